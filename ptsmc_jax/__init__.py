@@ -1,0 +1,73 @@
+"""Differentiable simulator of prescribed-time sliding mode control for spacecraft attitude.
+
+The names below are loaded when first used: importing the package does not import JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# name: module
+_EXPORTS = {
+    "AttitudeState": "plants",
+    "Spacecraft": "plants",
+    "spacecraft": "plants",
+    "Constant": "signals",
+    "Fixed": "signals",
+    "Sinusoid": "signals",
+    "Spin": "signals",
+    "Target": "signals",
+    "PrescribedTime": "controllers",
+    "NonlinearObserver": "observers",
+    "Sensors": "hardware",
+    "Parts": "rollout",
+    "Result": "rollout",
+    "STATUS": "rollout",
+    "simulate": "rollout",
+    "simulate_jit": "rollout",
+    "Metrics": "metrics",
+    "Dispersion": "dispersions",
+    "Requirement": "requirements",
+    "Scenario": "schema",
+    "ScenarioError": "schema",
+    "Study": "scenario",
+    "study": "scenario",
+}
+
+if TYPE_CHECKING:
+    from ptsmc_jax.controllers import PrescribedTime as PrescribedTime
+    from ptsmc_jax.dispersions import Dispersion as Dispersion
+    from ptsmc_jax.hardware import Sensors as Sensors
+    from ptsmc_jax.metrics import Metrics as Metrics
+    from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
+    from ptsmc_jax.plants import AttitudeState as AttitudeState
+    from ptsmc_jax.plants import Spacecraft as Spacecraft
+    from ptsmc_jax.plants import spacecraft as spacecraft
+    from ptsmc_jax.requirements import Requirement as Requirement
+    from ptsmc_jax.rollout import STATUS as STATUS
+    from ptsmc_jax.rollout import Parts as Parts
+    from ptsmc_jax.rollout import Result as Result
+    from ptsmc_jax.rollout import simulate as simulate
+    from ptsmc_jax.rollout import simulate_jit as simulate_jit
+    from ptsmc_jax.scenario import Study as Study
+    from ptsmc_jax.scenario import study as study
+    from ptsmc_jax.schema import Scenario as Scenario
+    from ptsmc_jax.schema import ScenarioError as ScenarioError
+    from ptsmc_jax.signals import Constant as Constant
+    from ptsmc_jax.signals import Fixed as Fixed
+    from ptsmc_jax.signals import Sinusoid as Sinusoid
+    from ptsmc_jax.signals import Spin as Spin
+    from ptsmc_jax.signals import Target as Target
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        value = getattr(importlib.import_module(f"ptsmc_jax.{_EXPORTS[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'ptsmc_jax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_EXPORTS]

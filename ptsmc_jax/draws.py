@@ -1,0 +1,79 @@
+"""Random numbers as a pure function of (seed, trial, name, sample): same values whatever the batch or the device.
+
+Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror, Shaw, SC11, 2011) on plain uint32. The rule, fixed for good:
+    key   = threefry(key=(seed, 0), counter=(trial, crc32(name)))
+    words = threefry(key, counter=(sample, block)), two a block
+    uniform u = (word + 1/2) / 2^32; normals in pairs by Box-Muller, r cos(a) and r sin(a), r from the first word.
+"""
+
+import zlib
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+
+Word = UInt32[Array, "..."]
+
+
+class Key(NamedTuple):
+    """Key of one stream of one trial: two 32-bit words."""
+
+    a: Array
+    b: Array
+
+
+def _word(value: int | Array | np.ndarray) -> Array:
+    if isinstance(value, int):
+        return jnp.asarray(np.uint32(value & 0xFFFFFFFF))
+    return jnp.asarray(value).astype(jnp.uint32)
+
+
+def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
+    """The two words of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
+    schedule = (key.a, key.b, key.a ^ key.b ^ jnp.uint32(0x1BD11BDA))
+    x, y = counter[0] + schedule[0], counter[1] + schedule[1]
+    for group in range(5):
+        for r in _ROTATIONS[group % 2]:
+            x = x + y
+            y = ((y << r) | (y >> (32 - r))) ^ x
+        x = x + schedule[(group + 1) % 3]
+        y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
+    return x, y
+
+
+def stream(seed: int | Array, trial: int | Array, name: str) -> Key:
+    """Key of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
+    label = jnp.uint32(zlib.crc32(name.encode()))
+    return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
+
+
+def derive(seed: int, name: str) -> int:
+    """Another seed, from 0 to 2^32 - 1, that follows from this one and a name (concrete, for whole studies)."""
+    return int(stream(seed, 0, name).a)
+
+
+def _pairs(key: Key, sample: int | Array, count: int) -> list[tuple[Array, Array]]:
+    return [threefry(key, (_word(sample), jnp.uint32(block))) for block in range((count + 1) // 2)]
+
+
+def _unit(word: Array) -> Array:
+    kind = jnp.result_type(float)
+    return (word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32)
+
+
+def uniforms(key: Key, count: int, sample: int | Array = 0) -> Float[Array, " {count}"]:
+    """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits)."""
+    words = [word for pair in _pairs(key, sample, count) for word in pair]
+    return jnp.stack([_unit(word) for word in words[:count]])
+
+
+def normals(key: Key, count: int, sample: int | Array = 0) -> Float[Array, " {count}"]:
+    """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
+    values = []
+    for a, b in _pairs(key, sample, count):
+        radius, angle = jnp.sqrt(-2.0 * jnp.log(_unit(a))), 2.0 * np.pi * _unit(b)
+        values += [radius * jnp.cos(angle), radius * jnp.sin(angle)]
+    return jnp.stack(values[:count])

@@ -1,0 +1,39 @@
+"""What stands between the law and the spacecraft: here the attitude and rate sensors."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ptsmc_jax import attitude, draws
+from ptsmc_jax.plants import AttitudeState
+
+ATTITUDE_NOISE, RATE_NOISE = "attitude_noise", "rate_noise"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sensors:
+    """Star tracker and gyro sampled once a period, white noise, independent per axis and sample."""
+
+    attitude_noise: Array  # 1 sigma of the small rotation about each body axis [rad]
+    rate_noise: Array  # 1 sigma [rad/s]
+
+    def keys(self, seed: int | Array, trial: int | Array) -> tuple[draws.Key, draws.Key]:
+        """Streams of a trial's noise, one for each sensor."""
+        return draws.stream(seed, trial, ATTITUDE_NOISE), draws.stream(seed, trial, RATE_NOISE)
+
+    def noise(
+        self, keys: tuple[draws.Key, draws.Key], sample: Int[Array, ""]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""
+        return (
+            self.attitude_noise * draws.normals(keys[0], 3, sample),
+            self.rate_noise * draws.normals(keys[1], 3, sample),
+        )
+
+    def measure(self, x: AttitudeState, noise: tuple[Float[Array, "3"], Float[Array, "3"]]) -> AttitudeState:
+        """The state as measured: attitude turned by a small rotation in body axes, rate with noise added."""
+        turned = attitude.multiply(x.q, attitude.from_rotation_vector(noise[0]))
+        return AttitudeState(turned, jnp.add(x.w, noise[1]))

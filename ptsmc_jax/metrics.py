@@ -1,0 +1,178 @@
+"""What a run is judged by, accumulated interval by interval inside the rollout."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax import numerics
+
+Scalar = Float[Array, ""]
+
+# name: (unit, what it is)
+CATALOGUE = {
+    "terminal_error": ("-", "2-norm of the attitude error vector at t_f"),
+    "terminal_angle": ("rad", "angle to the reference attitude at t_f"),
+    "window_error": ("-", "RMS of that 2-norm over the window after t_f"),
+    "hold_error": ("-", "largest of that 2-norm from t_f to t_end"),
+    "peak_torque": ("N m", "largest commanded torque about one axis, before the actuator"),
+    "peak_torque_delivered": ("N m", "largest delivered torque about one axis"),
+    "saturated": ("-", "fraction of the time in which the delivered torque is not the commanded one"),
+    "effort": ("N m s", "integral of the 1-norm of the delivered torque"),
+    "settling_time": ("s", "time from which the angle stays below settling_angle"),
+    "chattering": ("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
+    "peak_rate": ("rad/s", "largest 2-norm of the body rate"),
+    "peak_momentum": ("N m s", "largest 2-norm of the angular momentum"),
+}
+
+
+class Metrics(NamedTuple):
+    """Metrics of a run, scalars; units and meaning in `CATALOGUE`. settling_time is NaN where it never settles."""
+
+    terminal_error: Array
+    terminal_angle: Array
+    window_error: Array
+    hold_error: Array
+    peak_torque: Array
+    peak_torque_delivered: Array
+    saturated: Array
+    effort: Array
+    settling_time: Array
+    chattering: Array
+    peak_rate: Array
+    peak_momentum: Array
+
+
+class Sight(NamedTuple):
+    """What the metrics see of the true state at one time."""
+
+    error: Array  # (3,) attitude error vector [-]
+    error_rate: Array  # (3,) [1/s]
+    angle: Array  # to the reference [rad]
+    rate: Array  # |w| [rad/s]
+    momentum: Array  # |J w| [N m s]
+
+
+class Span(NamedTuple):
+    """One interval: its ends and the torques at `weights`, quadrature nodes in it (one where the torque is held)."""
+
+    t: Array  # [s]
+    t_next: Array
+    start: Sight
+    end: Sight
+    commanded: tuple[Array, ...]  # (3,) each [N m]
+    delivered: tuple[Array, ...]
+    weights: tuple[float, ...]  # sum to 1
+
+
+class Judged(NamedTuple):
+    """Times that the metrics refer to [s] and the settling angle [rad]."""
+
+    t_f: Array
+    t_end: Array
+    window: Array
+    settling_angle: Array
+
+
+class Running(NamedTuple):
+    """Accumulators; `settled_at` is the end of the last time spent above the settling angle."""
+
+    square_error: Array
+    hold_error: Array
+    peak_torque: Array
+    peak_torque_delivered: Array
+    saturated_for: Array
+    effort: Array
+    settled_at: Array
+    last_torque: Array  # (3,) delivered at the end of the last interval [N m]
+    variation: Array  # (3,) of the delivered torque after t_f [N m]
+    peak_rate: Array
+    peak_momentum: Array
+
+
+def begin(first: Sight, judged: Judged) -> Running:
+    """Accumulators at t = 0."""
+    zero = jnp.zeros_like(judged.t_f)
+    unsettled = first.angle >= judged.settling_angle
+    return Running(
+        *(zero,) * 6, jnp.where(unsettled, jnp.inf, 0.0), jnp.zeros(3), jnp.zeros(3), first.rate, first.momentum
+    )
+
+
+def update(running: Running, span: Span, judged: Judged) -> Running:
+    """Accumulators after one interval; one of length zero changes nothing."""
+    dt = span.t_next - span.t
+    lasts = dt > 0.0
+    safe_dt = jnp.where(lasts, dt, 1.0)
+    after = span.t_next > judged.t_f
+
+    delivered = span.delivered
+    top = jnp.stack([jnp.max(jnp.abs(u)) for u in span.commanded])
+    top_delivered = jnp.stack([jnp.max(jnp.abs(u)) for u in delivered])
+    unlike = [jnp.any(u != v) for u, v in zip(span.commanded, delivered, strict=True)]
+    saturated = sum(w * differs for w, differs in zip(span.weights, unlike, strict=True))
+    effort = sum(w * jnp.sum(jnp.abs(u)) for w, u in zip(span.weights, delivered, strict=True))
+    jumps = [jnp.abs(v - u) for u, v in zip((running.last_torque, *delivered), delivered, strict=False)]
+    jumps[0] = jnp.where(span.t > judged.t_f, jumps[0], 0.0)
+
+    # the angle falls below the threshold inside the interval: linear interpolation; stays above: not yet settled
+    above, above_next = span.start.angle >= judged.settling_angle, span.end.angle >= judged.settling_angle
+    drop = jnp.where(above & ~above_next, span.start.angle - span.end.angle, 1.0)
+    crossing = span.t + dt * (span.start.angle - judged.settling_angle) / drop
+    settled_at = jnp.where(above_next, jnp.inf, jnp.where(above, crossing, running.settled_at))
+
+    new = Running(
+        square_error=running.square_error + _square_error(span, judged, safe_dt),
+        hold_error=jnp.where(after, jnp.maximum(running.hold_error, numerics.norm(span.end.error)), 0.0),
+        peak_torque=jnp.maximum(running.peak_torque, jnp.max(top)),
+        peak_torque_delivered=jnp.maximum(running.peak_torque_delivered, jnp.max(top_delivered)),
+        saturated_for=running.saturated_for + dt * saturated,
+        effort=running.effort + dt * effort,
+        settled_at=settled_at,
+        last_torque=delivered[-1],
+        variation=running.variation + jnp.where(span.t >= judged.t_f, sum(jumps), jumps[0]),
+        peak_rate=jnp.maximum(running.peak_rate, span.end.rate),
+        peak_momentum=jnp.maximum(running.peak_momentum, span.end.momentum),
+    )
+    return numerics.select(lasts, new, running)
+
+
+def finish(running: Running, at_t_f: Sight, judged: Judged) -> Metrics:
+    """Metrics of the run from its accumulators and what was seen at t_f."""
+    terminal_error = numerics.norm(at_t_f.error)
+    square_error = running.square_error / judged.window
+    still = judged.t_end - judged.t_f
+    chattering = jnp.max(running.variation) / jnp.where(still > 0.0, still, 1.0)
+    positive = square_error > 0.0
+    return Metrics(
+        terminal_error=terminal_error,
+        terminal_angle=at_t_f.angle,
+        window_error=jnp.where(positive, jnp.sqrt(jnp.where(positive, square_error, 1.0)), 0.0),
+        hold_error=jnp.maximum(running.hold_error, terminal_error),
+        peak_torque=running.peak_torque,
+        peak_torque_delivered=running.peak_torque_delivered,
+        saturated=running.saturated_for / judged.t_end,
+        effort=running.effort,
+        settling_time=jnp.where(jnp.isfinite(running.settled_at), running.settled_at, jnp.nan),
+        chattering=chattering,
+        peak_rate=running.peak_rate,
+        peak_momentum=running.peak_momentum,
+    )
+
+
+def _square_error(span: Span, judged: Judged, dt: Scalar) -> Scalar:
+    """Integral of |error|^2 over the part of the interval inside the window; fourth order, once differentiable in t_f.
+
+    The error in between is the cubic through both ends and slopes (Hermite), its square the parabola through the ends
+    and the middle, integrated exactly.
+    """
+    middle = (span.start.error + span.end.error) / 2 + dt / 8 * (span.start.error_rate - span.end.error_rate)
+    g0, g1, g2 = (jnp.sum(e * e) for e in (span.start.error, middle, span.end.error))
+
+    def fraction(t: Array) -> Array:
+        return jnp.clip((t - span.t) / dt, 0.0, 1.0)
+
+    def primitive(x: Array) -> Array:
+        return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))
+
+    return dt * (primitive(fraction(judged.t_f + judged.window)) - primitive(fraction(judged.t_f)))

@@ -1,0 +1,107 @@
+"""Numerical pieces that the equations are written with: smooth sign, guarded norm, phi functions, integrators."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+
+
+def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array, "..."]:
+    """tanh(s / width), the boundary-layer form of sign(s) [-]; where width is 0, the exact sign.
+
+    s: any shape; width: scalar in the units of s, at least 0. The slope at s = 0 is 1/width, and 0 for the exact sign.
+    """
+    exact = width <= 0.0
+    safe_width = jnp.where(exact, 1.0, width)
+    return jnp.where(exact, jnp.sign(s), jnp.tanh(s / safe_width))
+
+
+def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
+    """2-norm over all entries (Frobenius norm of a matrix), in the units of x; its gradient at x = 0 is set to 0."""
+    square = jnp.sum(x * x)
+    at_zero = square == 0.0
+    return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, square)))
+
+
+def lerp(weight: Scalar, a: Any, b: Any) -> Any:
+    """b + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
+    return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
+
+
+def select(condition: Array, a: Any, b: Any) -> Any:
+    """a where the scalar condition holds, b elsewhere, leaf by leaf; the side not taken leaks no tangent."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> Any:
+    """State at t + dt by one step of the classical Runge-Kutta method of order 4.
+
+    rate(t, y) returns dy/dt as a pytree like y; t, dt [s].
+    """
+
+    def ahead(slope: Any, step: Scalar) -> Any:
+        return jax.tree.map(lambda y, k: y + step * k, y, slope)
+
+    k1 = rate(t, y)
+    k2 = rate(t + dt / 2, ahead(k1, dt / 2))
+    k3 = rate(t + dt / 2, ahead(k2, dt / 2))
+    k4 = rate(t + dt, ahead(k3, dt))
+    return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
+
+
+def phi_functions(x: Float[Array, "n n"], order: int) -> list[Float[Array, "n n"]]:
+    """phi_0(x) = e^x and phi_1 .. phi_order, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x, of a square matrix [-].
+
+    They are the top blocks of the exponential of an augmented matrix (Sidje, ACM TOMS 24(1), 1998, section 2),
+    so nothing cancels for small x and the eigenvalues of x may repeat.
+    """
+    n = x.shape[-1]
+    augmented = jnp.zeros((n * (order + 1), n * (order + 1)), x.dtype)
+    augmented = augmented.at[:n, :n].set(x)
+    augmented = augmented + jnp.eye(n * (order + 1), k=n, dtype=x.dtype)
+    top = jax.scipy.linalg.expm(augmented, max_squarings=64)[:n]
+    return [top[:, k * n : (k + 1) * n] for k in range(order + 1)]
+
+
+class Decay(NamedTuple):
+    """What one step of `etdrk4` needs of the linear part -A over a step dt: matrices (n, n) [- or s]."""
+
+    half: Array  # e^(-A dt/2)
+    full: Array  # e^(-A dt)
+    stage: Array  # dt/2 phi_1(-A dt/2) [s]
+    ends: tuple[Array, Array, Array]  # weights of the forcing at the start, the middle (twice) and the end [s]
+
+
+def decay(a: Float[Array, "n n"], dt: Scalar) -> Decay:
+    """Coefficients of Cox and Matthews, J. Comput. Phys. 176 (2002), eqs. (26)-(29), for m' = -A m + forcing."""
+    half, phi_half = phi_functions(-a * dt / 2, 1)
+    full, p1, p2, p3 = phi_functions(-a * dt, 3)
+    ends = (dt * (p1 - 3 * p2 + 4 * p3), dt * 2 * (p2 - 2 * p3), dt * (4 * p3 - p2))
+    return Decay(half, full, dt / 2 * phi_half, ends)
+
+
+def etdrk4(rate: Callable, linear: Decay, t: Scalar, y: Any, m: Float[Array, " n"], dt: Scalar) -> tuple:
+    """One step of order 4 of y' = f(t, y, m), m' = -A m + g(t, y, m), exact in A: (y, m) at t + dt and stage outputs.
+
+    rate(t, y, m) returns (f, g, aux). With A = 0 it is `rk4`; however stiff A is, the step stays stable and exact
+    for a constant g. Returned besides: aux of the first and the third stage (start and middle of the step).
+    """
+
+    def ahead(slope: Any, step: Scalar) -> Any:
+        return jax.tree.map(lambda y, k: y + step * k, y, slope)
+
+    f1, g1, start = rate(t, y, m)
+    m2 = linear.half @ m + linear.stage @ g1
+    f2, g2, _ = rate(t + dt / 2, ahead(f1, dt / 2), m2)
+    m3 = linear.half @ m + linear.stage @ g2
+    f3, g3, middle = rate(t + dt / 2, ahead(f2, dt / 2), m3)
+    m4 = linear.half @ m2 + linear.stage @ (2 * g3 - g1)
+    f4, g4, _ = rate(t + dt, ahead(f3, dt), m4)
+    w1, w2, w4 = linear.ends
+    m_next = linear.full @ m + w1 @ g1 + w2 @ (g2 + g3) + w4 @ g4
+    y_next = jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, f1, f2, f3, f4)
+    return y_next, m_next, start, middle
