@@ -25,7 +25,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def normalise(q: Quaternion) -> Quaternion:
-    """q / |q|."""
+    """Q / |q|."""
     return q / jnp.sqrt(jnp.dot(q, q))
 
 

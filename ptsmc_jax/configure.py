@@ -1,4 +1,4 @@
-"""JAX set up for this work, before its backend starts: the command and the notebooks call it, the library never does."""
+"""JAX set up before its backend starts: the command and the notebooks call it, the library never does."""
 
 import hashlib
 import os
@@ -26,7 +26,7 @@ def configure(devices: int | None = None, cache: str | Path | None = "default") 
     if cache is not None:
         folder = _cache_folder() if cache == "default" else Path(cache)
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 

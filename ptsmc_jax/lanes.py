@@ -6,7 +6,7 @@ but not arrays (trial, 3). Reshapes and slices become permutations, small contra
 not depend on the trial stays as it is. A primitive without a rule here goes through `jax.vmap` on its own.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -22,10 +22,10 @@ _LARGEST = 64
 
 _ELEMENTWISE = set(
     """abs acos acosh add and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp convert_element_type
-    copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic
-    lt max min mul ne neg nextafter not or population_count pow real reduce_precision rem round rsqrt
-    select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan tanh
-    xor""".split()
+    copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p
+    logistic lt max min mul ne neg nextafter not or population_count pow real reduce_precision rem round rsqrt
+    select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan
+    tanh xor""".split()
 )
 _STRUCTURAL = set("broadcast_in_dim concatenate expand_dims pad reshape rev slice squeeze transpose".split())
 _REDUCTIONS = {
@@ -69,14 +69,11 @@ def vmap(function: Callable, in_axes: Any = 0) -> Callable:
 
     def mapped(*args: Any) -> Any:
         axes = (in_axes,) * len(args) if in_axes is None or isinstance(in_axes, int) else tuple(in_axes)
-        flat_axes = jax.tree.leaves(
-            [jax.tree.map(lambda _, a=axis: _OFF if a is None else a, arg) if axis is None or isinstance(axis, int)
-             else jax.tree.map(lambda a: _OFF if a is None else a, axis, is_leaf=lambda a: a is None)
-             for axis, arg in zip(axes, args, strict=True)]
-        )  # fmt: skip
+        mapped_over = jax.tree.leaves(
+            jax.tree.map(_spread, axes, args, is_leaf=lambda axis: axis is None or isinstance(axis, int))
+        )
         leaves, tree = jax.tree.flatten(args)
         leaves = [jnp.asarray(leaf) for leaf in leaves]
-        mapped_over = [axis != _OFF for axis in flat_axes]
         sizes = {leaf.shape[0] for leaf, on in zip(leaves, mapped_over, strict=True) if on}
         if len(sizes) != 1:
             raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
@@ -95,10 +92,14 @@ def vmap(function: Callable, in_axes: Any = 0) -> Callable:
     return mapped
 
 
-_OFF = -1  # stands for None where a pytree may hold no None
+def _spread(axis: int | None, tree: Any) -> Any:
+    """Whether each leaf under one entry of in_axes is mapped over."""
+    if axis not in (None, 0):
+        raise ValueError(f"in_axes may hold 0 and None only, found {axis}")
+    return jax.tree.map(lambda _: axis == 0, tree)
 
 
-def _object_array(shape: tuple[int, ...], items: Iterator | Sequence) -> np.ndarray:
+def _object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
     array = np.empty(shape, dtype=object)
     for index, item in zip(np.ndindex(*shape), items, strict=True):
         array[index] = item
@@ -195,10 +196,12 @@ def _reduction(eqn: Any, value: _Lane) -> _Lane:
     kept = [a for a in range(len(value.shape)) if a not in eqn.params["axes"]]
     shape = tuple(value.shape[a] for a in kept)
     rows = value.parts.transpose([*kept, *eqn.params["axes"]]).reshape((*shape, -1))
-    return _Lane(shape, _object_array(shape, (_fold(_REDUCTIONS[eqn.primitive.name], rows[i]) for i in np.ndindex(*shape))))
+    return _Lane(
+        shape, _object_array(shape, (_fold(_REDUCTIONS[eqn.primitive.name], rows[i]) for i in np.ndindex(*shape)))
+    )
 
 
-def _fold(operation: Callable, items: Sequence) -> Array:
+def _fold(operation: Callable, items: Iterable) -> Array:
     return reduce(lambda a, b: operation(*jnp.broadcast_arrays(a, b)), items)
 
 
@@ -259,9 +262,7 @@ def _scan(eqn: Any, values: list, trials: int) -> list:
         return after, tuple(spread(v, d) for v, d in zip(out[carried:], outputs[carried:], strict=True))
 
     first = tuple(spread(v, d) for v, d in zip(init, differs, strict=True))
-    last, ys = lax.scan(
-        step, first, tuple(rows(v) for v in xs), params["length"], params["reverse"], params["unroll"]
-    )
+    last, ys = lax.scan(step, first, tuple(rows(v) for v in xs), params["length"], params["reverse"], params["unroll"])
     results = [gather(c, s, d) for c, s, d in zip(last, carry_shapes, differs, strict=True)]
     for y, shape, laned in zip(ys, out_shapes[carried:], outputs[carried:], strict=True):
         if laned:  # (component) of (time, trial) -> (trial, time, *shape)

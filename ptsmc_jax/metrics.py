@@ -1,5 +1,6 @@
 """What a run is judged by, accumulated interval by interval inside the rollout."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -95,7 +96,17 @@ def begin(first: Sight, judged: Judged) -> Running:
     zero = jnp.zeros_like(judged.t_f)
     unsettled = first.angle >= judged.settling_angle
     return Running(
-        *(zero,) * 6, jnp.where(unsettled, jnp.inf, 0.0), jnp.zeros(3), jnp.zeros(3), first.rate, first.momentum
+        square_error=zero,
+        hold_error=zero,
+        peak_torque=zero,
+        peak_torque_delivered=zero,
+        saturated_for=zero,
+        effort=zero,
+        settled_at=jnp.where(unsettled, jnp.inf, 0.0),
+        last_torque=jnp.zeros(3),
+        variation=jnp.zeros(3),
+        peak_rate=first.rate,
+        peak_momentum=first.momentum,
     )
 
 
@@ -107,13 +118,16 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     after = span.t_next > judged.t_f
 
     delivered = span.delivered
-    top = jnp.stack([jnp.max(jnp.abs(u)) for u in span.commanded])
-    top_delivered = jnp.stack([jnp.max(jnp.abs(u)) for u in delivered])
-    unlike = [jnp.any(u != v) for u, v in zip(span.commanded, delivered, strict=True)]
-    saturated = sum(w * differs for w, differs in zip(span.weights, unlike, strict=True))
-    effort = sum(w * jnp.sum(jnp.abs(u)) for w, u in zip(span.weights, delivered, strict=True))
-    jumps = [jnp.abs(v - u) for u, v in zip((running.last_torque, *delivered), delivered, strict=False)]
-    jumps[0] = jnp.where(span.t > judged.t_f, jumps[0], 0.0)
+    largest, largest_delivered = (
+        jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques])) for torques in (span.commanded, delivered)
+    )
+    nodes = list(zip(span.weights, span.commanded, delivered, strict=True))
+    saturated = sum(w * jnp.any(u != v) for w, u, v in nodes)
+    effort = sum(w * jnp.sum(jnp.abs(v)) for w, _, v in nodes)
+    # total variation after t_f: the jump at the start of the interval, then what happens inside
+    jump = jnp.where(span.t > judged.t_f, jnp.abs(delivered[0] - running.last_torque), 0.0)
+    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros(3))
+    variation = jump + jnp.where(span.t >= judged.t_f, inside, 0.0)
 
     # the angle falls below the threshold inside the interval: linear interpolation; stays above: not yet settled
     above, above_next = span.start.angle >= judged.settling_angle, span.end.angle >= judged.settling_angle
@@ -124,13 +138,13 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     new = Running(
         square_error=running.square_error + _square_error(span, judged, safe_dt),
         hold_error=jnp.where(after, jnp.maximum(running.hold_error, numerics.norm(span.end.error)), 0.0),
-        peak_torque=jnp.maximum(running.peak_torque, jnp.max(top)),
-        peak_torque_delivered=jnp.maximum(running.peak_torque_delivered, jnp.max(top_delivered)),
+        peak_torque=jnp.maximum(running.peak_torque, largest),
+        peak_torque_delivered=jnp.maximum(running.peak_torque_delivered, largest_delivered),
         saturated_for=running.saturated_for + dt * saturated,
         effort=running.effort + dt * effort,
         settled_at=settled_at,
         last_torque=delivered[-1],
-        variation=running.variation + jnp.where(span.t >= judged.t_f, sum(jumps), jumps[0]),
+        variation=running.variation + variation,
         peak_rate=jnp.maximum(running.peak_rate, span.end.rate),
         peak_momentum=jnp.maximum(running.peak_momentum, span.end.momentum),
     )

@@ -68,6 +68,6 @@ def _blocks(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.A
 
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
     spread, whole = PartitionSpec("device"), PartitionSpec()
-    return jax.shard_map(
-        share, mesh=mesh, in_specs=(whole, whole, whole, spread), out_specs=spread, check_vma=False
-    )(parts, dispersion, seed, trials)
+    return jax.shard_map(share, mesh=mesh, in_specs=(whole, whole, whole, spread), out_specs=spread, check_vma=False)(
+        parts, dispersion, seed, trials
+    )

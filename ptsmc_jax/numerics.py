@@ -28,12 +28,12 @@ def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
 
 
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
-    """b + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
+    """B + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
 
 
 def select(condition: Array, a: Any, b: Any) -> Any:
-    """a where the scalar condition holds, b elsewhere, leaf by leaf; the side not taken leaks no tangent."""
+    """A where the scalar condition holds, b elsewhere, leaf by leaf; the side not taken leaks no tangent."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 

@@ -27,12 +27,10 @@ class Spacecraft:
     inertia_inverse: Array  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
 
     def gyroscopic(self, w: Float[Array, "3"]) -> Float[Array, "3"]:
-        """w x J w [N m]."""
+        """W x J w [N m]."""
         return jnp.cross(w, self.inertia @ w)
 
-    def rate(
-        self, x: AttitudeState, torque: Float[Array, "3"], disturbance: Float[Array, "3"]
-    ) -> AttitudeState:
+    def rate(self, x: AttitudeState, torque: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
         """Time derivative of the state under torque and disturbance [N m], (1) and (2)."""
         w_dot = self.inertia_inverse @ (torque + disturbance - self.gyroscopic(x.w))
         return AttitudeState(attitude.derivative(x.q, x.w), w_dot)

@@ -37,7 +37,7 @@ class Requirement:
     limit: float
 
     def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
-        """Verdict over trials, (trials,) values and status flags; a trial that failed or has no value does not meet it."""
+        """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks it."""
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
         within = ok & (values <= self.limit)
         worst = float(np.max(np.where(ok, values, np.nan)))

@@ -118,9 +118,7 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: AttitudeSta
     def fly(x: AttitudeState, t: Scalar, u: Array, dt: Scalar) -> AttitudeState:
         step = dt / parts.substeps
         for k in range(parts.substeps):
-            x = numerics.rk4(
-                lambda time, y: parts.plant.rate(y, u, parts.disturbance(time)), t + k * step, x, step
-            )
+            x = numerics.rk4(lambda time, y: parts.plant.rate(y, u, parts.disturbance(time)), t + k * step, x, step)
         return parts.plant.normalise(x)
 
     def period(carry: tuple[_State, Any], tick: tuple) -> tuple[tuple[_State, Any], Any]:

@@ -117,7 +117,9 @@ def quaternion(table: schema.Attitude, name: str) -> np.ndarray:
     try:
         return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
     except ValueError:
-        raise wrong(f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"') from None
+        raise wrong(
+            f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
+        ) from None
 
 
 def _resolve(scenario: Scenario) -> Scenario:
@@ -251,7 +253,7 @@ def _check_reachable(scenario: Scenario, parts: Parts) -> None:
         )
     if scenario.dispersion is not None and scenario.dispersion.attitude is not None:
         return  # the attitude is drawn; a trial that meets the singularity is marked and counted
-    t, square = (np.asarray(v) for v in theory.predicted_path(parts))
+    t, square = (np.asarray(v) for v in _path(parts))
     if square[0] < SINGULAR_CLEARANCE**2:
         raise ScenarioError(f"{said}, but lies at {singular}; allowed is |q4| of at least {SINGULAR_CLEARANCE}")
     if square.min() < SINGULAR_CLEARANCE**2:
@@ -260,6 +262,9 @@ def _check_reachable(scenario: Scenario, parts: Parts) -> None:
             f"{said} with initial.rate = {schema.show(table.rate)}, but from there the path to the reference meets "
             f"{singular}, at t = {when:.4g} s; allowed is a start whose path keeps |q4| above {SINGULAR_CLEARANCE}"
         )
+
+
+_path = jax.jit(theory.predicted_path)
 
 
 def _vector(values: Any) -> Any:
@@ -286,7 +291,7 @@ def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
     body_rate = float(sum(rates)) + 2.0 * table.eta / table.t_f
     sensors = _sensors(scenario)
     if loop.mode == "continuous":
-        timing = _grid(scenario, reach, controller, observer, max(frequency, body_rate), saves)
+        timing = _grid(scenario, reach, observer, max(frequency, body_rate), saves)
         substeps = 1
     else:
         if loop.clock == "anchored":
@@ -313,7 +318,9 @@ def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
     )
 
 
-def _grid(scenario: Scenario, reach: Reach, controller, observer, frequency: float, saves: object) -> clock.Graded:
+def _grid(
+    scenario: Scenario, reach: Reach, observer: observers.NonlinearObserver, frequency: float, saves: object
+) -> clock.Graded:
     """Grid of the continuous loop; refused where the smooth sign is too stiff for a sensible number of steps."""
     loop, table = scenario.loop, scenario.controller
     assert loop.t_end is not None
@@ -324,9 +331,7 @@ def _grid(scenario: Scenario, reach: Reach, controller, observer, frequency: flo
     # s' = -(tau/2) |T J^-1| K2 tanh(s/width) + ...: the rate of the boundary layer at tau = t_f, and in hold
     switching = float(jnp.linalg.norm(observer.model.inertia_inverse) * jnp.maximum(bound.floor, bound.start))
     layer = switching / (2.0 * table.sign_width) if table.sign_width > 0 else 0.0
-    grid = clock.graded(
-        reach.t_f, reach.smallest_delta, loop.t_end, loop.window, table.k1, frequency, layer, saves
-    )
+    grid = clock.graded(reach.t_f, reach.smallest_delta, loop.t_end, loop.window, table.k1, frequency, layer, saves)
     if grid.before + grid.after > MOST_STEPS:
         raise wrong(
             "controller.sign_width",

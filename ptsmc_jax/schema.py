@@ -58,11 +58,11 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     """A table of a scenario file."""
 
 
-class Plant(Table):
+class Plant(Table, frozen=True):
     kind: Literal["spacecraft"] = "spacecraft"
 
 
-class Spacecraft(Table):
+class Spacecraft(Table, frozen=True):
     inertia: Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")] = (
         10.0,
         12.0,
@@ -70,7 +70,7 @@ class Spacecraft(Table):
     )
 
 
-class Attitude(Table):
+class Attitude(Table, frozen=True):
     """Exactly one of the attitude keys; `euler_deg` goes with `sequence`."""
 
     quat_xyzw: Four | None = None
@@ -85,29 +85,29 @@ class Attitude(Table):
 ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
 
 
-class Initial(Attitude):
+class Initial(Attitude, frozen=True):
     rate: Three = (0.0, 0.0, 0.0)
 
 
-class FixedReference(Attitude):
+class FixedReference(Attitude, frozen=True):
     kind: Literal["fixed"] = "fixed"
 
 
-class SpinReference(Attitude):
+class SpinReference(Attitude, frozen=True):
     kind: Literal["spin"] = "spin"
     rate: Three = (0.0, 0.0, 0.0)
 
 
-class NoDisturbance(Table):
+class NoDisturbance(Table, frozen=True):
     kind: Literal["none"] = "none"
 
 
-class ConstantDisturbance(Table):
+class ConstantDisturbance(Table, frozen=True):
     kind: Literal["constant"] = "constant"
     amplitude: Three = (0.01, 0.01, 0.01)
 
 
-class SinusoidDisturbance(Table):
+class SinusoidDisturbance(Table, frozen=True):
     kind: Literal["sinusoid"] = "sinusoid"
     amplitude: Three = (0.01, 0.01, 0.01)
     frequency: Three = (0.1, 0.1, 0.1)
@@ -115,7 +115,7 @@ class SinusoidDisturbance(Table):
     bias: Three = (0.0, 0.0, 0.0)
 
 
-class Controller(Table):
+class Controller(Table, frozen=True):
     kind: Literal["prescribed_time"] = "prescribed_time"
     error: Literal["additive", "multiplicative"] = "additive"
     t_f: Positive = 30.0
@@ -128,12 +128,12 @@ class Controller(Table):
     initial_estimate_error: NotNegative = 0.0
 
 
-class NonlinearObserver(Table):
+class NonlinearObserver(Table, frozen=True):
     kind: Literal["nonlinear"] = "nonlinear"
     gain: ThreePositive = (10.0, 10.0, 10.0)
 
 
-class Loop(Table):
+class Loop(Table, frozen=True):
     mode: Literal["continuous", "sampled"] = "continuous"
     period: Positive = 0.05
     clock: Literal["anchored", "flight"] = "anchored"
@@ -142,7 +142,7 @@ class Loop(Table):
     settling_angle: Positive = 1e-3
 
 
-class Hardware(Table):
+class Hardware(Table, frozen=True):
     torque_limit: Positive | None = None
     torque_rate_limit: Positive | None = None
     torque_lag: Positive | None = None
@@ -153,36 +153,36 @@ class Hardware(Table):
     rate_bias: NotNegative | None = None
 
 
-class UniformAttitude(Table):
+class UniformAttitude(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
 
 
-class AxisAngle(Table):
+class AxisAngle(Table, frozen=True):
     kind: Literal["axis_angle"] = "axis_angle"
     min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
     max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
 
 
-class NormalAttitude(Table):
+class NormalAttitude(Table, frozen=True):
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 1.0
 
 
-class NormalRate(Table):
+class NormalRate(Table, frozen=True):
     kind: Literal["normal"] = "normal"
     std: NotNegative = 0.01
 
 
-class RelativeInertia(Table):
+class RelativeInertia(Table, frozen=True):
     kind: Literal["relative_normal"] = "relative_normal"
     std: NotNegative = 0.05
 
 
-class UniformPhase(Table):
+class UniformPhase(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
 
 
-class Limit(Table):
+class Limit(Table, frozen=True):
     """A requirement in full: metric <= limit in this share of the trials, with this one-sided confidence."""
 
     limit: Positive
@@ -194,7 +194,7 @@ Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f"]
 FREE: tuple[str, ...] = typing.get_args(Free)
 
 
-class Tune(Table):
+class Tune(Table, frozen=True):
     free: Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")] = (
         "eta",
         "delta",
@@ -208,14 +208,14 @@ class Tune(Table):
     steps: Count = 150
 
 
-class Dispersion(Table):
+class Dispersion(Table, frozen=True):
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
     rate: NormalRate | None = None
     inertia: RelativeInertia | None = None
     disturbance_phase: UniformPhase | None = None
 
 
-class Scenario(Table):
+class Scenario(Table, frozen=True):
     """A scenario as its file says it, every key resolved; tables that are None are off."""
 
     plant: Plant = Plant()
@@ -269,7 +269,7 @@ def load(path: str | Path) -> dict[str, Any]:
 
 
 def parse(raw: Mapping[str, Any], metrics: typing.Collection[str]) -> Scenario:
-    """Scenario from raw tables, keys that are absent at their defaults; raises ScenarioError. `metrics`: known names."""
+    """Scenario from raw tables, absent keys at their defaults; raises ScenarioError. `metrics`: known names."""
     defaults = Scenario()
     names = Scenario.__struct_fields__
     found: dict[str, Any] = {}
@@ -289,9 +289,8 @@ def parse(raw: Mapping[str, Any], metrics: typing.Collection[str]) -> Scenario:
         if given is not None:  # a table without an attitude keeps the default one
             said = [key for key in ATTITUDE_KEYS if getattr(given, key) is not None]
             if len(said) > 1:
-                raise ScenarioError(
-                    f"{name} has two attitude keys, {' and '.join(said)}, but must have one of {', '.join(ATTITUDE_KEYS)}"
-                )
+                two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
+                raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
             if not said:
                 found[name] = msgspec.structs.replace(given, quat_xyzw=default.quat_xyzw)
     return Scenario(**found)

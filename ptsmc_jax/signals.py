@@ -79,6 +79,6 @@ class Sinusoid:
 
 
 def time_derivative(signal: Callable, t: Time) -> Array:
-    """d signal / dt at t, exact (by automatic differentiation), in the signal's units per second."""
+    """D signal / dt at t, exact (by automatic differentiation), in the signal's units per second."""
     t = jnp.asarray(t, jnp.result_type(float))
     return jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]

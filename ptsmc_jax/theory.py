@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ptsmc_jax import numerics
 from ptsmc_jax.rollout import Parts
@@ -35,9 +36,7 @@ def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Array, error_rate: A
     return ErrorMotion(x, (s0 * decay - eta * x) / (t_f - t), s0 * decay)
 
 
-def first_torque(
-    inertia: Float[Array, "3 3"], q: Float[Array, "4"], eta: Scalar, t_f: Scalar
-) -> Float[Array, "3"]:
+def first_torque(inertia: Float[Array, "3 3"], q: Float[Array, "4"], eta: Scalar, t_f: Scalar) -> Float[Array, "3"]:
     """Torque at t = 0 [N m] from rest to the fixed reference identity, d_hat(0) = 0: -2 eta^2 J v / (q4 t_f^2).
 
     inertia [kg m^2], t_f [s]. For a rotation by theta about n: 2 eta^2 |(J n)_i| tan(theta/2) / t_f^2 about axis i.
@@ -58,7 +57,7 @@ def later_peak_time(eta: Scalar, t_f: Scalar) -> Scalar:
     return t_f * (1.0 - jnp.exp(-(2.0 * eta - 3.0) / ((eta - 1.0) * (eta - 2.0))))
 
 
-def sliding_envelope(parts: Parts, t: np.ndarray) -> np.ndarray:
+def sliding_envelope(parts: Parts, t: ArrayLike) -> np.ndarray:
     """Bound on |s|_2 before the hand-over for the continuous loop with the smooth sign and no noise; t (time,) [s].
 
     |s|^2 <= |s(0)|^2 r^(2 eta) + beta tau^2 / (eta - 1), beta = sup(|T J^-1| K2)/2 * 3 * 0.2785 width, r = tau/t_f:
@@ -93,4 +92,3 @@ def predicted_path(parts: Parts, points: int = 2000) -> tuple[Array, Array]:
     reference = jax.vmap(lambda time: parts.reference(time).q)(t)
     path = reference[:, :3] + motion.error
     return t, 1.0 - jnp.sum(path**2, axis=1)
-

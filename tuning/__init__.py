@@ -1,0 +1,1 @@
+"""Gain tuning on the simulator, and the `ptsmc` command."""

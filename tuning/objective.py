@@ -30,7 +30,7 @@ class Problem:
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array]:
-    """f = ln RMS window error [-] and c = metric / limit - 1, (requirements, trials): met where c <= 0.
+    """F = ln RMS window error [-] and c = metric / limit - 1, (requirements, trials): met where c <= 0.
 
     A trial that fails counts with a window error of `FAILED`, and as that many times over its limits.
     """
@@ -48,4 +48,3 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 
     errors, over = lanes.vmap(fly)(problem.trials)
     return 0.5 * jnp.log(jnp.mean(errors[: problem.averaged] ** 2)), over.T
-

@@ -223,7 +223,7 @@ def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
 def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """f and c of many points, without derivatives; their number is a multiple of the devices'."""
+    """F and c of many points, without derivatives; their number is a multiple of the devices'."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
     whole, spread = PartitionSpec(), PartitionSpec("device")
 

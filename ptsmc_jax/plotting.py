@@ -1,0 +1,195 @@
+"""Histories and tuning runs as matplotlib figures, axes labelled with units; each function returns a Figure."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from ptsmc_jax import theory
+from ptsmc_jax.rollout import Log, Parts
+
+# Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
+_STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"))
+_TIME = "time [s]"
+_RC: Any = {
+    "font.size": 11,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "savefig.dpi": 130,
+}
+
+
+def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str, Figure]:
+    """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
+    return {
+        "attitude": attitude(parts, log),
+        "error": error(parts, log),
+        "rate": rate(parts, log),
+        "torque": torque(parts, log, limit),
+        "sliding": sliding(parts, log),
+        "disturbance": disturbance(parts, log),
+    }
+
+
+def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write NAME.png for each figure into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name}.png")
+    return [folder / f"{name}.png" for name in figures]
+
+
+def attitude(parts: Parts, log: Log) -> Figure:
+    """Quaternion and its reference over time."""
+    figure, axes = _figure("Attitude", "quaternion component [-]")
+    _components(axes, log.t, log.x.q, "q")
+    axes.plot(log.t, log.reference, color="0.6", lw=1.0, zorder=1)
+    axes.plot([], [], color="0.6", lw=1.0, label="reference")
+    _mark(axes, parts)
+    axes.legend(ncols=3, loc="best")
+    return figure
+
+
+def error(parts: Parts, log: Log) -> Figure:
+    """2-norm of the attitude error vector on a log scale, with the window in which it is judged."""
+    figure, axes = _figure("Attitude error", "|$\\varepsilon_1$| [-]")
+    size = np.linalg.norm(log.error, axis=1)
+    axes.semilogy(log.t, np.maximum(size, 1e-16), color=_STYLES[0][0])
+    t_f = float(parts.controller.t_f)
+    axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def rate(parts: Parts, log: Log) -> Figure:
+    """Body rate over time."""
+    figure, axes = _figure("Body rate", "rate [rad/s]")
+    _components(axes, log.t, log.x.w, "w")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def torque(parts: Parts, log: Log, limit: float | None = None) -> Figure:
+    """Delivered torque over time, its largest value marked, the limit drawn where one is given [N m]."""
+    figure, axes = _figure("Control torque", "torque [N m]")
+    held = not hasattr(parts.clock, "max_step")
+    _components(axes, log.t, log.u, "u", drawstyle="steps-post" if held else "default")
+    row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
+    peak = log.commanded[row, column]
+    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=f"peak {abs(peak):.3g} N m at {log.t[row]:.4g} s")
+    if limit is not None:
+        for sign in (-1.0, 1.0):
+            axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
+        axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} N m")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def sliding(parts: Parts, log: Log) -> Figure:
+    """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
+    figure, axes = _figure("Sliding variable", "|s| [-]")
+    _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
+    before = log.t[log.t < float(parts.controller.hand_over)]
+    axes.plot(before, theory.sliding_envelope(parts, before), color="0.5", lw=1.2, label="envelope of |s|, no noise")
+    axes.set_yscale("log")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def disturbance(parts: Parts, log: Log) -> Figure:
+    """Estimated and true disturbance over time."""
+    figure, axes = _figure("Disturbance and its estimate", "torque [N m]")
+    _components(axes, log.t, log.d_hat, "\\hat d")
+    axes.plot(log.t, log.disturbance, color="0.6", lw=1.0, zorder=1)
+    axes.plot([], [], color="0.6", lw=1.0, label="true $d_i$")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
+def tuning_history(
+    names: Sequence[str], units: Sequence[str], gains: np.ndarray, rms: np.ndarray, admissible: np.ndarray
+) -> Figure:
+    """Search of all starts: RMS window error and gains over the steps.
+
+    gains (steps, starts, gains), rms (steps, starts), admissible (steps, starts) bool: every requirement met.
+    """
+    with matplotlib.rc_context(_RC):
+        figure = Figure(figsize=(8.0, 2.2 * (len(names) + 1)), layout="constrained")
+        axes = figure.subplots(len(names) + 1, 1, sharex=True)
+        steps = np.arange(len(rms))
+        for start in range(rms.shape[1]):
+            axes[0].semilogy(steps, rms[:, start], color="0.75", lw=1.0)
+            met = np.where(admissible[:, start], rms[:, start], np.nan)
+            axes[0].semilogy(steps, met, color=_STYLES[0][0])
+        axes[0].plot([], [], color=_STYLES[0][0], label="requirements met")
+        axes[0].plot([], [], color="0.75", label="beyond a limit")
+        axes[0].set(ylabel="RMS window\nerror [-]", title="Tuning, all starts")
+        axes[0].legend(ncols=2)
+        for k, (name, unit) in enumerate(zip(names, units, strict=True)):
+            for start in range(rms.shape[1]):
+                axes[k + 1].plot(steps, gains[:, start, k], color=_STYLES[1][0], lw=1.0)
+            axes[k + 1].set_ylabel(f"{name}\n[{unit}]")
+            if np.nanmax(gains[..., k]) > 10 * np.nanmin(gains[..., k]):
+                axes[k + 1].set_yscale("log")
+        axes[-1].set_xlabel("step")
+    return figure
+
+
+def tradeoff(sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | None = None) -> Figure:
+    """Accuracy against torque, a point a trial.
+
+    sets: label -> (window errors (trials,) [-], peak torques (trials,) [N m]).
+    """
+    figure, axes = _figure("Accuracy against torque, fresh trials", "peak torque [N m]")
+    markers = ("o", "^", "s", "D")
+    arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
+    for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), _STYLES, markers, strict=False):
+        rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
+        axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
+        text = f"{label}: RMS {rms:.2g}, mean peak {mean:.2g} N m"
+        axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
+    if limit is not None:
+        axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} N m")
+    axes.set_xlabel("window error [-]")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14))
+    return figure
+
+
+def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
+    with matplotlib.rc_context(_RC):
+        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+        axes = figure.subplots()
+        axes.set(xlabel=_TIME, ylabel=ylabel)
+        axes.set_title(title, loc="left")
+    return figure, axes
+
+
+def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
+    values = np.asarray(values)
+    for k, (colour, style) in zip(range(values.shape[1]), _STYLES, strict=False):
+        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=f"${symbol}_{k + 1}$", **kwargs)
+
+
+def _mark(axes: Axes, parts: Parts) -> None:
+    """A line at the prescribed time."""
+    t_f = float(parts.controller.t_f)
+    axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
+    axes.annotate(
+        f"$t_f$ = {t_f:g} s", (t_f, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+        textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
+    )  # fmt: skip
+    axes.margins(x=0.01)

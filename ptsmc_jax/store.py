@@ -1,0 +1,112 @@
+"""Result folders: what is refused, what lies in each, written so that a folder is whole or not there."""
+
+import csv
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import re
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
+
+
+class RefusedError(ValueError):
+    """A folder that must not be written to. Its text is one sentence."""
+
+
+def versions(command: str, seed: int, **others: Any) -> dict[str, Any]:
+    """What made a result: command and seed, versions, machine."""
+    return {
+        "command": command,
+        "seed": seed,
+        **others,
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+    }
+
+
+def previous(folder: Path, command: str, scenario: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
+    """The summary of the same scenario, seed and command in this folder; None if there is none."""
+    try:
+        made = json.loads((folder / "versions.json").read_text())
+        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(scenario))
+        if same and made.get("command") == command and made.get("seed") == seed:
+            return json.loads((folder / "summary.json").read_text())
+    except (OSError, ValueError):
+        pass
+    return None
+
+
+def check(folder: Path, force: bool) -> None:
+    """Raise RefusedError where this folder must not be written to."""
+    if folder.exists() and not folder.is_dir():
+        raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
+    if folder.is_dir() and any(folder.iterdir()) and not force:
+        raise RefusedError(
+            f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
+        )
+
+
+def write(folder: Path, fill: Callable[[Path], None]) -> None:
+    """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        fill(making)
+        making.chmod(0o755)
+        if not folder.exists():
+            making.rename(folder)
+            return
+        for path in sorted(making.rglob("*")):
+            if path.is_file():
+                target = folder / path.relative_to(making)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(path, target)
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
+
+
+def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
+    """A TOML file, arrays of numbers on one line."""
+    text = re.sub(r"\[\n((?:    [^\[\]\n]+,\n)+)\]", _one_line, tomli_w.dumps(dict(tables)))
+    path.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """A JSON file; numbers that are not finite become null."""
+    path.write_text(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A CSV file; numbers with as many digits as it takes to read them back exactly."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
+
+
+def _one_line(array: re.Match[str]) -> str:
+    return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].splitlines()) + "]"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,246 @@
+"""The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+import ptsmc_jax
+
+if TYPE_CHECKING:
+    from ptsmc_jax.schema import Scenario
+    from tuning.report import Tuning
+
+app = App(
+    name="ptsmc",
+    help="Prescribed-time sliding mode control for spacecraft attitude: simulate it, tune its gains.",
+    version=ptsmc_jax.__version__,
+    help_format="plaintext",
+)
+
+ScenarioFile = Annotated[
+    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
+]
+Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME.")]
+Seed = Annotated[int, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
+Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
+Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
+Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
+
+
+class UsageError(ValueError):
+    """An option that cannot be followed. Its text is one sentence."""
+
+
+@app.command
+def simulate(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = 0,
+    trial: Annotated[
+        int | None, Parameter(help="Draw this trial's dispersions; without it the run is nominal.")
+    ] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly one run and write its history, metrics and figures.
+
+    Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
+    """
+    _whole("--seed", seed)
+    if trial is not None:
+        _whole("--trial", trial)
+    loaded, folder = _prepare(scenario, "simulate", out)
+    from ptsmc_jax import store
+
+    store.check(folder, force)
+    from ptsmc_jax.scenario import study
+    from tuning import single
+
+    run = single.fly(study(loaded), seed, trial)
+    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures))
+    if not quiet:
+        _show_run(run, folder)
+    return 0 if run.met else 1
+
+
+@app.command
+def tune(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = 0,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find the gains with the smallest error after t_f that keep every limit, and prove them on fresh trials.
+
+    Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input.
+    """
+    _whole("--seed", seed)
+    loaded, folder = _prepare(scenario, "tune", out)
+    from ptsmc_jax import schema, store
+    from ptsmc_jax.scenario import replace, study
+
+    if loaded.tune is None:
+        loaded = replace(loaded, tune={})
+    done = None if force else store.previous(folder, "tune", schema.dump(loaded), seed)
+    if done is not None:
+        if not quiet:
+            _show_tuning(done, folder, "already done")
+        return 0 if done["status"] == "met" else 1
+    store.check(folder, force)
+    study(loaded)  # what it refuses, it refuses before the search
+    from tuning import report
+
+    with _Progress(quiet) as told:
+        result: Tuning = report.tune(loaded, seed, told)
+    store.write(folder, lambda making: report.write(making, loaded, result, seed, figures))
+    if not quiet:
+        _show_tuning(report.summary(result, seed), folder, "done")
+    return 0 if result.met else 1
+
+
+def main() -> None:
+    """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
+    status: object = None
+    try:
+        status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        _fail(" ".join(str(error).split()))
+    except ValueError as error:
+        if not _expected(error):
+            raise
+        _fail(str(error))
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; nothing was written", file=sys.stderr)
+        sys.exit(130)
+    except OSError as error:
+        _fail(f"{error.strerror or error}: {error.filename}")
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _expected(error: ValueError) -> bool:
+    from ptsmc_jax.schema import ScenarioError
+    from ptsmc_jax.store import RefusedError
+
+    return isinstance(error, ScenarioError | RefusedError | UsageError)
+
+
+def _fail(sentence: str) -> None:
+    print(f"ptsmc: {sentence}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _whole(option: str, value: int) -> None:
+    if not 0 <= value < 2**32:
+        raise UsageError(f"{option} is {value}, but must be a whole number from 0 to {2**32 - 1}")
+
+
+def _prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Scenario, Path]":
+    """The checked scenario and the folder for the results; the backend is configured on the way."""
+    from ptsmc_jax import schema
+
+    raw = schema.load(scenario) if scenario is not None else {}
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from ptsmc_jax.scenario import from_tables
+
+    name = scenario.stem if scenario is not None else "default"
+    return from_tables(raw), out if out is not None else Path("out") / f"{command}-{name}"
+
+
+class _Progress:
+    """A progress bar on the error stream with the best error so far; silent where told to be."""
+
+    def __init__(self, quiet: bool):
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(30),
+            MofNCompleteColumn(),
+            TextColumn("steps"),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._task = self._bar.add_task("compiling, choosing starts", total=None)
+
+    def __enter__(self) -> Callable[[int, int, float, bool], None]:
+        self._bar.start()
+        return self._tell
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def _tell(self, done: int, total: int, rms: float, admissible: bool) -> None:
+        met = "limits met" if admissible else "limits not yet met"
+        self._bar.update(self._task, completed=done, total=total, description=f"RMS error {rms:.3e}, {met}")
+
+
+def _show_run(run: Any, folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ptsmc_jax.metrics import CATALOGUE
+
+    console = Console(highlight=False)
+    table = Table("metric", "value", "unit", "meaning", box=None, pad_edge=False)
+    for name, (unit, meaning) in CATALOGUE.items():
+        value = run.metrics[name]
+        table.add_row(name, "never" if value != value else f"{value:.5g}", unit, meaning)
+    console.print(f"status: {run.status}" + (f", {run.reason}, at {run.bad_time:.4g} s" if run.reason else ""))
+    console.print(table)
+    for verdict in run.verdicts:
+        console.print(str(verdict), soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)
+
+
+def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tuning.bounds import UNITS
+
+    console = Console(highlight=False)
+    groups = {"paper": summary["paper"], "before": summary.get("before"), "tuned": summary["fresh"]}
+    groups = {name: group for name, group in groups.items() if group is not None}
+    table = Table("", *groups, "unit", box=None, pad_edge=False)
+    for gain, unit in UNITS.items():
+        if any(group["gains"][gain] != groups["paper"]["gains"][gain] for group in groups.values()):
+            table.add_row(gain, *(f"{group['gains'][gain]:.6g}" for group in groups.values()), unit)
+    trials = summary["fresh"]["trials"]
+    rows = (
+        ("RMS window error", "window_error", "rms", "-"),
+        ("largest window error", "window_error", "max", "-"),
+        ("mean peak torque", "peak_torque", "mean", "N m"),
+        ("largest peak torque", "peak_torque", "max", "N m"),
+        ("mean effort", "effort", "mean", "N m s"),
+    )
+    for label, metric, statistic, unit in rows:
+        cells = (group[metric][statistic] if group[metric] else None for group in groups.values())
+        table.add_row(label, *("-" if cell is None else f"{cell:.4g}" for cell in cells), unit)
+    table.add_row("failed trials", *(str(trials - group["counts"]["ok"]) for group in groups.values()), "")
+    console.print(f"tuning {how}; judged on {trials} fresh trials, flight clock, exact sign:", soft_wrap=True)
+    console.print(table)
+    if summary["accuracy_gain_over_paper"] is not None:
+        console.print(f"accuracy: {summary['accuracy_gain_over_paper']:.1f} times the paper's gains'")
+    for gain, side in summary["at_bound"].items():
+        console.print(f"{gain} ended on its {side} bound", soft_wrap=True)
+    for verdict in summary["verdicts"]:
+        met = "met" if verdict["met"] else f"NOT met, {verdict['failures']} of {verdict['trials']} trials beyond it"
+        worst = "-" if verdict["worst"] is None else f"{verdict['worst']:.4g}"
+        console.print(
+            f"{verdict['metric']} at most {verdict['limit']:g} {verdict['unit']}: worst {worst}: {met}", soft_wrap=True
+        )
+    console.print(f"results in {folder}", soft_wrap=True)

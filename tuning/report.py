@@ -1,0 +1,208 @@
+"""What a tuning run hands its user: gains judged on fresh trials beside the paper's and the scenario's own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from ptsmc_jax import draws, montecarlo, plotting, schema, store
+from ptsmc_jax.metrics import Metrics
+from ptsmc_jax.montecarlo import Trials
+from ptsmc_jax.requirements import Verdict
+from ptsmc_jax.scenario import Reach, Study, reach_of, replace, study
+from ptsmc_jax.schema import Scenario
+from tuning import bounds as gain_bounds
+from tuning.bounds import Bounds
+from tuning.objective import Problem
+from tuning.optimise import Search, search
+
+FRESH = 1000  # trials on which gains are judged
+PAPER = {"eta": 3.0, "delta": 0.05, "observer_gain": 10.0, "k1": 1.0}
+DIGITS = 6  # of the gains handed over; what is judged is what is handed over
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """A finished tuning run."""
+
+    tuned: Scenario
+    gains: dict[str, float]
+    search: Search
+    at_bound: dict[str, str]
+    training: Trials  # tuned gains on the training trials as they were trained on
+    fresh: dict[str, Trials]  # by whose gains: "tuned", "paper" and, where they differ from it, "before"
+    fresh_seed: int
+    judged_gains: dict[str, dict[str, float]]  # the gains of each of them
+    verdicts: list[Verdict]  # of the tuned gains on the fresh trials
+
+    @property
+    def met(self) -> bool:
+        """Every requirement met on every fresh trial, and no fresh trial failed."""
+        return all(v.met for v in self.verdicts) and bool(np.all(self.fresh["tuned"].ok))
+
+
+def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool], None]) -> Tuning:
+    """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw."""
+    table = scenario.tune
+    assert table is not None
+    limits = Bounds(table.free, *(tuple(table.bounds[name][k] for name in table.free) for k in (0, 1)))
+    ready = study(scenario, reach=_reach(scenario, table))
+    own = gain_bounds.gains_of(ready.parts)
+    problem = Problem(
+        parts=ready.parts,
+        dispersion=ready.dispersion,
+        seed=jnp.uint32(seed),
+        trials=jnp.arange(_trials(ready, table.trials), dtype=jnp.uint32),
+        limits=jnp.asarray([r.limit for r in ready.requirements]),
+        averaged=_trials(ready, table.trials),
+        names=table.free,
+        metrics=tuple(r.metric for r in ready.requirements),
+    )
+    start = np.asarray([own[name] for name in table.free])
+    found = search(problem, limits, ready.requirements, start, table.starts, table.steps, seed, report)
+    gains = {name: _rounded(value) for name, value in zip(table.free, found.gains, strict=True)}
+    tuned = with_gains(scenario, gains)
+    training = montecarlo.run(
+        gain_bounds.with_gains(ready.parts, gains), ready.dispersion, seed, np.asarray(problem.trials)
+    )
+
+    fresh_seed = draws.derive(seed, "fresh trials")
+    period = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+    paper = {**PAPER, "delta": max(PAPER["delta"], period)}
+    candidates = {"tuned": tuned, "paper": with_gains(scenario, paper)}
+    if any(own[name] != paper.get(name, own[name]) for name in own):
+        candidates["before"] = scenario
+    fresh, judged_gains = {}, {}
+    for name, candidate in candidates.items():
+        judged = study(as_flown(candidate))
+        trials = np.arange(_trials(judged, FRESH))
+        fresh[name] = montecarlo.run(judged.parts, judged.dispersion, fresh_seed, trials)
+        judged_gains[name] = gain_bounds.gains_of(study(candidate).parts)
+    verdicts = [r.verdict(getattr(fresh["tuned"].metrics, r.metric), fresh["tuned"].ok) for r in ready.requirements]
+    at_bound = limits.at_bound(found.gains)
+    return Tuning(tuned, gains, found, at_bound, training, fresh, fresh_seed, judged_gains, verdicts)
+
+
+def as_flown(scenario: Scenario) -> Scenario:
+    """The scenario on the flight clock with the exact sign; a continuous loop, or a tuned sign width, as it is."""
+    if scenario.loop.mode != "sampled":
+        return scenario
+    flown = replace(scenario, loop__clock="flight")
+    if scenario.tune is not None and "sign_width" in scenario.tune.free:
+        return flown
+    return replace(flown, controller__sign_width=0.0)
+
+
+def with_gains(scenario: Scenario, gains: dict[str, float]) -> Scenario:
+    """The scenario with other gains."""
+    changes: dict[str, Any] = {f"controller__{k}": v for k, v in gains.items() if k != "observer_gain"}
+    if "observer_gain" in gains:
+        changes["observer__gain"] = [gains["observer_gain"]] * 3
+    return replace(scenario, **changes)
+
+
+def statistics(trials: Trials) -> dict[str, Any]:
+    """Counts by status and statistics of each metric over the trials that ended well."""
+    summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
+    for name in Metrics._fields:
+        values = getattr(trials.metrics, name)[trials.ok]
+        known = values[np.isfinite(values)]
+        if known.size == 0:
+            summary[name] = None
+            continue
+        summary[name] = {
+            "mean": known.mean(),
+            "rms": np.sqrt(np.mean(known**2)),
+            "median": np.median(known),
+            "q99": np.quantile(known, 0.99),
+            "max": known.max(),
+        }
+        if known.size < values.size:
+            summary[name]["without_value"] = int(values.size - known.size)
+    return summary
+
+
+def summary(tuning: Tuning, seed: int) -> dict[str, Any]:
+    """What `summary.json` says."""
+    groups = {name: {"gains": tuning.judged_gains[name], **statistics(trials)} for name, trials in tuning.fresh.items()}
+    tuned, paper = (groups[name]["window_error"] for name in ("tuned", "paper"))
+    return {
+        "status": "met" if tuning.met else "not met",
+        "gains": tuning.gains,
+        "at_bound": tuning.at_bound,
+        "accuracy_gain_over_paper": paper["rms"] / tuned["rms"] if tuned and paper else None,
+        "training": {"seed": seed, **statistics(tuning.training)},
+        "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
+        "paper": {"seed": tuning.fresh_seed, **groups["paper"]},
+        **({"before": {"seed": tuning.fresh_seed, **groups["before"]}} if "before" in groups else {}),
+        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
+        "search": {
+            "starts": int(tuning.search.history[0].rms.size),
+            "steps": len(tuning.search.history) - 1,
+            "rounds_with_harder_trials": tuning.search.rounds,
+            "dropped_starts": tuning.search.dropped,
+            "trials": tuning.search.trials.tolist(),
+        },
+    }
+
+
+def write(folder: Path, scenario: Scenario, tuning: Tuning, seed: int, figures: bool) -> None:
+    """Fill a result folder."""
+    assert scenario.tune is not None
+    names = scenario.tune.free
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
+    store.write_json(folder / "versions.json", store.versions("tune", seed))
+    store.write_json(folder / "summary.json", summary(tuning, seed))
+    metrics = [f"{m}_over_limit" for m in scenario.requirements]
+    rows = [
+        [step, start, row.rms[start], *row.gains[start], *row.worst[start]]
+        for step, row in enumerate(tuning.search.history)
+        for start in range(row.rms.size)
+    ]
+    store.write_csv(folder / "history.csv", ["step", "start", "rms_window_error", *names, *metrics], rows)
+    if figures:
+        plotting.save(_figures(scenario, tuning), folder / "figures")
+
+
+def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+    assert scenario.tune is not None
+    names, first = scenario.tune.free, tuning.search.history[0].rms.size
+    history = [step for step in tuning.search.history if step.rms.size == first]
+    limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
+    return {
+        "history": plotting.tuning_history(
+            names,
+            [gain_bounds.UNITS[name] for name in names],
+            np.stack([step.gains for step in history]),
+            np.stack([step.rms for step in history]),
+            np.stack([np.all(step.worst <= 1.0, axis=1) for step in history]),
+        ),
+        "tradeoff": plotting.tradeoff(
+            {
+                name: (trials.metrics.window_error[trials.ok], trials.metrics.peak_torque[trials.ok])
+                for name, trials in tuning.fresh.items()
+            },
+            limit,
+        ),
+    }
+
+
+def _reach(scenario: Scenario, table: schema.Tune) -> Reach:
+    own = reach_of(scenario)
+    delta = table.bounds.get("delta", (own.delta, own.delta)) if "delta" in table.free else (own.delta, own.delta)
+    gain = table.bounds["observer_gain"][0] if "observer_gain" in table.free else own.gain
+    return Reach(own.t_f, max(delta[1], own.delta), min(delta[0], own.smallest_delta), min(gain, own.gain))
+
+
+def _trials(ready: Study, wanted: int) -> int:
+    """How many trials differ at all: one where nothing is drawn."""
+    return wanted if ready.dispersion.attitude is not None or ready.parts.sensors is not None else 1
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
