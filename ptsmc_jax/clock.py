@@ -151,4 +151,5 @@ def graded(
     hold_step = min(0.1 / max(1.0, k1 / 2.0), rapid, 1.5 / max(layer, 1e-12))
     after = math.ceil((t_end - t_f + delta) / hold_step)
     times = np.asarray(saves, dtype=float).reshape(-1)
-    return Graded(*(jnp.asarray(float(v)) for v in (t_end, window, max_step)), jnp.asarray(times), before, after)
+    end, width, largest = (jnp.asarray(float(v)) for v in (t_end, window, max_step))
+    return Graded(end, width, largest, jnp.asarray(times), before, after)

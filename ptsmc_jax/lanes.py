@@ -148,8 +148,9 @@ def _apply(eqn: Any, values: list, trials: int) -> Sequence:
     name, params = eqn.primitive.name, eqn.params
     if name in _CALLS:
         inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
-        consts = inner.consts if isinstance(inner, core.ClosedJaxpr) else ()
-        return _evaluate(getattr(inner, "jaxpr", inner), consts, values, trials)
+        if isinstance(inner, core.ClosedJaxpr):
+            return _evaluate(inner.jaxpr, inner.consts, values, trials)
+        return _evaluate(inner, (), values, trials)
     if name == "scan":
         return _scan(eqn, values, trials)
     sizes = [np.prod(v.aval.shape, dtype=int) for v in (*eqn.invars, *eqn.outvars)]
