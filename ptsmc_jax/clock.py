@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.numerics import Leaf
+
 Scalar = Float[Array, ""]
 
 
@@ -44,8 +46,8 @@ class Anchored:
     is a partial one; its noise is blended with the next sample's so that nothing jumps where it vanishes.
     """
 
-    period: Array  # h [s]
-    t_end: Array  # [s]
+    period: Leaf  # h [s]
+    t_end: Leaf  # [s]
     before: int = field(metadata={"static": True})  # samples before the hand-over, at least t_s / period
     after: int = field(metadata={"static": True})  # samples from the hand-over on
 
@@ -64,8 +66,8 @@ class Anchored:
 class Flight:
     """Control clock as flown: samples at k period from t = 0, the hand-over at the first one not before t_s."""
 
-    period: Array  # h [s]
-    t_end: Array  # [s]
+    period: Leaf  # h [s]
+    t_end: Leaf  # [s]
     count: int = field(metadata={"static": True})  # samples, at least t_end / period
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -85,10 +87,10 @@ class Graded:
     Before the hand-over nodes are uniform in a ln(tau) + tau / max_step, tau = t_f - t, and uniform after it.
     """
 
-    t_end: Array  # [s]
-    window: Array  # [s]
-    max_step: Array  # largest step [s]
-    saves: Array  # (m,) further nodes [s]
+    t_end: Leaf  # [s]
+    window: Leaf  # [s]
+    max_step: Leaf  # largest step [s]
+    saves: Leaf  # (m,) further nodes [s]
     before: int = field(metadata={"static": True})  # steps before the hand-over, more than t_s / max_step
     after: int = field(metadata={"static": True})  # steps after it
 

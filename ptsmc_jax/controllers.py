@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState, Spacecraft
 from ptsmc_jax.signals import Target
 
@@ -37,11 +38,11 @@ class PrescribedTime:
     """
 
     model: Spacecraft  # the nominal plant
-    t_f: Array  # prescribed time [s]
-    eta: Array  # eta > 2 [-]
-    delta: Array  # hand-over this long before t_f, Remark 1 [s]
-    k1: Array  # K1 of (60) [1/s]
-    sign_width: Array  # boundary layer of the smooth sign, in the units of s [-]
+    t_f: Leaf  # prescribed time [s]
+    eta: Leaf  # eta > 2 [-]
+    delta: Leaf  # hand-over this long before t_f, Remark 1 [s]
+    k1: Leaf  # K1 of (60) [1/s]
+    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s [-]
 
     @property
     def hand_over(self) -> Scalar:

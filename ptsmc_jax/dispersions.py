@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude, draws
+from ptsmc_jax.draws import Whole
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.rollout import Parts
 
@@ -30,8 +32,8 @@ class UniformAttitude:
 class AxisAngle:
     """Initial attitude turned away from the reference at t = 0: axis uniform on the sphere, angle uniform."""
 
-    smallest: Array  # [rad]
-    largest: Array  # [rad]
+    smallest: Leaf  # [rad]
+    largest: Leaf  # [rad]
 
     def draw(self, key: draws.Key, nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
         """Initial attitude, (4,); nominal: that of [initial]; reference: the reference at t = 0."""
@@ -49,7 +51,7 @@ class AxisAngle:
 class NormalAttitude:
     """Initial attitude turned from the nominal one by a normal rotation vector."""
 
-    std: Array  # per axis [rad]
+    std: Leaf  # per axis [rad]
 
     def draw(self, key: draws.Key, nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
         """Initial attitude, (4,); nominal: that of [initial]; reference: the reference at t = 0."""
@@ -64,7 +66,7 @@ class Dispersion:
 
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
 
-    def apply(self, parts: Parts, seed: int | Array, trial: int | Array) -> Parts:
+    def apply(self, parts: Parts, seed: Whole, trial: Whole) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
         if self.attitude is None:
             return parts

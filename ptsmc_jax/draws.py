@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, UInt32
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
+Whole = int | np.integer | Array  # a whole number, negative ones wrap to 32 bits
 
 
 class Key(NamedTuple):
@@ -25,7 +26,7 @@ class Key(NamedTuple):
     b: Array
 
 
-def _word(value: int | Array | np.ndarray) -> Array:
+def _word(value: Whole) -> Array:
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF))
     return jnp.asarray(value).astype(jnp.uint32)
@@ -44,7 +45,7 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
     return x, y
 
 
-def stream(seed: int | Array, trial: int | Array, name: str) -> Key:
+def stream(seed: Whole, trial: Whole, name: str) -> Key:
     """Key of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
     label = jnp.uint32(zlib.crc32(name.encode()))
     return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
@@ -55,7 +56,7 @@ def derive(seed: int, name: str) -> int:
     return int(stream(seed, 0, name).a)
 
 
-def _pairs(key: Key, sample: int | Array, count: int) -> list[tuple[Array, Array]]:
+def _pairs(key: Key, sample: Whole, count: int) -> list[tuple[Array, Array]]:
     return [threefry(key, (_word(sample), jnp.uint32(block))) for block in range((count + 1) // 2)]
 
 
@@ -64,13 +65,13 @@ def _unit(word: Array) -> Array:
     return (word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32)
 
 
-def uniforms(key: Key, count: int, sample: int | Array = 0) -> Float[Array, " {count}"]:
+def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
     """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits)."""
     words = [word for pair in _pairs(key, sample, count) for word in pair]
     return jnp.stack([_unit(word) for word in words[:count]])
 
 
-def normals(key: Key, count: int, sample: int | Array = 0) -> Float[Array, " {count}"]:
+def normals(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
     """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
     values = []
     for a, b in _pairs(key, sample, count):

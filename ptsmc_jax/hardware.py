@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ptsmc_jax import attitude, draws
+from ptsmc_jax.draws import Whole
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState
 
 ATTITUDE_NOISE, RATE_NOISE = "attitude_noise", "rate_noise"
@@ -17,10 +19,10 @@ ATTITUDE_NOISE, RATE_NOISE = "attitude_noise", "rate_noise"
 class Sensors:
     """Star tracker and gyro sampled once a period, white noise, independent per axis and sample."""
 
-    attitude_noise: Array  # 1 sigma of the small rotation about each body axis [rad]
-    rate_noise: Array  # 1 sigma [rad/s]
+    attitude_noise: Leaf  # 1 sigma of the small rotation about each body axis [rad]
+    rate_noise: Leaf  # 1 sigma [rad/s]
 
-    def keys(self, seed: int | Array, trial: int | Array) -> tuple[draws.Key, draws.Key]:
+    def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key]:
         """Streams of a trial's noise, one for each sensor."""
         return draws.stream(seed, trial, ATTITUDE_NOISE), draws.stream(seed, trial, RATE_NOISE)
 

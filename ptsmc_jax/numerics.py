@@ -1,13 +1,21 @@
 """Numerical pieces that the equations are written with: smooth sign, guarded norm, phi functions, integrators."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from math import factorial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
+
+# Type of a part's numbers: an array, alone or with batch axes; at run time anything, since JAX rebuilds pytrees
+# around placeholders and a check of the type would refuse them.
+if TYPE_CHECKING:
+    Leaf = Array
+else:
+    Leaf = Any
 
 
 def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array, "..."]:
@@ -53,18 +61,36 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> An
     return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
 
 
+_TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
+_DOUBLINGS = 40  # norms up to 2^39
+
+
 def phi_functions(x: Float[Array, "n n"], order: int) -> list[Float[Array, "n n"]]:
     """phi_0(x) = e^x and phi_1 .. phi_order, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x, of a square matrix [-].
 
-    They are the top blocks of the exponential of an augmented matrix (Sidje, ACM TOMS 24(1), 1998, section 2),
-    so nothing cancels for small x and the eigenvalues of x may repeat.
+    Scaling and doubling, phi_k(2x) = 2^-k (phi_0 phi_k + sum_(j=1..k) phi_j / (k-j)!) (Skaflestad and Wright, Applied
+    Numerical Mathematics 59, 2009): nothing cancels for small x, eigenvalues may repeat, and no LAPACK is called, whose
+    batched solves were seen to lock up when two of them shared a small thread pool.
     """
-    n = x.shape[-1]
-    augmented = jnp.zeros((n * (order + 1), n * (order + 1)), x.dtype)
-    augmented = augmented.at[:n, :n].set(x)
-    augmented = augmented + jnp.eye(n * (order + 1), k=n, dtype=x.dtype)
-    top = jax.scipy.linalg.expm(augmented, max_squarings=64)[:n]
-    return [top[:, k * n : (k + 1) * n] for k in range(order + 1)]
+    one = jnp.eye(x.shape[-1], dtype=x.dtype)
+    size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(x), axis=1)))
+    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
+    small = x * 2.0**-doublings
+    top = one / factorial(order + _TERMS)
+    for k in range(_TERMS - 1, -1, -1):
+        top = one / factorial(order + k) + small @ top
+    phi = [top]
+    for k in range(order - 1, -1, -1):
+        phi.insert(0, one / factorial(k) + small @ phi[0])
+
+    def double(step: Array, phi: list[Array]) -> list[Array]:
+        larger = [
+            (phi[0] @ phi[k] + sum((phi[j] / factorial(k - j) for j in range(1, k + 1)), 0.0 * one)) / 2**k
+            for k in range(order + 1)
+        ]
+        return select(step < doublings, larger, phi)
+
+    return jax.lax.fori_loop(0, _DOUBLINGS, double, phi)
 
 
 class Decay(NamedTuple):

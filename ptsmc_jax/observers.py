@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import numerics
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import Spacecraft
 
 Scalar = Float[Array, ""]
@@ -41,9 +42,9 @@ class NonlinearObserver:
     """
 
     model: Spacecraft  # the nominal plant
-    gain: Array  # (3,) diagonal of l [N m s, so that l J^-1 is in 1/s]
-    disturbance_rate_bound: Array  # c of Assumption 1, bound on each component of d' [N m/s]
-    initial_error: Array  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
+    gain: Leaf  # (3,) diagonal of l [N m s, so that l J^-1 is in 1/s]
+    disturbance_rate_bound: Leaf  # c of Assumption 1, bound on each component of d' [N m/s]
+    initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
 
     def decay_matrix(self) -> Matrix:
         """A = l J^-1 [1/s]."""
@@ -56,7 +57,7 @@ class NonlinearObserver:
         equal gains that is the paper's smallest diagonal element of l J^-1.
         """
         root = jnp.sqrt(self.gain)
-        slowest = jnp.linalg.eigvalsh(root[:, None] * self.model.inertia_inverse * root)[0]
+        slowest = jnp.linalg.eigvalsh(root[:, None] * self.model.inertia_inverse * root[None, :])[0]
         factor = jnp.sqrt(jnp.max(self.gain) / jnp.min(self.gain))
         floor = factor * jnp.sqrt(3.0) * self.disturbance_rate_bound / slowest
         return ErrorBound(slowest, factor * self.initial_error, floor)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude
+from ptsmc_jax.numerics import Leaf
 
 
 class AttitudeState(NamedTuple):
@@ -23,8 +24,8 @@ class AttitudeState(NamedTuple):
 class Spacecraft:
     """Rigid spacecraft, J w' = -w x J w + u + d (2); build it with `spacecraft`, which checks the inertia."""
 
-    inertia: Array  # (3, 3) J [kg m^2]
-    inertia_inverse: Array  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
+    inertia: Leaf  # (3, 3) J [kg m^2]
+    inertia_inverse: Leaf  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
 
     def gyroscopic(self, w: Float[Array, "3"]) -> Float[Array, "3"]:
         """W x J w [N m]."""

@@ -14,7 +14,9 @@ from jaxtyping import Array, Float
 from ptsmc_jax import metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.controllers import PrescribedTime
+from ptsmc_jax.draws import Whole
 from ptsmc_jax.hardware import Sensors
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import NonlinearObserver
 from ptsmc_jax.plants import AttitudeState, Spacecraft
 
@@ -44,9 +46,9 @@ class Parts:
     sensors: Sensors | None  # None: the law sees the true state
     clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
     initial: AttitudeState
-    t_end: Array  # [s]
-    window: Array  # after t_f, for window_error [s]
-    settling_angle: Array  # [rad]
+    t_end: Leaf  # [s]
+    window: Leaf  # after t_f, for window_error [s]
+    settling_angle: Leaf  # [rad]
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
 
 
@@ -86,7 +88,7 @@ class _State(NamedTuple):
     bad_time: Array
 
 
-def simulate(parts: Parts, seed: int | Array = 0, trial: int | Array = 0, record: bool = False) -> Result:
+def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False) -> Result:
     """One closed-loop run. seed, trial: whole numbers below 2^32 that name its noise; record: return the history too.
 
     A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude
+from ptsmc_jax.numerics import Leaf
 
 Time = Float[Array, ""]
 
@@ -30,7 +31,7 @@ class Target(NamedTuple):
 class Fixed:
     """A constant reference attitude."""
 
-    q: Array  # (4,) unit quaternion
+    q: Leaf  # (4,) unit quaternion
 
     def __call__(self, t: Time) -> Target:
         """Target at t [s]."""
@@ -42,8 +43,8 @@ class Fixed:
 class Spin:
     """A reference that turns at a constant rate: q_f(t) = q(0) exp(w t)."""
 
-    q: Array  # (4,) attitude at t = 0
-    rate: Array  # (3,) [rad/s], in the reference's axes
+    q: Leaf  # (4,) attitude at t = 0
+    rate: Leaf  # (3,) [rad/s], in the reference's axes
 
     def __call__(self, t: Time) -> Target:
         """Target at t [s]."""
@@ -56,7 +57,7 @@ class Spin:
 class Constant:
     """A constant disturbance; zero serves as none."""
 
-    value: Array  # (3,) [N m]
+    value: Leaf  # (3,) [N m]
 
     def __call__(self, t: Time) -> Float[Array, "3"]:
         """Torque at t [s], (3,) [N m]."""
@@ -68,10 +69,10 @@ class Constant:
 class Sinusoid:
     """bias + amplitude sin(frequency t + phase), per axis."""
 
-    amplitude: Array  # (3,) [N m]
-    frequency: Array  # (3,) [rad/s]
-    phase: Array  # (3,) [rad]
-    bias: Array  # (3,) [N m]
+    amplitude: Leaf  # (3,) [N m]
+    frequency: Leaf  # (3,) [rad/s]
+    phase: Leaf  # (3,) [rad]
+    bias: Leaf  # (3,) [N m]
 
     def __call__(self, t: Time) -> Float[Array, "3"]:
         """Torque at t [s], (3,) [N m]."""

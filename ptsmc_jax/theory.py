@@ -12,6 +12,7 @@ from ptsmc_jax import numerics
 from ptsmc_jax.rollout import Parts
 
 Scalar = Float[Array, ""]
+Vector = Float[Array, " n"]
 
 
 class ErrorMotion(NamedTuple):
@@ -22,7 +23,7 @@ class ErrorMotion(NamedTuple):
     s: Array  # [-]
 
 
-def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Array, error_rate: Array) -> ErrorMotion:
+def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: Vector) -> ErrorMotion:
     """Closed form of the second-order law before the hand-over for a perfect disturbance estimate and K2 = 0.
 
     x(t) = r^eta (x(0) + s(0) L), s(t) = s(0) r^eta, with r = (t_f - t)/t_f, L = ln(1/r), s(0) = t_f x'(0) + eta x(0):
@@ -88,7 +89,9 @@ def predicted_path(parts: Parts, points: int = 2000) -> tuple[Array, Array]:
     error, error_rate = controller.errors(x0, target)
     tau = controller.t_f * (controller.delta / controller.t_f) ** jnp.linspace(0.0, 1.0, points)
     t = controller.t_f - tau
-    motion = exact_error(t[:, None], controller.t_f, controller.eta, error, error_rate)
-    reference = jax.vmap(lambda time: parts.reference(time).q)(t)
-    path = reference[:, :3] + motion.error
-    return t, 1.0 - jnp.sum(path**2, axis=1)
+
+    def square(time: Scalar) -> Scalar:
+        motion = exact_error(time, controller.t_f, controller.eta, error, error_rate)
+        return 1.0 - jnp.sum((parts.reference(time).q[:3] + motion.error) ** 2)
+
+    return t, jax.vmap(square)(t)

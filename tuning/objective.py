@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import lanes, montecarlo, rollout
 from ptsmc_jax.dispersions import Dispersion
+from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.rollout import Parts
 from tuning.bounds import with_gains
 
@@ -21,9 +22,9 @@ class Problem:
 
     parts: Parts
     dispersion: Dispersion
-    seed: Array  # uint32
-    trials: Array  # (trials,) uint32
-    limits: Array  # (requirements,) in the metrics' units
+    seed: Leaf  # uint32
+    trials: Leaf  # (trials,) uint32
+    limits: Leaf  # (requirements,) in the metrics' units
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements

@@ -32,7 +32,7 @@ LARGEST_SLOPE = 1.0
 CANDIDATES = 32  # points flown for each start that is chosen
 CHARGE, APART = 3.0, 0.15
 MARGIN = 0.005  # limits are approached to within this share, so that the exact forms stay below them
-SCREENED = 4096  # trials looked through for those that a limit depends on
+SCREENED = 16384  # trials looked through for those that a limit depends on
 HARDEST = 8  # of them that join the constraints
 ROUNDS = 2  # searches again with hardest trials added, at most
 

@@ -1,0 +1,248 @@
+import ast
+import math
+import zlib
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ROOT
+from jax.extend.random import threefry_2x32
+from scipy import stats
+
+from ptsmc_jax import draws, lanes
+
+# False alarms: with other seeds each check would fail once in 1e6 or less; the seeds are fixed, so it either does or not.
+ALARM = 1e-6
+SIGMAS = -stats.norm.ppf(ALARM / 2)
+
+
+# the rule, in whole numbers
+
+
+def threefry(key, counter):
+    mask, turns = 0xFFFFFFFF, (13, 15, 26, 6, 17, 29, 16, 24)
+    parity = 0x1BD11BDA ^ key[0] ^ key[1]
+    schedule = [key[0], key[1], parity]
+    x, y = (counter[0] + key[0]) & mask, (counter[1] + key[1]) & mask
+    for k in range(20):
+        x = (x + y) & mask
+        y = (y << turns[k % 8] & mask | y >> 32 - turns[k % 8]) ^ x
+        if k % 4 == 3:
+            n = k // 4 + 1
+            x, y = (x + schedule[n % 3]) & mask, (y + schedule[(n + 1) % 3] + n) & mask
+    return x, y
+
+
+def expected(seed, trial, name, sample, count):
+    key = threefry((seed, 0), (trial, zlib.crc32(name.encode())))
+    pairs = [threefry(key, (sample % 2**32, block)) for block in range(-(-count // 2))]
+    uniforms, normals = [], []
+    for u, v in ([(word + 0.5) / 2**32 for word in pair] for pair in pairs):
+        r = math.sqrt(-2 * math.log(u))
+        uniforms += [u, v]
+        normals += [r * math.cos(2 * math.pi * v), r * math.sin(2 * math.pi * v)]
+    return uniforms[:count], normals[:count]
+
+
+def words(*values):
+    return [jnp.uint32(value) for value in values]
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "output"),
+    [  # kat_vectors of Random123, threefry2x32 20
+        ((0, 0), (0, 0), (0x6B200159, 0x99BA4EFE)),
+        ((0xFFFFFFFF, 0xFFFFFFFF), (0xFFFFFFFF, 0xFFFFFFFF), (0x1CB996FC, 0xBB002BE7)),
+        ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
+    ],
+)
+def test_threefry_gives_the_published_answers(key, counter, output):
+    assert threefry(key, counter) == output  # the oracle below is right too
+    assert tuple(int(w) for w in draws.threefry(draws.Key(*words(*key)), tuple(words(*counter)))) == output
+
+
+def test_threefry_is_that_of_jax():
+    rng = np.random.default_rng(3)
+    counters = jnp.asarray(rng.integers(0, 2**32, size=(2, 500), dtype=np.uint32))
+    for key in rng.integers(0, 2**32, size=(4, 2), dtype=np.uint32):
+        got = draws.threefry(draws.Key(*words(*key)), (counters[0], counters[1]))
+        np.testing.assert_array_equal(jnp.concatenate(got), threefry_2x32(jnp.asarray(key), counters.reshape(-1)))
+
+
+CASES = [
+    (0, 0, "attitude_noise", 0, 1),
+    (1, 2, "rate_noise", 7, 3),
+    (2**32 - 1, 2**32 - 1, "", 2**32 - 1, 4),
+    (20240229, 77, "initial attitude: \u03b7", -40, 7),
+]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_numbers_follow_the_documented_rule(case):
+    seed, trial, name, sample, count = case
+    key = draws.stream(seed, trial, name)
+    assert (int(key.a), int(key.b)) == threefry((seed, 0), (trial, zlib.crc32(name.encode())))
+    uniforms, normals = expected(*case)
+    np.testing.assert_array_equal(draws.uniforms(key, count, sample), uniforms)  # exact in 64 bits
+    # log, cos and sin within an ulp or two of numbers below 7; 2 pi v is rounded at 6
+    np.testing.assert_allclose(draws.normals(key, count, sample), normals, rtol=0, atol=1e-14)
+
+
+def test_a_derived_seed_is_the_first_word_of_a_stream():
+    for seed, name in ((0, "fresh trials"), (2**32 - 1, "x")):
+        got = draws.derive(seed, name)
+        assert got == threefry((seed, 0), (0, zlib.crc32(name.encode())))[0]
+        assert type(got) is int
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.int32, jnp.int32, jnp.int64])
+def test_negative_samples_wrap(kind):
+    key = draws.stream(5, 6, "name")
+    for sample in (-1, -2, -(2**31)):
+        np.testing.assert_array_equal(draws.normals(key, 3, kind(sample)), draws.normals(key, 3, sample % 2**32))
+
+
+def test_seed_and_trial_may_be_of_any_integer_type():
+    plain = draws.stream(2**32 - 5, 2**31 + 1, "name")
+    for kind in (np.uint32, np.int64, jnp.uint32, jnp.int64):
+        assert draws.stream(kind(2**32 - 5), kind(2**31 + 1), "name") == plain
+
+
+def test_one_number_whatever_the_batch():
+    def one(trial, sample):
+        key = draws.stream(11, trial, "rate_noise")
+        return draws.uniforms(key, 3, sample), draws.normals(key, 5, sample)
+
+    trials, samples = np.meshgrid(np.arange(4, dtype=np.uint32), np.arange(-3, 5, dtype=np.int32))
+    trials, samples = jnp.asarray(trials.ravel()), jnp.asarray(samples.ravel())
+    alone = [one(int(t), int(s)) for t, s in zip(trials, samples, strict=True)]
+    alone = [np.stack(rows) for rows in zip(*alone, strict=True)]
+    for form in (jax.vmap(one), lanes.vmap(one), jax.jit(jax.vmap(one)), jax.jit(lanes.vmap(one))):
+        uniforms, normals = form(trials, samples)
+        np.testing.assert_array_equal(uniforms, alone[0])
+        np.testing.assert_allclose(normals, alone[1], rtol=0, atol=1e-14)  # as above
+
+
+def test_uniforms_stay_inside_the_interval_and_normals_finite_in_32_bits():
+    # a sample whose first word rounds up to 2^32 in float32, found by search
+    sample = 26567072
+    assert threefry(threefry((0, 0), (0, zlib.crc32(b"any"))), (sample, 0))[0] == 0xFFFFFF81
+    with jax.enable_x64(False):
+        key = draws.stream(0, 0, "any")
+        u, n = draws.uniforms(key, 2, sample), draws.normals(key, 2, sample)
+        assert u.dtype == n.dtype == jnp.float32
+        assert np.all(np.isfinite(n))
+        assert np.all((np.asarray(u) > 0) & (np.asarray(u) < 1))
+
+
+def stream_names():
+    """Names given to `stream` and `derive` anywhere in the source, constants of the same file looked up."""
+    names = []
+    for path in [*(ROOT / "ptsmc_jax").glob("*.py"), *(ROOT / "tuning").glob("*.py")]:
+        tree, constants = ast.parse(path.read_text()), {}
+        for node in tree.body:
+            if isinstance(node, ast.Assign):
+                for target in node.targets:
+                    pairs = [(target, node.value)]
+                    if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                        pairs = list(zip(target.elts, node.value.elts, strict=True))
+                    constants |= {t.id: v.value for t, v in pairs
+                                  if isinstance(t, ast.Name) and isinstance(v, ast.Constant)}  # fmt: skip
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("draws.stream", "draws.derive"):
+                name = node.args[-1]
+                names.append(name.value if isinstance(name, ast.Constant) else constants[ast.unparse(name)])
+    return names
+
+
+def test_names_of_streams_do_not_collide():
+    names = stream_names()
+    assert {"attitude_noise", "rate_noise", "initial_attitude"} <= set(names)
+    assert len(names) == len(set(names))  # two uses of one name would share their numbers
+    assert len({zlib.crc32(name.encode()) for name in names}) == len(names)
+
+
+# statistics
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    """(sample, stream) normal numbers: 16 trials, two names, four numbers a sample."""
+
+    @jax.jit
+    def rows(samples):
+        def one(sample, trial, name):
+            return draws.normals(draws.stream(9, trial, name), 4, sample)
+
+        trials = jnp.arange(16, dtype=jnp.uint32)
+        columns = [jax.vmap(partial(one, name=name), (None, 0)) for name in ("attitude_noise", "rate_noise")]
+        return jax.vmap(lambda s: jnp.stack([column(s, trials) for column in columns]).reshape(-1))(samples)
+
+    return np.asarray(rows(jnp.arange(-8192, 8192)))
+
+
+def test_moments_are_those_of_the_normal_distribution(sheet):
+    n = sheet.size
+    for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10395 - 225)):
+        assert abs(np.mean(sheet**power) - moment) <= SIGMAS * math.sqrt(variance / n)
+
+
+def test_the_distribution_is_normal(sheet):
+    assert stats.kstest(sheet.ravel(), "norm").pvalue > ALARM
+
+
+def test_tails_are_right_up_to_five_sigma():
+    key, batches, batch = draws.stream(4, 5, "tails"), 16, 2**19
+    limits = jnp.arange(1.0, 6.0)
+
+    @jax.jit
+    def count(first):
+        n = jax.vmap(partial(draws.normals, key, 4))(first + jnp.arange(batch, dtype=jnp.uint32))
+        beyond = [jnp.stack([jnp.sum(n > limit), jnp.sum(n < -limit)]) for limit in limits]
+        return jnp.stack(beyond), jnp.max(jnp.abs(n))
+
+    counted = [count(jnp.uint32(k * batch)) for k in range(batches)]
+    beyond, total = sum(np.asarray(c[0]) for c in counted), batches * batch * 4  # 33.6 million; 9.6 beyond +5 sigma
+    for limit, sides in zip(limits, beyond, strict=True):
+        for side in sides:
+            assert stats.binomtest(int(side), total, stats.norm.sf(limit)).pvalue > ALARM
+    assert max(float(c[1]) for c in counted) < 6.77
+
+
+def test_uniforms_fill_the_interval_in_high_and_low_bits():
+    rows = jax.jit(jax.vmap(partial(draws.uniforms, draws.stream(6, 7, "bits"), 4)))(jnp.arange(2**18))
+    numbers = np.asarray(rows) * 2.0**32 - 0.5
+    assert np.all(numbers == np.floor(numbers))  # the words themselves
+    assert numbers.min() >= 0
+    assert numbers.max() < 2**32
+    for shift in (0, 8, 16, 24):
+        cells = np.bincount((numbers.ravel().astype(np.int64) >> shift) & 255, minlength=256)
+        assert stats.chisquare(cells).pvalue > ALARM
+
+
+def test_streams_are_uncorrelated_across_trial_name_and_axis(sheet):
+    # 128 columns, 8128 pairs: each may be off by what happens once in 8128e6
+    limit = -stats.norm.ppf(ALARM / 2 / 8128) / math.sqrt(len(sheet))
+    for values in (sheet, sheet**2, np.sign(sheet), np.abs(sheet)):
+        correlations = np.corrcoef(values.T) - np.eye(sheet.shape[1])
+        assert np.abs(correlations).max() < limit
+
+
+def test_samples_are_uncorrelated(sheet):
+    limit = -stats.norm.ppf(ALARM / 2 / (50 * sheet.shape[1])) / math.sqrt(len(sheet))
+    for values in (sheet, sheet**2):
+        values = (values - values.mean(axis=0)) / values.std(axis=0)
+        for lag in range(1, 51):
+            assert np.abs(np.mean(values[lag:] * values[:-lag], axis=0)).max() < limit
+
+
+def test_neighbouring_seeds_are_uncorrelated():
+    def row(seed):
+        key = draws.stream(seed, 0, "attitude_noise")
+        return jax.vmap(partial(draws.normals, key, 2))(jnp.arange(4096)).reshape(-1)
+
+    rows = np.asarray(jax.jit(jax.vmap(row))(jnp.arange(64, dtype=jnp.uint32)))
+    limit = -stats.norm.ppf(ALARM / 2 / 2016) / math.sqrt(rows.shape[1])  # 2016 pairs
+    assert np.abs(np.corrcoef(rows) - np.eye(64)).max() < limit

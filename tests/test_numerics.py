@@ -1,0 +1,314 @@
+import math
+from decimal import Decimal, localcontext
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import vector
+from jax import lax
+from scipy.linalg import expm
+
+from ptsmc_jax import numerics
+
+EPS = np.finfo(float).eps
+
+
+# smooth sign
+
+
+def test_smooth_sign_is_tanh_and_tends_to_the_sign():
+    s = np.array([-2.0, -0.3, -1e-4, 0.0, 1e-7, 0.01, 5.0])
+    for width in (1e-5, 1e-3, 0.7):
+        got = np.asarray(numerics.smooth_sign(vector(s), vector(width)))
+        # s / width and tanh round once each: 2 eps relative, with a factor of 2 for the compiled tanh
+        np.testing.assert_allclose(got, [math.tanh(x / width) for x in s], rtol=4 * EPS, atol=0)
+        # 1 - tanh(x) <= 2 exp(-2 x)
+        assert np.all(np.abs(got - np.sign(s)) <= 2 * np.exp(-2 * np.abs(s) / width) + EPS)
+
+
+def test_width_zero_is_the_exact_sign():
+    s = np.array([-1e300, -1e-300, -0.0, 0.0, 1e-300, 1e-9, 3.0])
+    np.testing.assert_array_equal(numerics.smooth_sign(vector(s), vector(0.0)), np.sign(s))
+
+
+@pytest.mark.parametrize(("s", "width"), [(0.0, 0.0), (0.3, 0.0), (0.0, 1e-3), (2e-3, 1e-3), (1.0, 1e-9)])
+def test_slopes_of_smooth_sign(s, width):
+    value, ratio = numerics.smooth_sign, s / width if width else math.inf
+    cosh = math.cosh(ratio) if ratio < 300 else math.inf
+    expected = (0.0, 0.0) if width == 0 else (1 / (width * cosh**2), -ratio / (width * cosh**2))
+    point = (vector(s), vector(width))
+    backward = jax.grad(value, argnums=(0, 1))(*point)
+    forward = [jax.jvp(value, point, (vector(a), vector(b)))[1] for a, b in ((1.0, 0.0), (0.0, 1.0))]
+    # 1 - tanh^2 cancels: its error is a few eps over a slope of 1/width
+    for got in (backward, forward):
+        np.testing.assert_allclose(got, expected, rtol=1e-14, atol=10 * EPS * max(1, ratio) / width if width else 0)
+
+
+# norm
+
+
+@pytest.mark.parametrize("size", [1.0, 5e-9, 1e-150, 1e150])
+def test_norm_and_its_gradient_are_those_of_the_2_norm(size):
+    direction = np.array([[0.6, -1.2, 0.3], [0.1, 0.0, 2.0]])
+    x = vector(size * direction)
+    length = math.sqrt(math.fsum(v * v for v in direction.flat))
+    np.testing.assert_allclose(numerics.norm(x), size * length, rtol=8 * EPS)  # six squares, a root
+    np.testing.assert_allclose(jax.grad(numerics.norm)(x), direction / length, rtol=16 * EPS, atol=0)
+
+
+def test_norm_at_zero_has_gradient_zero():
+    for shape in ((3,), (3, 3), ()):
+        zero = jnp.zeros(shape)
+        assert numerics.norm(zero) == 0.0
+        np.testing.assert_array_equal(jax.grad(numerics.norm)(zero), np.zeros(shape))
+        np.testing.assert_array_equal(jax.jvp(numerics.norm, (zero,), (jnp.ones(shape),))[1], 0.0)
+
+
+# blends
+
+
+def test_lerp_goes_from_b_to_a():
+    a, b = {"x": vector(2.0), "y": vector([1.0, -1.0])}, {"x": vector(4.0), "y": vector([5.0, 7.0])}
+    got = numerics.lerp(vector(0.25), a, b)
+    assert got["x"] == 3.5
+    np.testing.assert_array_equal(got["y"], [4.0, 5.0])
+
+
+def test_select_takes_one_side_and_no_tangent_of_the_other():
+    def f(x, side):
+        return numerics.select(side, {"v": 3.0 * x}, {"v": jnp.sqrt(x)})["v"]  # sqrt has an infinite slope at 0
+
+    for side, value, slope in ((True, 0.0, 3.0), (False, 0.0, math.inf)):
+        assert jax.jvp(partial(f, side=jnp.asarray(side)), (vector(0.0),), (vector(1.0),)) == (value, slope)
+
+
+# integrators
+
+
+def orders(errors):
+    return np.log2(np.asarray(errors)[:-1] / np.asarray(errors)[1:])
+
+
+@partial(jax.jit, static_argnames=("step", "count"))
+def march(step, y, end, count):
+    def advance(y, k):
+        return step(k * (end / count), y, end / count), None
+
+    return lax.scan(advance, y, jnp.arange(count))[0]
+
+
+def test_rk4_is_of_order_4():
+    # growth' = growth cos t and turning at the rate 2 t: exp(sin t) and the angle t^2
+    def rate(t, y):
+        x, z = y["turn"]
+        return {"growth": y["growth"] * jnp.cos(t), "turn": 2 * t * jnp.stack([-z, x])}
+
+    start = {"growth": vector(1.0), "turn": vector([1.0, 0.0])}
+    step, errors = partial(numerics.rk4, rate), []
+    for count in (40, 80, 160, 320):
+        got = march(step, start, 2.0, count)
+        turn = np.linalg.norm(got["turn"] - np.array([math.cos(4.0), math.sin(4.0)]))
+        errors.append([abs(got["growth"] - math.exp(math.sin(2.0))), turn])
+    assert np.min(errors) > 1e4 * EPS  # still truncation
+    # the next term of the error is smaller by a factor of order h, so the slope misses 4 by a few h
+    np.testing.assert_allclose(orders(errors)[1:], 4.0, atol=0.1)
+
+
+def phi_exact(x, order, slope=False):
+    """phi_order of a number, or its derivative, in 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
+    if x == 0.0:
+        return 1 / math.factorial(order + slope)
+    with localcontext() as context:
+        context.prec = 100
+        z = Decimal(float(x))
+        value = derivative = z.exp()
+        for k in range(1, order + 1):
+            value = (value - Decimal(1) / math.factorial(k - 1)) / z
+            derivative = (derivative - value) / z
+        return float(derivative if slope else value)
+
+
+def phi_quadrature(x, order):
+    """phi_k(x) = int_0^1 e^((1-s) x) s^(k-1)/(k-1)! ds by Gauss and Legendre, exponentials by SciPy."""
+    if order == 0:
+        return expm(x)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    s, w = (nodes + 1) / 2, weights / 2
+    return sum(b * expm((1 - a) * x) * a ** (order - 1) / math.factorial(order - 1) for a, b in zip(s, w, strict=True))
+
+
+three_phis = jax.jit(lambda x: numerics.phi_functions(x, 3))
+BASIS = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [
+        (0.0, 0.0, 0.0),
+        (1e-12, 2e-12, 5e-12),
+        (1e-6, 1e-3, 1.0),
+        (1.0, 1.0, 1.0),  # repeated
+        (2.0, 2.0, 2.0 + 1e-9),
+        (0.1, 5.0, 30.0),
+        (9.6, 9.6, 9.65),
+        (1e-6, 1.0, 1e6),
+        (1e6, 1e6, 3e6),
+    ],
+)
+def test_phi_functions_of_decaying_matrices(rates):
+    x = -BASIS @ np.diag(rates) @ BASIS.T
+    x = (x + x.T) / 2
+    # eps |x| is what one rounding of x costs; each squaring doubles a relative error, which comes to the same
+    tolerance = 20 * EPS * (1 + np.abs(x).sum(axis=0).max())
+    for order, got in enumerate(three_phis(vector(x))):
+        exact = BASIS @ np.diag([phi_exact(-rate, order) for rate in rates]) @ BASIS.T
+        np.testing.assert_allclose(got, exact, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("size", [0.3, 3.0, 8.0, 9.5, 20.0])
+def test_phi_functions_of_any_matrix(size):
+    shear = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])  # not diagonalisable
+    turn = np.array([[0.0, 0.7, -0.1], [-0.7, 0.0, 0.7], [0.1, -0.7, 0.0]])
+    growth = np.diag([1.0, 0.5, -1.0]) + 0.1
+    for x in (shear, turn, growth):
+        x = size * x / np.abs(x).sum(axis=0).max()
+        for order, got in enumerate(three_phis(vector(x))):
+            exact = phi_quadrature(x, order)
+            # as above, relative to the largest entry; twice, for SciPy's exponentials
+            tolerance = 40 * EPS * (1 + size) * max(1.0, np.abs(exact).max())
+            np.testing.assert_allclose(got, exact, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-9, 1e-3, 0.8, 4.0, 40.0, 1e4, 1e6])
+def test_gradients_of_phi_functions(rate):
+    def values(rate):
+        return jnp.stack([phi[0, 0] for phi in numerics.phi_functions(-rate * jnp.eye(2), 3)])
+
+    expected = [-phi_exact(-rate, order, slope=True) for order in range(4)]
+    # as for the values, and the tangent of each squaring adds its own rounding; relative to the largest slope
+    tolerance = 100 * EPS * (1 + rate) * np.abs(expected).max()
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        got = np.asarray(jax.jit(jacobian(values))(vector(rate)))
+        assert np.all(np.abs(got - expected) <= tolerance)
+
+
+def test_etdrk4_without_linear_part_is_rk4():
+    a, b = vector([[0.3, -1.0], [0.8, 0.1]]), vector([0.5, -0.2])
+    dt, t = vector(0.3), vector(1.7)
+
+    def rate(t, y, m):
+        return jnp.sin(t) * (a @ y) + m[:2], jnp.append(jnp.cos(y) * b, m[0] * m[2] + t), None
+
+    def joined(t, x):
+        f, g, _ = rate(t, x[:2], x[2:])
+        return jnp.concatenate([f, g])
+
+    y, m = vector([1.0, -2.0]), vector([0.4, 0.3, -0.9])
+    linear = numerics.decay(jnp.zeros((3, 3)), dt)
+    y_next, m_next, _, _ = numerics.etdrk4(rate, linear, t, y, m, dt)
+    expected = numerics.rk4(joined, t, jnp.concatenate([y, m]), dt)
+    # phi_k(0) = 1/k! to an eps; the weights of m are sums of three of them
+    np.testing.assert_allclose(jnp.concatenate([y_next, m_next]), expected, rtol=0, atol=50 * EPS)
+
+
+def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
+    matrix = vector(BASIS @ np.diag([0.5, 1.0, 3.0]) @ BASIS.T)
+
+    def exact(t):
+        return jnp.stack([jnp.sin(t), jnp.exp(-t)]), jnp.stack([jnp.cos(t), t * t, jnp.sin(2 * t)])
+
+    def rate(t, y, m):  # vanishes off the exact solution only where y and m are right: nonlinear, both ways
+        (y0, m0), (y1, m1) = jax.jvp(exact, (t,), (jnp.ones_like(t),))
+        coupling = jnp.sin(y[0] * m[1]) - jnp.sin(y0[0] * m0[1])
+        forcing = m1 + matrix @ m0 + jnp.sum(y * y) * m - jnp.sum(y0 * y0) * m0
+        return y1 + coupling + y - y0, forcing + coupling, None
+
+    errors = []
+    for count in (10, 20, 40, 80):
+        linear = numerics.decay(matrix, vector(1.5 / count))
+
+        def step(t, y, dt, linear=linear):
+            return numerics.etdrk4(rate, linear, t, *y, dt)[:2]
+
+        end = march(step, exact(vector(0.0)), vector(1.5), count)
+        errors.append(max(np.abs(a - b).max() for a, b in zip(end, exact(1.5), strict=True)))
+    assert errors[-1] > 1e4 * EPS
+    np.testing.assert_allclose(orders(errors)[1:], 4.0, atol=0.2)
+
+
+RATES = 10.0 ** np.arange(-6, 7)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_etdrk4_is_exact_for_a_constant_forcing_however_stiff(rate):
+    rates, dt = rate * np.array([1.0, 1.5, 3.0]), 0.05
+    m, g = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7])
+    linear = numerics.decay(vector(np.diag(rates)), vector(dt))
+    y, got, *_ = numerics.etdrk4(
+        lambda t, y, m: (jnp.zeros(1), vector(g), None), linear, vector(0.0), jnp.zeros(1), vector(m), vector(dt)
+    )
+    decayed, gained = np.exp(-rates * dt) * m, -np.expm1(-rates * dt) / rates * g
+    # relative to what has decayed and what came in: a few eps, doubled by each squaring of the exponential
+    assert np.all(np.abs(got - decayed - gained) <= 20 * EPS * (1 + rates * dt) * (np.abs(decayed) + np.abs(gained)))
+    assert y == 0.0
+
+
+@pytest.mark.parametrize("rate", [1e-6, 1.0, 1e3, 1e6])
+def test_etdrk4_follows_a_smooth_forcing_however_stiff(rate):
+    # m' = -rate m + cos t; the step integrates the quadratic through the forcing at its start, middle and end
+    linear = numerics.decay(vector([[rate]]), vector(0.05))
+
+    def step(t, y, dt):
+        return numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, *y, dt)[:2]
+
+    end = march(step, (jnp.zeros(1), vector([rate / (1 + rate**2)])), vector(5.0), 100)[1][0]
+    exact = (rate * math.cos(5.0) + math.sin(5.0)) / (1 + rate**2)
+    # |(s)(s-h/2)(s-h)|/3! <= h^3/124.7, weighed by (1 - exp(-rate T)) / rate <= min(1/rate, T)
+    assert abs(end - exact) <= 0.05**3 / 124 * min(1 / rate, 5.0) + 200 * EPS * (1 + rate * 0.05) / rate
+
+
+def test_etdrk4_hands_out_its_first_and_third_stage():
+    matrix, dt, t = BASIS @ np.diag([0.5, 1.0, 3.0]) @ BASIS.T, 0.4, 0.7
+    y, m = np.array([0.3, -1.1]), np.array([0.2, 1.0, -0.6])
+
+    def f(t, y, m):
+        return y * m[:2] - t
+
+    def g(t, y, m):
+        return np.array([y[0] * y[1], 1.0, 0.0]) + t * m * m
+
+    half, inverse = expm(-matrix * dt / 2), np.linalg.inv(matrix)
+    m2 = half @ m + inverse @ (np.eye(3) - half) @ g(t, y, m)
+    y2 = y + dt / 2 * f(t, y, m)
+    m3 = half @ m + inverse @ (np.eye(3) - half) @ g(t + dt / 2, y2, m2)
+    y3 = y + dt / 2 * f(t + dt / 2, y2, m2)
+
+    def rate(t, y, m):
+        forcing = jnp.stack([y[0] * y[1], jnp.ones(()), jnp.zeros(())]) + t * m * m
+        return y * m[:2] - t, forcing, {"t": t, "y": y, "m": m}
+
+    linear = numerics.decay(vector(matrix), vector(dt))
+    *_, start, middle = numerics.etdrk4(rate, linear, vector(t), vector(y), vector(m), vector(dt))
+    for got, expected in ((start, (t, y, m)), (middle, (t + dt / 2, y3, m3))):
+        for a, b in zip((got["t"], got["y"], got["m"]), expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)  # numbers near 1, a dozen roundings
+
+
+@pytest.mark.parametrize("rate", [0.0, *RATES])
+def test_gradients_of_a_step_in_the_rate_and_the_length(rate):
+    def step(rate, dt):
+        linear = numerics.decay(rate * jnp.eye(2), dt)
+        return numerics.etdrk4(
+            lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
+        )[1][0]
+
+    dt = 0.05
+    got = jax.jit(jax.grad(step, argnums=(0, 1)))(vector(rate), vector(dt))
+    x = -rate * dt
+    in_rate = -dt * math.exp(x) - 0.3 * dt * dt * phi_exact(x, 1, slope=True)
+    in_dt = (0.3 - rate) * math.exp(x)
+    # eps, doubled by each squaring, of the terms: the largest tangent is that of e^x at x = -1 or what remains of it
+    scale = np.array([dt * max(math.exp(x), dt), (1 + rate) * max(math.exp(x), 1 / (1 + rate))])
+    assert np.all(np.abs(np.array(got) - [in_rate, in_dt]) <= 200 * EPS * (1 + rate * dt) * scale)

@@ -1,0 +1,193 @@
+import dataclasses
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import FULL_INERTIA, PAPER_INERTIA, vector
+from jax import lax
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import numerics, plants
+
+EPS = np.finfo(float).eps
+
+
+def random_body(seed):
+    """A tensor that a body has: the sum of m (|r|^2 I - r r') over points."""
+    points = np.random.default_rng(seed).normal(size=(6, 3)) * [1.0, 2.0, 0.5]
+    return sum((r @ r) * np.eye(3) - np.outer(r, r) for r in points)
+
+
+INERTIAS = [np.diag(PAPER_INERTIA), np.array(FULL_INERTIA), random_body(0), random_body(1)]
+
+
+# motion
+
+
+@pytest.mark.parametrize("inertia", INERTIAS)
+def test_rate_is_eulers_equation(inertia):
+    rng = np.random.default_rng(4)
+    body = plants.spacecraft(inertia)
+    for _ in range(5):
+        q, w, u, d = rng.normal(size=4), *rng.normal(size=(3, 3))
+        got = body.rate(plants.AttitudeState(vector(q), vector(w)), vector(u), vector(d))
+        momentum = inertia @ w
+        gyroscopic = [
+            w[1] * momentum[2] - w[2] * momentum[1],
+            w[2] * momentum[0] - w[0] * momentum[2],
+            w[0] * momentum[1] - w[1] * momentum[0],
+        ]
+        scale = np.linalg.norm(w) ** 2 * np.linalg.norm(inertia)
+        tolerance = 10 * EPS * np.linalg.norm(inertia) * np.linalg.norm(w)
+        np.testing.assert_allclose(body.gyroscopic(vector(w)), gyroscopic, rtol=0, atol=10 * EPS * scale)
+        np.testing.assert_allclose(body.momentum(plants.AttitudeState(vector(q), vector(w))), momentum, rtol=0, atol=tolerance)
+        w_dot = np.linalg.solve(inertia, u + d - gyroscopic)
+        tolerance = 20 * EPS * np.linalg.cond(inertia) * (np.abs(w_dot).max() + scale / np.linalg.norm(inertia))
+        np.testing.assert_allclose(got.w, w_dot, rtol=0, atol=tolerance)
+        v, s = q[:3], q[3]
+        np.testing.assert_allclose(got.q[:3], (s * w + np.cross(v, w)) / 2, rtol=0, atol=20 * EPS)
+        np.testing.assert_allclose(got.q[3], -v @ w / 2, rtol=0, atol=20 * EPS)
+
+
+@partial(jax.jit, static_argnames="count")
+def coast(body, x, end, count):
+    def advance(x, k):
+        def rate(t, y):
+            return body.rate(y, jnp.zeros(3), jnp.zeros(3))
+
+        return numerics.rk4(rate, k * (end / count), x, end / count), None
+
+    return lax.scan(advance, x, jnp.arange(count))[0]
+
+
+@pytest.mark.parametrize("inertia", INERTIAS)
+def test_free_motion_conserves_momentum_and_energy_to_order_4(inertia):
+    body, rotation = plants.spacecraft(inertia), Rotation.from_rotvec([0.3, -2.0, 1.0])
+    w, end = np.array([0.3, -0.5, 0.4]), 40.0
+    start = plants.AttitudeState(vector(rotation.as_quat()), vector(w))
+    momentum, energy = rotation.apply(inertia @ w), w @ inertia @ w / 2
+
+    drifts = []
+    for count in (400, 800):
+        x = coast(body, start, end, count)
+        q, w_end = np.asarray(x.q), np.asarray(x.w)
+        now = Rotation.from_quat(q).apply(inertia @ w_end)  # SciPy normalises q
+        drifts.append(
+            [
+                np.linalg.norm(now - momentum) / np.linalg.norm(momentum),
+                abs(w_end @ inertia @ w_end / 2 - energy) / energy,
+                abs(q @ q - 1),
+            ]
+        )
+        # the remainder of a step of RK4 is (rate h)^5/120 with rates of |w| times the spread of the moments
+        moments = np.linalg.eigvalsh(inertia)
+        rate = np.linalg.norm(w) * max(1.0, (moments[2] - moments[0]) / moments[0])
+        assert max(drifts[-1]) <= end * rate * (rate * end / count) ** 4 / 120
+    # the momentum's drift falls by 2^4, up to the next term, and is still truncation
+    assert drifts[1][0] > 1e4 * EPS
+    np.testing.assert_allclose(drifts[0][0] / drifts[1][0], 16.0, atol=0.5)
+    assert np.linalg.norm(np.asarray(x.w) - w) > 0.1  # it did move
+
+
+def test_the_body_is_turned_by_its_rate():
+    # a principal spin: q exp(w t) exactly, body axes on the right
+    body, w = plants.spacecraft(PAPER_INERTIA), np.array([0.0, 0.2, 0.0])
+    start = Rotation.from_rotvec([1.0, 0.2, -0.5])
+    x = coast(body, plants.AttitudeState(vector(start.as_quat()), vector(w)), 10.0, 100)
+    end = (start * Rotation.from_rotvec(w * 10.0)).as_quat()
+    np.testing.assert_allclose(x.w, w, rtol=0, atol=4 * EPS)
+    # (|w|/2 h)^5/120 a step
+    np.testing.assert_allclose(x.q * np.sign(x.q[3]), end * np.sign(end[3]), rtol=0, atol=100 * 0.01**5 / 120)
+
+
+def test_normalise_restores_the_norm_alone():
+    x = plants.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
+    got = plants.spacecraft(PAPER_INERTIA).normalise(x)
+    np.testing.assert_allclose(got.q, np.array([1, 2, -3, 4]) / np.sqrt(30), rtol=4 * EPS)
+    np.testing.assert_array_equal(got.w, x.w)
+
+
+# as a part
+
+
+def test_the_spacecraft_is_a_frozen_pytree_of_arrays():
+    body = plants.spacecraft(FULL_INERTIA)
+    leaves = jax.tree.leaves(body)
+    assert len(leaves) == 2
+    assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 and leaf.shape == (3, 3) for leaf in leaves)
+    np.testing.assert_allclose(body.inertia @ body.inertia_inverse, np.eye(3), rtol=0, atol=20 * EPS)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        body.inertia = jnp.eye(3)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_three_moments_are_a_diagonal_tensor():
+    np.testing.assert_array_equal(plants.check_inertia([1, 2, 2.5]), np.diag([1, 2, 2.5]))
+
+
+# which inertias there are
+
+ALLOWED = {
+    "sphere": (1, 1, 1),
+    "plate": (1, 1, 2),  # flat: the largest is the sum
+    "nearly a rod": (1e-6, 1, 1),
+    "uneven": (2, 3, 4.9),
+}
+REFUSED = {
+    "more than a plate": ((1, 1, 2.001), "must not exceed"),
+    "rod": ((0, 1, 1), "positive definite"),
+    "point": ((0, 0, 0), "positive definite"),
+    "negative": ((-1, 2, 2), "positive definite"),
+    "two negative": ((-1, -2, 2), "positive definite"),
+    "thin and not a rod": ((1e-6, 1, 1.1), "must not exceed"),
+}
+ROTATIONS = [np.eye(3), *Rotation.random(3, rng=np.random.default_rng(8)).as_matrix()]
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("moments", ALLOWED.values(), ids=list(ALLOWED))
+def test_bodies_that_exist_are_allowed_in_any_size_and_axes(moments, scale):
+    for order in itertools.permutations(moments):
+        for rotation in ROTATIONS:
+            tensor = scale * rotation @ np.diag(order) @ rotation.T
+            # made symmetric at most, by an eps
+            np.testing.assert_allclose(plants.check_inertia(tensor), tensor, rtol=0, atol=8 * EPS * scale * max(order))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(("moments", "reason"), REFUSED.values(), ids=list(REFUSED))
+def test_bodies_that_cannot_exist_are_refused_in_any_size_and_axes(moments, reason, scale):
+    for order in itertools.permutations(moments):
+        for rotation in ROTATIONS:
+            tensor = scale * rotation @ np.diag(order) @ rotation.T
+            for build in (plants.check_inertia, plants.spacecraft):
+                with pytest.raises(ValueError, match=reason):
+                    build((tensor + tensor.T) / 2)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "reason"),
+    [
+        (5.0, "three principal moments or a symmetric 3x3"),
+        ([1.0, 2.0], "three principal moments or a symmetric 3x3"),
+        (np.eye(4), "three principal moments or a symmetric 3x3"),
+        ([[1.0, 2.0, 3.0]], "three principal moments or a symmetric 3x3"),
+        ([1.0, np.nan, 1.0], "finite"),
+        ([1.0, np.inf, 1.0], "finite"),
+        ([[2.0, 0.1, 0], [0.0, 2.0, 0], [0, 0, 2.0]], "symmetric"),
+        ([[2e-7, 1e-9, 0], [0.0, 2e-7, 0], [0, 0, 2e-7]], "symmetric"),
+    ],
+)
+def test_what_is_no_inertia_is_refused(inertia, reason):
+    for build in (plants.check_inertia, plants.spacecraft):
+        with pytest.raises(ValueError, match=reason):
+            build(inertia)
+
+
+def test_rounding_does_not_break_symmetry():
+    tensor = np.array(FULL_INERTIA)
+    tensor[0, 1] *= 1 + 1e-15
+    got = plants.check_inertia(tensor)
+    np.testing.assert_array_equal(got, got.T)

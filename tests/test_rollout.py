@@ -1,0 +1,263 @@
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import clock, observers, plants, rollout, signals, theory
+from tests.helpers import FULL_INERTIA, REFERENCE, parts, vector, with_controller
+
+fly = rollout.simulate_jit
+
+
+def perfect(run: rollout.Parts) -> rollout.Parts:
+    """No disturbance, so that d_hat = 0 is a perfect estimate, and K2 = 0: exact solution 1 applies."""
+    quiet = signals.Constant(jnp.zeros(3))
+    bound = replace(run.observer, disturbance_rate_bound=vector(0.0))
+    return replace(run, disturbance=quiet, observer=bound)
+
+
+def finer(run: rollout.Parts, times: int) -> rollout.Parts:
+    """The same run on a grid with that many times the steps."""
+    grid = run.clock
+    assert isinstance(grid, clock.Graded)
+    grid = replace(grid, before=grid.before * times, after=grid.after * times, max_step=grid.max_step / times)
+    return replace(run, clock=grid)
+
+
+def reference_run(case: dict) -> rollout.Parts:
+    # the data were made with c instead of sqrt(3) c in (55)
+    times = [row["t"] for row in case["trajectory"]]
+    return parts(case["t_f"], case["eta"], case["delta"], rate_bound=1e-3 / np.sqrt(3.0), saves=times)
+
+
+@pytest.mark.parametrize("case", REFERENCE["cases"], ids=lambda case: case["name"])
+def test_continuous_loop_meets_the_independent_integration(case):
+    run = reference_run(case)
+    result = fly(run, record=True)
+    log = result.log
+    assert log is not None
+    steps = log.t.size - 1
+    assert steps <= 600
+    for row in case["trajectory"]:
+        k = int(np.flatnonzero(np.asarray(log.t) == row["t"])[-1])  # save times are nodes, exactly
+        for name, value in (("q", log.x.q), ("omega", log.x.w), ("d_hat", log.d_hat), ("s", log.s)):
+            np.testing.assert_allclose(value[k], row[name], rtol=0, atol=2e-8, err_msg=f"{name} at {row['t']}")
+        # the torque is no state: it is the states times gains up to 2 J eta^2/tau^2 before the hand-over, 2 J after
+        tau = max(case["t_f"] - row["t"], case["delta"])
+        gain = 2 * 14 * case["eta"] ** 2 / tau**2 if row["t"] < case["t_f"] - case["delta"] else 2 * 14
+        np.testing.assert_allclose(log.u[k], row["torque"], rtol=0, atol=2e-8 * max(gain, 1.0))
+    summary = case["summary"]
+    np.testing.assert_allclose(result.metrics.terminal_error, summary["terminal_error_2"], rtol=1e-3)
+    late = np.asarray(log.t) >= case["t_f"]
+    np.testing.assert_allclose(np.abs(log.error[late]).max(), summary["hold_error_inf"], rtol=1e-3)
+    assert int(result.status) == rollout.OK
+
+
+@pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01)])
+def test_perfect_estimate_gives_the_exact_solution(eta, rate):
+    run = finer(perfect(parts(30.0, eta, 0.05, inertia=FULL_INERTIA, rate=rate)), 2)
+    log = fly(run, record=True).log
+    assert log is not None
+    before = np.asarray(log.t) < 29.949
+    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    t = np.asarray(log.t)[before]
+    exact = jax.vmap(lambda t: theory.exact_error(t, vector(30.0), vector(eta), error, error_rate))(vector(t))
+    # the default grid leaves up to 1e-9, twice its steps a sixteenth; s is tau times a rate, tau up to 30 s
+    np.testing.assert_allclose(np.asarray(log.error)[before], exact.error, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.asarray(log.s)[before], exact.s, rtol=0, atol=3e-9)
+
+
+def test_exact_solution_for_a_moving_reference():
+    spin = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.004, -0.006, 0.005))
+    run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=spin, rate=(0.01, 0.0, -0.01))), 2)
+    log = fly(run, record=True).log
+    assert log is not None
+    before = np.asarray(log.t) < 19.89
+    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    t = vector(np.asarray(log.t)[before])
+    exact = jax.vmap(lambda t: theory.exact_error(t, vector(20.0), vector(3.5), error, error_rate))(t)
+    np.testing.assert_allclose(np.asarray(log.error)[before], exact.error, rtol=0, atol=1e-10)
+
+
+def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution():
+    run = perfect(parts(30.0, 3.0, 0.5))
+    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    start = error + 0 * error_rate
+
+    def at_hand_over(eta, delta):
+        log = rollout.simulate(with_controller(run, eta=eta, delta=delta), record=True).log
+        assert log is not None
+        held = run.clock.ticks(run.controller.t_f, delta).hold
+        return log.error[jnp.argmax(held)]  # the first row of the hold phase is the hand-over
+
+    point = (vector(3.0), vector(0.5))
+    by_eta, by_delta = jax.jit(jax.jacfwd(at_hand_over, (0, 1)))(*point)
+    r = 0.5 / 30.0
+    log_r, s0 = -np.log(r), 3.0 * start
+    np.testing.assert_allclose(at_hand_over(*point), r**3 * (start + s0 * log_r), rtol=1e-9)
+    # d/d eta of r^eta (x0 + eta x0 L): -L r^eta (x0 + s0 L) + r^eta x0 L = -s0 L^2 r^eta from rest
+    np.testing.assert_allclose(by_eta, -s0 * log_r**2 * r**3, rtol=1e-8)
+    np.testing.assert_allclose(by_delta, r**3 * (3.0 * (start + s0 * log_r) - s0) / 0.5, rtol=1e-8)
+
+
+def test_order_of_convergence_is_four():
+    run = parts(30.0, 3.0, 0.5, sign_width=1e-2)
+    assert isinstance(run.clock, clock.Graded)
+
+    def final(scale: int) -> np.ndarray:
+        grid = replace(run.clock, before=20 * scale, after=10 * scale, max_step=vector(3.0 / scale))
+        log = rollout.simulate(replace(run, clock=grid), record=True).log
+        assert log is not None
+        return np.concatenate([log.x.q[-1], log.x.w[-1]])
+
+    truth = final(64)
+    sizes = np.array([4, 8, 16])
+    errors = np.array([np.abs(final(int(n)) - truth).max() for n in sizes])
+    assert errors[-1] > 1e-13  # still truncation, not rounding
+    slope = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    assert 3.7 < slope < 4.5
+
+
+@pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), FULL_INERTIA, (0.01, 0.012, 0.015)])
+@pytest.mark.parametrize("gain", [0.5, 10.0, 300.0])
+def test_no_observer_gain_blows_up(inertia, gain):
+    scale = np.max(inertia) / 14.0
+    wave = signals.Sinusoid(*(vector([v] * 3) for v in (0.01 * scale, 0.1, 0.0, 0.0)))
+    run = parts(30.0, 3.0, 0.5, gain, inertia=inertia, disturbance=wave, rate_bound=1e-3 * scale)
+    result = fly(run, record=True)
+    assert result.log is not None
+    assert int(result.status) == rollout.OK
+    # (55): the estimate stays as near as its own bound says
+    bound = run.observer.error_bound()
+    off = np.linalg.norm(result.log.d_hat - result.log.disturbance, axis=1)
+    allowed = np.array([float(bound(t)) for t in result.log.t]) + 1e-12
+    assert np.all(off <= allowed * (1 + 1e-6))
+
+
+def test_sampled_loop_converges_to_the_continuous_one_with_first_order():
+    truth = fly(parts(20.0, 3.0, 2.0, 5.0, sign_width=0.05)).metrics
+    gaps = []
+    for period in (0.04, 0.02, 0.01):
+        metrics = fly(parts(20.0, 3.0, 2.0, 5.0, sign_width=0.05, period=period)).metrics
+        gaps.append(abs(float(metrics.window_error / truth.window_error) - 1.0))
+    ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
+    assert np.all((ratios > 1.8) & (ratios < 2.2))  # zero-order hold: half a period of delay
+
+
+def test_held_torque_is_what_an_adaptive_integrator_makes_of_it():
+    from scipy.integrate import solve_ivp
+
+    run = parts(20.0, 3.0, 1.0, period=0.25, noise=(2e-5, 1e-6), inertia=FULL_INERTIA)
+    log = jax.tree.map(np.asarray, fly(run, np.uint32(3), np.uint32(7), record=True).log)
+    inertia = np.asarray(FULL_INERTIA)
+
+    def rate(t, y, u):
+        q, w = y[:4], y[4:]
+        v_dot = 0.5 * (q[3] * w + np.cross(q[:3], w))
+        d = 0.01 * np.sin(0.1 * t) * np.ones(3)
+        w_dot = np.linalg.solve(inertia, u + d - np.cross(w, inertia @ w))
+        return np.concatenate([v_dot, [-0.5 * q[:3] @ w], w_dot])
+
+    y = np.concatenate([log.x.q[0], log.x.w[0]])
+    for k in range(len(log.t) - 1):
+        if log.t[k + 1] > log.t[k]:
+            span = (log.t[k], log.t[k + 1])
+            y = solve_ivp(rate, span, y, args=(log.u[k],), rtol=1e-11, atol=1e-13).y[:, -1]
+    # RK4 at 0.25 s and up to 0.15 rad/s: (0.04)^5/120 a step, 120 steps: 1e-7
+    np.testing.assert_allclose(np.concatenate([log.x.q[-1], log.x.w[-1]]), y, atol=1e-7)
+
+
+def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
+    for run in (parts(), parts(period=0.05), parts(period=0.07, flight=True, t_end=41.3)):
+        log = fly(run, record=True).log
+        assert log is not None
+        assert float(log.t[-1]) == float(run.t_end)
+        assert np.all(np.diff(log.t) >= 0.0)
+
+
+@pytest.mark.parametrize("flight", [False, True])
+def test_metrics_at_t_f_are_taken_inside_the_period(flight):
+    run = parts(20.0, 3.0, 0.53, period=0.05, flight=flight)  # t_f = t_s + 10.6 periods; 20.0 on the flight clock
+    run = with_controller(run, t_f=vector(20.02))
+    result = fly(run, record=True)
+    log = jax.tree.map(np.asarray, result.log)
+    k = np.flatnonzero((log.t < 20.02) & log.lasts)[-1]
+    assert 20.02 - log.t[k] > 1e-3  # not on a sample
+    halves = 64  # Euler-free check: RK4 in many small steps from the sample before, under the same torque
+    x = jax.tree.map(lambda v: jnp.asarray(v[k]), log.x)
+    from ptsmc_jax import numerics
+
+    for j in range(halves):
+        step = (20.02 - log.t[k]) / halves
+        x = numerics.rk4(
+            lambda t, y: run.plant.rate(y, jnp.asarray(log.u[k]), run.disturbance(t)), log.t[k] + j * step, x, step
+        )
+    error, _ = run.controller.errors(x, run.reference(vector(20.02)))
+    np.testing.assert_allclose(result.metrics.terminal_error, np.linalg.norm(error), rtol=1e-8)
+
+
+def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
+    turned = np.array([0.0, 0.0, 1.0, 1e-4])
+    near = fly(parts(q=turned / np.linalg.norm(turned)))
+    assert int(near.status) == rollout.SINGULAR
+    assert float(near.bad_time) == 0.0
+
+    wild = fly(parts(20.0, 8.0, 0.05, period=0.05, noise=(0.05, 0.05)), np.uint32(0), np.uint32(0))
+    assert int(wild.status) in (rollout.TOO_FAST, rollout.SINGULAR, rollout.DIVERGED)
+    assert 0.0 < float(wild.bad_time) <= 30.0
+
+    lost = fly(parts(q=np.array([np.nan, 0.0, 0.0, 1.0])))
+    assert int(lost.status) == rollout.DIVERGED
+    assert np.isnan(float(lost.metrics.window_error))  # not hidden
+
+
+def test_either_sign_of_the_quaternion_is_the_same_run():
+    q = parts().initial.q
+    one, other = fly(parts(), record=True), fly(parts(q=-q), record=True)
+    assert one.log is not None
+    assert other.log is not None
+    np.testing.assert_array_equal(one.log.x.q, other.log.x.q)
+    np.testing.assert_array_equal(one.metrics.window_error, other.metrics.window_error)
+    # and a reference given with q_f4 < 0 is reached with a true error of zero, not of 2 pi
+    flipped = fly(parts(reference=signals.Fixed(vector(0.0, 0.0, 0.0, -1.0))))
+    np.testing.assert_allclose(flipped.metrics.window_error, one.metrics.window_error, rtol=1e-9)
+    assert float(flipped.metrics.terminal_angle) < 1e-6
+
+
+def test_another_number_is_the_same_program():
+    traced = 0
+
+    def counted(run, seed, trial):
+        nonlocal traced
+        traced += 1
+        return rollout.simulate(run, seed, trial).metrics
+
+    program = jax.jit(counted)
+    for k in range(3):
+        run = parts(20.0 + k, 3.0 + k, 0.5 + k, 10.0 * (1 + k), k1=1.0 + k, period=0.05, noise=(1e-5 * k, 1e-6))
+        run = replace(run, clock=clock.Anchored(vector(0.05), vector(30.0 + k), 500, 300))
+        program(run, np.uint32(k), np.uint32(k))
+    assert traced == 1
+
+
+def test_simulate_without_jit_is_the_same():
+    run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.0)
+    with jax.disable_jit():
+        plain = rollout.simulate(run, np.uint32(1), np.uint32(2))
+    compiled = fly(run, np.uint32(1), np.uint32(2))
+    for name, a, b in zip(plain.metrics._fields, plain.metrics, compiled.metrics, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, err_msg=name)
+
+
+def test_observer_and_controller_hold_a_model_of_their_own():
+    heavier = plants.spacecraft((10.5, 12.6, 14.7))
+    run = parts(30.0, 3.0, 0.5, period=0.05)
+    off = fly(replace(run, plant=heavier))
+    assert int(off.status) == rollout.OK
+    # 5 % more inertia is a disturbance of 5 % of the commanded torque, which the observer sees only in part
+    assert float(off.metrics.window_error) > 2 * float(fly(run).metrics.window_error)
+    assert isinstance(run.observer, observers.NonlinearObserver)
+    np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)
