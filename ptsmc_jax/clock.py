@@ -43,7 +43,8 @@ class Anchored:
     """Control clock with a sample at the hand-over t_s: t_k = t_s + (k - before) period.
 
     Everything, the noise too, moves with t_s, so a run depends smoothly on delta and t_f. The first period, from t = 0,
-    is a partial one; its noise is blended with the next sample's so that nothing jumps where it vanishes.
+    is a partial one; its noise is blended with the next sample's so that nothing jumps where it vanishes (there the
+    slope may have a small kink, the value none).
     """
 
     period: Leaf  # h [s]
@@ -53,12 +54,13 @@ class Anchored:
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
-        sample = jnp.arange(-self.before, self.after)
-        nominal = (t_f - delta) + sample * self.period
-        t = _not_above(_not_below(nominal, 0.0), self.t_end)
-        t_next = _not_above(_not_below(nominal + self.period, 0.0), self.t_end)
-        partial = jnp.where(nominal < 0.0, (t_next - t) / self.period, 1.0)
-        return Ticks(t, t_next, sample >= 0, sample.astype(jnp.int32), partial)
+        sample = jnp.arange(-self.before, self.after, dtype=jnp.int32)
+        # one array of nodes, so that one interval ends where, to the last bit, the next begins
+        nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1) * self.period
+        nodes = _not_above(_not_below(nominal, 0.0), self.t_end)
+        t, t_next = nodes[:-1], nodes[1:]
+        partial = jnp.where(nominal[:-1] < 0.0, (t_next - t) / self.period, 1.0)
+        return Ticks(t, t_next, sample >= 0, sample, partial)
 
 
 @jax.tree_util.register_dataclass
@@ -72,11 +74,10 @@ class Flight:
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
-        sample = jnp.arange(self.count)
-        nominal = sample * self.period
-        hold = nominal >= t_f - delta - 1e-9 * self.period  # rounding must not cost a period
-        t, t_next = _not_above(nominal, self.t_end), _not_above(nominal + self.period, self.t_end)
-        return Ticks(t, t_next, hold, sample.astype(jnp.int32), jnp.ones_like(t))
+        nodes = _not_above(jnp.arange(self.count + 1) * self.period, self.t_end)
+        t, t_next = nodes[:-1], nodes[1:]
+        hold = t >= t_f - delta - 1e-9 * self.period  # rounding must not cost a period
+        return Ticks(t, t_next, hold, jnp.arange(self.count, dtype=jnp.int32), jnp.ones_like(t))
 
 
 @jax.tree_util.register_dataclass

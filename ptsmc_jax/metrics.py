@@ -94,7 +94,6 @@ class Running(NamedTuple):
 def begin(first: Sight, judged: Judged) -> Running:
     """Accumulators at t = 0."""
     zero = jnp.zeros_like(judged.t_f)
-    unsettled = first.angle >= judged.settling_angle
     return Running(
         square_error=zero,
         hold_error=zero,
@@ -102,7 +101,7 @@ def begin(first: Sight, judged: Judged) -> Running:
         peak_torque_delivered=zero,
         saturated_for=zero,
         effort=zero,
-        settled_at=jnp.where(unsettled, jnp.inf, 0.0),
+        settled_at=jnp.where(_unsettled(first, judged), jnp.inf, 0.0),
         last_torque=jnp.zeros(3),
         variation=jnp.zeros(3),
         peak_rate=first.rate,
@@ -130,7 +129,7 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     variation = jump + jnp.where(span.t >= judged.t_f, inside, 0.0)
 
     # the angle falls below the threshold inside the interval: linear interpolation; stays above: not yet settled
-    above, above_next = span.start.angle >= judged.settling_angle, span.end.angle >= judged.settling_angle
+    above, above_next = _unsettled(span.start, judged), _unsettled(span.end, judged)
     drop = jnp.where(above & ~above_next, span.start.angle - span.end.angle, 1.0)
     crossing = span.t + dt * (span.start.angle - judged.settling_angle) / drop
     settled_at = jnp.where(above_next, jnp.inf, jnp.where(above, crossing, running.settled_at))
@@ -157,11 +156,11 @@ def finish(running: Running, at_t_f: Sight, judged: Judged) -> Metrics:
     square_error = running.square_error / judged.window
     still = judged.t_end - judged.t_f
     chattering = jnp.max(running.variation) / jnp.where(still > 0.0, still, 1.0)
-    positive = square_error > 0.0
+    none = square_error == 0.0
     return Metrics(
         terminal_error=terminal_error,
         terminal_angle=at_t_f.angle,
-        window_error=jnp.where(positive, jnp.sqrt(jnp.where(positive, square_error, 1.0)), 0.0),
+        window_error=jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square_error))),
         hold_error=jnp.maximum(running.hold_error, terminal_error),
         peak_torque=running.peak_torque,
         peak_torque_delivered=running.peak_torque_delivered,
@@ -172,6 +171,10 @@ def finish(running: Running, at_t_f: Sight, judged: Judged) -> Metrics:
         peak_rate=running.peak_rate,
         peak_momentum=running.peak_momentum,
     )
+
+
+def _unsettled(sight: Sight, judged: Judged) -> Array:
+    return ~(sight.angle < judged.settling_angle)  # an angle that is no number is not settled
 
 
 def _square_error(span: Span, judged: Judged, dt: Scalar) -> Scalar:

@@ -83,7 +83,7 @@ def phi_functions(x: Float[Array, "n n"], order: int) -> list[Float[Array, "n n"
     for k in range(order - 1, -1, -1):
         phi.insert(0, one / factorial(k) + small @ phi[0])
 
-    def double(step: Array, phi: list[Array]) -> list[Array]:
+    def double(step: Any, phi: list[Array]) -> list[Array]:
         larger = [
             (phi[0] @ phi[k] + sum((phi[j] / factorial(k - j) for j in range(1, k + 1)), 0.0 * one)) / 2**k
             for k in range(order + 1)

@@ -8,7 +8,7 @@ import math
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -268,7 +268,7 @@ def load(path: str | Path) -> dict[str, Any]:
         raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
 
 
-def parse(raw: Mapping[str, Any], metrics: typing.Collection[str]) -> Scenario:
+def parse(raw: Mapping[str, Any], metrics: Collection[str]) -> Scenario:
     """Scenario from raw tables, absent keys at their defaults; raises ScenarioError. `metrics`: known names."""
     defaults = Scenario()
     names = Scenario.__struct_fields__
@@ -310,7 +310,7 @@ def _without_none(value: Any) -> Any:
     return value
 
 
-def nearest(name: str, known: typing.Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
     """The known name most like this one."""
     return difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)[0]
 
@@ -342,7 +342,7 @@ def _dispersion(raw: Mapping[str, Any]) -> Dispersion:
     return Dispersion(**found)
 
 
-def _requirement(metric: str, value: Any, metrics: typing.Collection[str]) -> float | Limit:
+def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
     key = f"requirements.{metric}"
     if metric not in metrics:
         raise ScenarioError(f"{key} is not a known metric; the nearest known one is {nearest(metric, metrics)}")

@@ -55,10 +55,8 @@ def test_noise_differs_from_sample_to_sample_and_trial_to_trial(errors):
 
 
 def test_noise_is_drawn_from_the_streams_named_after_the_sensors():
-    keys = SENSORS.keys(7, 8)
-    for key, noise, name, size in zip(
-        keys, SENSORS.noise(keys, jnp.asarray(-5)), ("attitude_noise", "rate_noise"), SIZES, strict=True
-    ):
+    noises = SENSORS.noise(SENSORS.keys(7, 8), jnp.asarray(-5))
+    for noise, name, size in zip(noises, ("attitude_noise", "rate_noise"), SIZES, strict=True):
         np.testing.assert_array_equal(noise, size * draws.normals(draws.stream(7, 8, name), 3, -5))
 
 

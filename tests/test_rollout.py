@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, observers, plants, rollout, signals, theory
+from ptsmc_jax import clock, plants, rollout, signals, theory
 from tests.helpers import FULL_INERTIA, REFERENCE, parts, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -83,7 +83,7 @@ def test_exact_solution_for_a_moving_reference():
 
 
 def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution():
-    run = perfect(parts(30.0, 3.0, 0.5))
+    run = finer(perfect(parts(30.0, 3.0, 0.5)), 4)  # 3e-8 relative on the default grid, 1/256 of it here
     error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
     start = error + 0 * error_rate
 
@@ -193,7 +193,10 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     for j in range(halves):
         step = (20.02 - log.t[k]) / halves
         x = numerics.rk4(
-            lambda t, y: run.plant.rate(y, jnp.asarray(log.u[k]), run.disturbance(t)), log.t[k] + j * step, x, step
+            lambda t, y: run.plant.rate(y, jnp.asarray(log.u[k]), run.disturbance(t)),
+            vector(log.t[k] + j * step),
+            x,
+            vector(step),
         )
     error, _ = run.controller.errors(x, run.reference(vector(20.02)))
     np.testing.assert_allclose(result.metrics.terminal_error, np.linalg.norm(error), rtol=1e-8)
@@ -211,7 +214,7 @@ def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
 
     lost = fly(parts(q=np.array([np.nan, 0.0, 0.0, 1.0])))
     assert int(lost.status) == rollout.DIVERGED
-    assert np.isnan(float(lost.metrics.window_error))  # not hidden
+    assert all(np.isnan(float(getattr(lost.metrics, name))) for name in ("window_error", "hold_error", "settling_time"))
 
 
 def test_either_sign_of_the_quaternion_is_the_same_run():
@@ -257,7 +260,7 @@ def test_observer_and_controller_hold_a_model_of_their_own():
     run = parts(30.0, 3.0, 0.5, period=0.05)
     off = fly(replace(run, plant=heavier))
     assert int(off.status) == rollout.OK
-    # 5 % more inertia is a disturbance of 5 % of the commanded torque, which the observer sees only in part
-    assert float(off.metrics.window_error) > 2 * float(fly(run).metrics.window_error)
-    assert isinstance(run.observer, observers.NonlinearObserver)
+    same = fly(replace(run, plant=plants.spacecraft((10.0, 12.0, 14.0))))
+    np.testing.assert_array_equal(same.metrics.window_error, fly(run).metrics.window_error)
+    assert abs(float(off.metrics.window_error / same.metrics.window_error) - 1.0) > 0.05
     np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)

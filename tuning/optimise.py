@@ -182,7 +182,7 @@ def _descend(problem: Problem, bounds: Bounds, z: np.ndarray, steps: int, report
         z = np.asarray(optax.apply_updates(z, updates))
     for start in best.order()[:POLISHED]:
         if np.isfinite(best.rms[start]):
-            _polish(tightened, bounds, best, start)
+            _polish(tightened, bounds, best, int(start))
     chosen = best.order()[0]
     gains, f, c, _, _ = _evaluate(tightened, bounds, best.z[chosen : chosen + 1])
     worst = (c[0].max(axis=1, initial=-1.0) + 1.0) * (1.0 - MARGIN)

@@ -1,0 +1,101 @@
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ptsmc_jax import clock
+from tests.helpers import vector
+
+
+@settings(max_examples=60, deadline=None)
+@given(t_f=st.floats(5.0, 40.0), share=st.floats(0.01, 0.4), coast=st.floats(1.0, 12.0))
+def test_anchored_periods_fill_the_time_and_meet_the_hand_over(t_f, share, coast):
+    period, delta = 0.1, max(share * t_f, 0.1)
+    ticks = clock.Anchored(vector(period), vector(t_f + coast), 401, 400).ticks(vector(t_f), vector(delta))
+    t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
+    assert np.all(t_next >= t)
+    assert t[0] == 0.0
+    assert t_next[-1] == t_f + coast
+    np.testing.assert_array_equal(t[1:], t_next[:-1])  # no gap, no overlap
+    first = int(np.argmax(ticks.hold))
+    np.testing.assert_allclose(t[first], t_f - delta, atol=1e-12)
+    assert int(ticks.sample[first]) == 0
+    whole = (t > 0) & (t_next < t_f + coast)
+    np.testing.assert_allclose((t_next - t)[whole], period, atol=1e-12)
+    np.testing.assert_allclose(ticks.noise_weight[ticks.t > 0], 1.0)
+
+
+@pytest.mark.parametrize("periods", [10, 20])
+def test_anchored_ticks_are_continuous_where_delta_is_a_multiple_of_the_period(periods):
+    anchored = clock.anchored(0.1, 15.0, 10.0, 8.0)
+
+    def ends(delta):
+        ticks = anchored.ticks(vector(10.0), delta)
+        return ticks.t, ticks.t_next
+
+    at = vector(periods * 0.1)
+    for nearby in (at - 1e-9, at + 1e-9):
+        for a, b in zip(ends(at), ends(nearby), strict=True):
+            np.testing.assert_allclose(a, b, atol=1.1e-9)
+    # the lengths' derivatives add up to none: t_end does not move
+    slopes = jax.jvp(ends, (at,), (vector(1.0),))[1]
+    np.testing.assert_allclose(np.sum(np.asarray(slopes[1] - slopes[0])), 0.0, atol=1e-12)
+
+
+def test_a_partial_first_period_takes_part_of_its_noise_from_the_next_sample():
+    ticks = clock.anchored(0.1, 15.0, 10.0, 8.0).ticks(vector(10.0), vector(1.07))
+    first = int(np.flatnonzero(np.asarray(ticks.t_next) > 0)[0])
+    np.testing.assert_allclose(ticks.t_next[first] - ticks.t[first], 0.03, atol=1e-12)
+    np.testing.assert_allclose(ticks.noise_weight[first], 0.3, atol=1e-10)
+
+
+def test_flight_clock_counts_from_zero_and_hands_over_at_the_first_sample_not_before_t_s():
+    flight = clock.flight(0.1, 15.04)
+    ticks = flight.ticks(vector(10.0), vector(1.07))
+    np.testing.assert_allclose(ticks.t[:150], 0.1 * np.arange(150), rtol=1e-15)
+    assert float(ticks.t_next[-1]) == 15.04
+    assert float(ticks.t[np.argmax(ticks.hold)]) == pytest.approx(9.0)
+    on_sample = flight.ticks(vector(10.0), vector(1.0))  # 10 - 1 = 90 periods, rounding or not
+    assert float(on_sample.t[np.argmax(on_sample.hold)]) == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
+def test_graded_grid_has_its_nodes_and_steps_as_promised(t_f, delta):
+    saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
+    grid = clock.graded(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, 1e-3, saves)
+    ticks = grid.ticks(vector(t_f), vector(delta))
+    t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
+    assert np.all(t_next >= t)
+    assert t[0] == 0.0
+    assert t_next[-1] == t_f + 10.0
+    for node in (t_f - delta, t_f, t_f + 1.0, *saves):
+        assert node in t_next
+    lasts = t_next > t  # saves on other nodes make intervals of length zero
+    before = lasts & (t_next <= t_f - delta)
+    np.testing.assert_array_equal(np.asarray(ticks.hold)[lasts], ~before[lasts])
+    steps = (t_next - t)[before]
+    assert steps.max() <= float(grid.max_step) * (1 + 1e-9)
+    tau = t_f - t[before]
+    # a d(ln tau) + d(tau)/max_step = 1 a step: each is at most tau/a of what remains
+    a = (grid.before - (t_f - delta) / float(grid.max_step)) / np.log(t_f / delta)
+    assert np.all(steps <= tau / a * (1 + 1e-9) + 1e-12)
+    # and nowhere much smaller than both allow, away from inserted nodes
+    allowed = 1 / (a / tau + 1 / float(grid.max_step))
+    assert np.median(steps / allowed) > 0.8
+
+
+def test_graded_nodes_move_with_t_f_and_delta_by_their_exact_derivative():
+    grid = clock.graded(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, 0.1)
+
+    def nodes(t_f, delta):
+        return grid.ticks(t_f, delta).t
+
+    point = (vector(30.0), vector(0.5))
+    slopes = jax.jacfwd(nodes, (0, 1))(*point)
+    h = 1e-5
+    for k, slope in enumerate(slopes):
+        moved = [list(point), list(point)]
+        moved[0][k], moved[1][k] = point[k] - h, point[k] + h
+        central = (nodes(*moved[1]) - nodes(*moved[0])) / (2 * h)
+        np.testing.assert_allclose(slope, central, atol=1e-6)  # h^2 times third derivatives of up to 1e3

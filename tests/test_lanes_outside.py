@@ -1,0 +1,198 @@
+"""`lanes.vmap` under transformations from outside, with every form of in_axes, and what its loops run on."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import jaxprs_in_params
+from test_lanes import (
+    FIXED,
+    SYMMETRIC,
+    TABLE,
+    TRIALS,
+    M,
+    Q,
+    S,
+    X,
+    Y,
+    agree,
+    check,
+    cubed,
+    draw,
+    squared,
+    time_and_state,
+)
+
+from ptsmc_jax import lanes
+from ptsmc_jax.plants import AttitudeState
+
+# transformations from outside
+
+
+def law(x, m, s):
+    """A bit of everything that a rollout has."""
+
+    def step(c, k):
+        force = jnp.cross(c, m @ c) - s * jnp.where(jnp.abs(c) > 0.5, jnp.sign(c), 2 * c)
+        return c + 0.1 * jnp.tanh(force) * jnp.sin(0.1 * k), jnp.max(jnp.abs(force))
+
+    end, peaks = lax.scan(step, x, jnp.arange(6))
+    return jnp.linalg.norm(end), jnp.max(peaks) + jnp.sum(cubed(end))
+
+
+ARGS = (X, M, S)
+
+
+def loss(vmap, x, m, s):
+    error, peak = vmap(law)(x, m, s)
+    return jnp.sqrt(jnp.mean(error**2)) + jnp.mean(peak)
+
+
+def along(vmap, *args):
+    return jax.jvp(vmap(law), args, tuple(jnp.cos(a) for a in args))
+
+
+def gradients(vmap, *args):
+    return jax.grad(partial(loss, vmap), argnums=(0, 1, 2))(*args)
+
+
+GAIN = jnp.asarray(0.3)
+PAIR = draw(TRIALS, 3, trials=2, seed=3)
+
+# name: what is done with a vmap and (x, m, s) of TRIALS trials
+OUTSIDE = {
+    "jit": lambda vmap, *args: vmap(law)(*args),
+    "jvp": along,
+    "grad": gradients,
+    "jacfwd": lambda vmap, x, m, s: jax.jacfwd(lambda s: loss(vmap, x, m, s))(s),
+    "jacfwd of a shared gain": lambda vmap, x, m, _: jax.jacfwd(lambda g: vmap(law, (0, 0, None))(x, m, g))(GAIN),
+    "jacrev of a shared gain": lambda vmap, x, m, _: jax.jacrev(lambda g: vmap(law, (0, None, None))(x, m[0], g))(GAIN),
+    "captured gain": lambda vmap, x, m, _: jax.jacrev(lambda g: vmap(lambda x: jnp.sin(g * x) @ x)(x))(GAIN),
+    "second derivative": lambda vmap, x, m, _: jax.hessian(lambda g: vmap(lambda x: jnp.sin(g * x) @ x)(x))(GAIN),
+    "vmap": lambda vmap, x, m, s: jax.vmap(vmap(law), (0, None, None))(PAIR, m, s),
+    "vmap of a shared gain": lambda vmap, x, m, _: jax.vmap(lambda g: vmap(law, (0, 0, None))(x, m, g))(FIXED),
+    "scan": lambda vmap, x, m, s: lax.scan(lambda c, g: (vmap(law, (0, 0, None))(x, m, g)[0], c), s, FIXED),
+    "map over blocks": lambda vmap, x, m, s: lax.map(lambda x: vmap(law, (0, None, None))(x, m[0], s[0]), PAIR),
+    "itself": lambda vmap, *args: vmap(lambda x, m, g: vmap(law, (None, 0, None))(x, m, g), (0, None, 0))(*args),
+    "itself, both mapped": lambda vmap, x, m, s: vmap(vmap(lambda a: (jnp.cumsum(a), a @ a)))(m),
+    "jax.vmap inside": lambda vmap, x, m, s: vmap(jax.vmap(lambda a: a * jnp.sum(a)))(m),
+    "checkpoint": lambda vmap, *args: jax.grad(jax.checkpoint(partial(loss, vmap)))(*args),
+    "custom_vjp": lambda vmap, x, m, s: jax.grad(lambda x: vmap(squared)(x).sum())(x),
+    "what goes through jax.vmap": lambda vmap, x, m, s: jax.grad(
+        lambda m: vmap(lambda m: jnp.sum(jnp.linalg.inv(SYMMETRIC(m)) ** 2))(m).sum()
+    )(m),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_lanes_compose_with_transformations_from_outside(name):
+    got, expected = (jax.jit(partial(OUTSIDE[name], vmap))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
+    agree(got, expected)
+
+
+@pytest.mark.parametrize("function", [OUTSIDE["jit"], along, gradients])
+def test_lanes_need_no_jit(function):
+    agree(function(lanes.vmap, *ARGS), function(jax.vmap, *ARGS))
+
+
+def test_custom_derivatives_survive():
+    slope = jax.jvp(lanes.vmap(cubed), (X,), (jnp.ones_like(X),))[1]
+    np.testing.assert_allclose(slope, 100 * X, rtol=1e-15)
+
+
+# arguments
+
+ROWS = [
+    ("all mapped", lambda x, s: x * s, (X, S), 0),
+    ("one shared", lambda x, y: (x * y, y.sum()), (X, FIXED), (0, None)),
+    ("a list of axes", lambda x, y: x * y, (X, FIXED), [0, None]),
+    ("shared matrix", lambda m, x: m @ x, (TABLE.T, X), (None, 0)),
+    ("shared pytree", lambda p, x: p["a"] * x + p["b"][0], ({"a": FIXED, "b": (FIXED,)}, X), (None, 0)),
+    ("mapped pytree", lambda p, x: p["a"] * x + p["b"][0], ({"a": S, "b": (X,)}, FIXED), (0, None)),
+    ("axes in a pytree", lambda p: p[0] * p[1][1] + p[1][2], ((S, {1: X, 2: FIXED}),), ((0, {1: 0, 2: None}),)),
+    ("None among the leaves", lambda p, q: p[0] + q["x"], ((X, None), {"x": FIXED, "y": None}), (0, None)),
+    ("Python numbers", lambda x, a, n: x * a + n, (X, 2.0, 3), (0, None, None)),
+    ("NumPy arrays", lambda x, a: x * a, (np.asarray(X), np.ones(3)), (0, None)),
+    ("one trial", law, (X[:1], M[:1], S[:1]), 0),
+    ("many trials", law, (jnp.tile(X, (40, 1)), M[0], jnp.arange(200.0)), (0, None, 0)),
+    ("no trial", lambda x, s: (x * s, x @ x), (X[:0], S[:0]), 0),
+    ("keys", lambda key: jax.random.normal(key, (3,)), (jax.random.split(jax.random.key(1), TRIALS),), 0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("function", "args", "in_axes"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
+def test_arguments_mapped_and_shared(function, args, in_axes):
+    check(function, *args, in_axes=in_axes)
+
+
+def test_default_axes_map_everything():
+    agree(lanes.vmap(jnp.multiply)(X, Y), X * Y)
+
+
+def test_registered_dataclasses_may_hold_axes():
+    state = AttitudeState(Q, FIXED)
+    check(lambda x: x.q[:3] * x.w, state, in_axes=(AttitudeState(0, None),))  # pyright: ignore[reportArgumentType]
+
+
+def test_single_precision_without_64_bits():
+    with jax.enable_x64(False):
+        args = [jnp.asarray(np.asarray(a), jnp.float32) for a in ARGS]
+        got, expected = (jax.jit(vmap(law))(*args) for vmap in (lanes.vmap, jax.vmap))
+        assert {a.dtype for a in got} == {jnp.dtype("float32")}
+        for a, b in zip(got, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)  # eps 1e-7, a hundred operations
+
+
+ERRORS = [
+    ("unequal numbers of trials", (X, S[:3]), 0),
+    ("nothing mapped", (X, S), None),
+    ("nothing mapped, by a tuple", (X, S), (None, None)),
+    ("no leaves to map", (None, FIXED), (0, None)),
+    ("another axis", (X, S), 1),
+    ("a negative axis", (X, S), (0, -1)),
+    ("a wrong number of axes", (X, S), (0,)),
+    ("axes of another structure", ({"a": X}, S), ({"b": 0}, 0)),
+    ("a number mapped", (X, 2.0), (0, 0)),
+]
+
+
+@pytest.mark.parametrize(("args", "in_axes"), [row[1:] for row in ERRORS], ids=[row[0] for row in ERRORS])
+def test_arguments_that_cannot_be_mapped_raise(args, in_axes):
+    with pytest.raises(ValueError):  # noqa: PT011
+        lanes.vmap(lambda *a: a, in_axes)(*args)
+
+
+def test_the_error_names_what_was_found():
+    with pytest.raises(ValueError, match=r"one number of trials, found \[3, 5\]"):
+        lanes.vmap(jnp.multiply)(X, Y[:3])
+    with pytest.raises(ValueError, match="0 and None only, found 1"):
+        lanes.vmap(jnp.multiply, (0, 1))(X, Y)
+
+
+# what it is for
+
+
+def shapes_in_loops(jaxpr, inside=False):
+    for eqn in jaxpr.eqns:
+        loop = inside or eqn.primitive.name == "scan"
+        if inside:
+            yield from (v.aval.shape for v in eqn.outvars)
+        for inner in jaxprs_in_params(eqn.params):
+            yield from shapes_in_loops(inner, loop)
+
+
+def test_loops_run_on_vectors_over_the_trials():
+    traced = jax.make_jaxpr(lanes.vmap(lambda x, m, s: law(x, m, s)[0]))(*ARGS)
+    assert set(shapes_in_loops(traced.jaxpr)) == {(), (TRIALS,)}
+
+
+def test_what_no_trial_touches_is_computed_once():
+    traced = jax.make_jaxpr(lanes.vmap(time_and_state))(S)
+    (scan,) = [eqn for eqn in traced.jaxpr.eqns if eqn.primitive.name == "scan"]
+    exponentials = [eqn for eqn in scan.params["jaxpr"].jaxpr.eqns if eqn.primitive.name == "exp"]
+    assert [eqn.outvars[0].aval.shape for eqn in exponentials] == [()]
+    (times, states) = jax.eval_shape(lanes.vmap(time_and_state), S)[1]
+    assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))

@@ -1,0 +1,123 @@
+"""Metrics against plain numpy on the history of the same run, and against hand-made spans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+from ptsmc_jax import metrics, rollout
+from tests.helpers import parts, vector
+
+
+def flown(**changes):
+    run = parts(20.0, 3.0, 0.5, **changes)
+    result = rollout.simulate_jit(run, np.uint32(1), np.uint32(4), record=True)
+    log = jax.tree.map(np.asarray, result.log)
+    return run, result.metrics, jax.tree.map(lambda rows: rows[log.lasts], log)
+
+
+@pytest.fixture(scope="module", params=["continuous", "sampled", "flight"])
+def run(request):
+    noisy = {"period": 0.05, "noise": (2e-4, 1e-5)}
+    return flown(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
+
+
+def test_window_error_is_the_integral_of_the_squared_error(run):
+    parts, found, log = run
+    rates = jax.vmap(lambda t, x: parts.controller.errors(x, parts.reference(t))[1])
+    slope = rates(jnp.asarray(log.t), jax.tree.map(jnp.asarray, log.x))
+    spline = CubicHermiteSpline(log.t, log.error, slope)
+    t = np.linspace(20.0, 21.0, 20001)
+    expected = np.sqrt(np.trapezoid(np.sum(spline(t) ** 2, axis=1), t))
+    np.testing.assert_allclose(found.window_error, expected, rtol=1e-5)  # Simpson in a step: 0.1^4 times slopes of 1/s
+
+
+def test_torque_metrics(run):
+    parts, found, log = run
+    held = parts.sensors is not None
+    size = np.abs(log.commanded)
+    # the continuous run also looks between and at the far ends of its rows, where the torque is steep by 3 % a step
+    np.testing.assert_allclose(found.peak_torque, size.max(), rtol=1e-15 if held else 0.03)
+    np.testing.assert_allclose(found.peak_torque_delivered, found.peak_torque)
+    total = np.sum(np.abs(log.u), axis=1)
+    if held:
+        effort = np.sum(total[:-1] * np.diff(log.t))
+        jumps = np.abs(np.diff(log.u[:-1], axis=0))[log.t[1:-1] > 20.0]
+        np.testing.assert_allclose(found.effort, effort, rtol=1e-12)
+        np.testing.assert_allclose(found.chattering, jumps.sum(axis=0).max() / 10.0, rtol=1e-12)
+    else:
+        # trapezium over the rows: second order, 0.2 % at these steps
+        np.testing.assert_allclose(found.effort, np.trapezoid(total, log.t), rtol=5e-3)
+        late = log.u[log.t >= 20.0]
+        np.testing.assert_allclose(found.chattering, np.abs(np.diff(late, axis=0)).sum(axis=0).max() / 10.0, rtol=1e-6)
+    assert float(found.saturated) == 0.0
+
+
+def test_error_rate_and_momentum_metrics(run):
+    parts, found, log = run
+    late = log.t >= 20.0
+    hold = np.linalg.norm(log.error[late], axis=1).max()
+    np.testing.assert_allclose(found.hold_error, max(hold, float(found.terminal_error)), rtol=1e-12)
+    np.testing.assert_allclose(found.peak_rate, np.linalg.norm(log.x.w, axis=1).max(), rtol=1e-12)
+    inertia = np.asarray(parts.plant.inertia)
+    np.testing.assert_allclose(found.peak_momentum, np.linalg.norm(log.x.w @ inertia, axis=1).max(), rtol=1e-12)
+    np.testing.assert_allclose(found.terminal_angle, 2 * np.arcsin(found.terminal_error), rtol=1e-6)
+
+
+def test_settling_time(run):
+    _, found, log = run
+    angle = 2 * np.arcsin(np.minimum(np.linalg.norm(log.error, axis=1), 1.0))  # the reference is the identity
+    last = np.flatnonzero(angle >= 1e-3)[-1]
+    assert log.t[last] <= float(found.settling_time) <= log.t[last + 1]
+
+
+def span(t, t_next, angles, torque=0.0, delivered=None):
+    sights = [metrics.Sight(vector([a / 2, 0, 0]), jnp.zeros(3), vector(a), vector(a), vector(a)) for a in angles]
+    u = vector([torque, 0.0, 0.0])
+    got = u if delivered is None else vector([delivered, 0.0, 0.0])
+    return metrics.Span(vector(t), vector(t_next), *sights, (u,), (got,), (1.0,))
+
+
+def judge(spans, t_end=4.0):
+    judged = metrics.Judged(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
+    running = metrics.begin(spans[0].start, judged)
+    for one in spans:
+        running = metrics.update(running, one, judged)
+    return metrics.finish(running, spans[1].start, judged)
+
+
+def test_settling_interpolates_restarts_and_is_nan_where_it_never_comes():
+    falls = judge([span(0, 1, (1.0, 0.5)), span(1, 2, (0.5, 0.3)), span(2, 4, (0.3, 0.05))])
+    np.testing.assert_allclose(falls.settling_time, 2.0 + 2.0 * 0.2 / 0.25)
+    again = judge([span(0, 1, (0.05, 0.05)), span(1, 2, (0.05, 0.3)), span(2, 4, (0.3, 0.05))])
+    assert float(again.settling_time) > 2.0
+    assert float(judge([span(0, 1, (0.05, 0.05)), span(1, 4, (0.05, 0.01))]).settling_time) == 0.0
+    assert np.isnan(float(judge([span(0, 1, (1.0, 0.05)), span(1, 4, (0.05, 0.2))]).settling_time))
+    assert np.isnan(float(judge([span(0, 1, (1.0, 0.05)), span(1, 4, (0.05, np.nan))]).settling_time))
+
+
+def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
+    found = judge([span(0, 1, (1, 1), 3.0, 2.0), span(1, 3, (1, 1), 1.0), span(3, 4, (1, 1), -1.0)])
+    np.testing.assert_allclose(found.saturated, 0.25)
+    np.testing.assert_allclose([found.peak_torque, found.peak_torque_delivered], [3.0, 2.0])
+    np.testing.assert_allclose(found.effort, 2.0 + 2.0 + 1.0)
+    np.testing.assert_allclose(found.chattering, 2.0 / 3.0)  # the jump at t_f itself does not count
+
+
+def test_an_interval_of_length_zero_changes_nothing():
+    plain = [span(0, 1, (1.0, 0.5), 1.0), span(1, 4, (0.5, 0.2), 0.5)]
+    with_empty = [plain[0], span(1, 1, (9.0, 9.0), 99.0), plain[1]]
+    judged = metrics.Judged(vector(1.0), vector(4.0), vector(1.0), vector(0.1))
+    results = []
+    for spans in (plain, with_empty):
+        running = metrics.begin(spans[0].start, judged)
+        for one in spans:
+            running = metrics.update(running, one, judged)
+        results.append(metrics.finish(running, plain[1].start, judged))
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_catalogue_names_every_metric():
+    assert tuple(metrics.CATALOGUE) == metrics.Metrics._fields

@@ -1,0 +1,96 @@
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from ptsmc_jax import dispersions, montecarlo, rollout, scenario
+from tests.helpers import FIRST_FLIGHT, parts, vector
+
+# eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
+TABLE = (
+    (3.0, 0.05, 10.0, (1.2e-5, 0.16), (4.6e-4, 0.60)),
+    (5.0, 0.05, 10.0, (1.4e-5, 0.45), (5.5e-3, 6.8)),
+    (3.0, 0.5, 10.0, (3.1e-5, 0.16), (3.4e-5, 0.16)),
+    (5.0, 0.5, 10.0, (2.7e-5, 0.45), (4.3e-5, 0.45)),
+    (4.0, 1.0, 40.0, (1.3e-5, 0.29), (1.5e-5, 0.29)),
+)
+SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+
+
+@pytest.fixture(scope="module")
+def flown():
+    run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=22.0)
+    return run, montecarlo.run(run, SPREAD, 5, np.arange(256))
+
+
+def test_256_trials_equal_the_loop_over_them(flown):
+    run, trials = flown
+    alone = jax.jit(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial))
+    for k in range(256):
+        metrics, status, _, q = alone(np.uint32(k))
+        assert int(status) == trials.status[k]
+        np.testing.assert_allclose(q, trials.initial_q[k], atol=1e-15)
+        for name in metrics._fields:
+            a, b = float(getattr(metrics, name)), float(getattr(trials.metrics, name)[k])
+            assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
+
+
+def test_trials_equal_plain_vmap(flown):
+    run, trials = flown
+    plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))
+    metrics, _, _, _ = plain(np.arange(256, dtype=np.uint32))
+    for name in metrics._fields:
+        a, b = getattr(metrics, name), getattr(trials.metrics, name)
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_a_trial_does_not_depend_on_the_others(flown):
+    run, trials = flown
+    some = np.array([200, 3, 3, 77])
+    again = montecarlo.run(run, SPREAD, 5, some)
+    np.testing.assert_allclose(again.metrics.window_error, trials.metrics.window_error[some], rtol=1e-12)
+    np.testing.assert_allclose(again.initial_q, trials.initial_q[some], atol=1e-15)
+    other = montecarlo.run(run, SPREAD, 6, some)
+    assert not np.any(other.metrics.window_error == again.metrics.window_error)
+
+
+def test_a_trial_replayed_alone_with_its_history_equals_its_row(flown):
+    run, trials = flown
+    drawn = SPREAD.apply(run, np.uint32(5), np.uint32(42))
+    result = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(42), record=True)
+    for name in result.metrics._fields:
+        a, b = float(getattr(result.metrics, name)), float(getattr(trials.metrics, name)[42])
+        assert a == pytest.approx(b, rel=1e-12, abs=1e-12), name
+
+
+def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
+    run, trials = flown
+    wide = replace(SPREAD, attitude=dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
+    near = replace(wide, attitude=dispersions.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
+    failed = montecarlo.run(run, near, 5, np.arange(8))
+    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": 8}
+    assert np.all(failed.bad_time >= 0.0)
+    mixed = montecarlo.run(run, wide, 5, np.arange(256))
+    assert sum(mixed.counts().values()) == 256
+    assert np.all(np.isfinite(mixed.metrics.window_error[mixed.ok]))
+    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0}
+
+
+@pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), TABLE)
+def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, quiet, noisy):
+    base = scenario.replace(
+        scenario.read(FIRST_FLIGHT),
+        controller__eta=eta,
+        controller__delta=delta,
+        observer__gain=[gain] * 3,
+        loop__clock="flight",  # one program for all rows
+    )
+    silent = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})
+    for case, (rms, peak) in ((silent, quiet), (base, noisy)):
+        ready = scenario.study(case)
+        trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(1000))
+        assert np.all(trials.ok)
+        # 15 %: the notes' figures come from 64 trials
+        np.testing.assert_allclose(np.sqrt(np.mean(trials.metrics.window_error**2)), rms, rtol=0.15)
+        np.testing.assert_allclose(np.mean(trials.metrics.peak_torque), peak, rtol=0.15)

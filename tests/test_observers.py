@@ -1,0 +1,119 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ptsmc_jax import observers, plants
+from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
+
+
+def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
+    return observers.NonlinearObserver(plants.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
+
+
+@pytest.mark.parametrize("dt", [0.0, 1e-9, 0.05, 1.0, 1e3])
+def test_update_matrix_is_one_minus_the_exponential_over_dt(dt):
+    found = observer()
+    a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
+    expected = a if dt == 0.0 else (np.eye(3) - expm(-a * dt)) / dt
+    rounding = 1e-6 if dt == 1e-9 else 1e-14  # the oracle loses 1e-16/(a dt) to cancellation
+    np.testing.assert_allclose(found.update_matrix(vector(dt)), expected, rtol=1e-12, atol=rounding)
+
+
+def held_motion(inertia, torque, seconds, steps=2000):
+    """Rates at both ends of a period of held torque, by numpy RK4 in many steps."""
+    inverse = np.linalg.inv(inertia)
+    w = np.array([0.05, -0.1, 0.08])
+    start, h = w, seconds / steps
+
+    def rate(w):
+        return inverse @ (torque - np.cross(w, inertia @ w))
+
+    for _ in range(steps):
+        k1 = rate(w)
+        k2 = rate(w + h / 2 * k1)
+        k3 = rate(w + h / 2 * k2)
+        w = w + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(w + h * k3))
+    return start, w
+
+
+@pytest.mark.parametrize("gain", [0.5, 10.0, 300.0])
+def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
+    found = observer(gain=(gain,) * 3)
+    d, u, h = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.3, -0.2]), 0.05
+    w, w_next = held_motion(np.asarray(FULL_INERTIA), u + d, h)
+    matrix = found.update_matrix(vector(h))
+    d_hat = found.update(matrix, vector(d), vector(w), vector(w_next), vector(u), vector(h))
+    # what is right stays; the mean of both gyroscopic torques is the trapezium rule: h^2/12 (d^2/dt^2 of 0.01 N m)
+    np.testing.assert_allclose(d_hat, d, atol=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA, (1e-3, 1.2e-3, 1.5e-3)])
+@pytest.mark.parametrize("dt", [1e-3, 0.05, 10.0])
+def test_digital_update_contracts_for_any_gain_and_period(inertia, dt):
+    for gain in (0.5, 10.0, 300.0):
+        found = observer(inertia, (gain,) * 3)
+        matrix = np.asarray(found.update_matrix(vector(dt)))
+        modes = np.linalg.eigvals(np.eye(3) - matrix * dt).real
+        assert np.all((modes >= -1e-12) & (modes < 1.0))
+
+
+def test_continuous_error_obeys_its_equation():
+    """(54) with the true motion: d_hat' = forcing - A d_hat must be -A (d_hat - d)."""
+    found, body = observer(), plants.spacecraft(FULL_INERTIA)
+    w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
+    w_dot = body.rate(plants.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), w), u, d).w
+    a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
+    np.testing.assert_allclose(found.decay_matrix(), a, rtol=1e-12)
+    found_rate = found.forcing(w, w_dot, u) - found.decay_matrix() @ d_hat
+    np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)
+
+
+def test_bound_is_the_corrected_one():
+    bound = observer(PAPER_INERTIA, (10.0,) * 3).error_bound()
+    rate = 10.0 / 14.0
+    for t in (0.0, 0.7, 5.0, 100.0):
+        expected = np.sqrt(3) * 1e-3 / rate * (1 - np.exp(-rate * t))  # with sqrt(3), against the paper's (55)
+        np.testing.assert_allclose(bound(vector(t)), expected, atol=1e-17)
+
+
+def worst_error(a, sign_pattern, c, seconds, steps=20000):
+    """Estimation error for d' = +-c held in a fixed sign pattern along the slowest mode, exactly: -A^-1 (I - E) c."""
+    return np.linalg.solve(a, (np.eye(3) - expm(-a * seconds)) @ (c * sign_pattern))
+
+
+@pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA])
+@pytest.mark.parametrize("gain", [(10.0, 10.0, 10.0), (30.0, 3.0, 10.0)])
+def test_error_stays_inside_the_bound_and_can_come_near_it(inertia, gain):
+    found = observer(inertia, gain)
+    bound, a = found.error_bound(), np.asarray(found.decay_matrix())
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    ratios = [
+        np.linalg.norm(worst_error(a, sign, 1e-3, t)) / float(bound(vector(t)))
+        for t in (0.1, 1.0, 10.0, 100.0)
+        for sign in signs
+    ]
+    assert max(ratios) <= 1.0 + 1e-12
+    assert max(ratios) > 0.25  # no empty bound
+    initial = observer(inertia, gain, c=0.0, start=0.05).error_bound()
+    for t in (0.0, 0.5, 3.0):
+        gone = np.linalg.norm(expm(-a * t) @ np.eye(3), axis=0).max() * 0.05
+        assert gone <= float(initial(vector(t))) * (1 + 1e-12)
+
+
+def test_paper_bound_is_violated_in_its_own_case():
+    """c/l_m, without the sqrt(3), is below the error that d' = (c, c, c) leaves with a diagonal J."""
+    a = np.diag(10.0 / np.array(PAPER_INERTIA))
+    error = np.linalg.norm(worst_error(a, np.ones(3), 1e-3, 100.0))
+    assert error > 1e-3 / (10.0 / 14.0)
+    assert error < float(observer(PAPER_INERTIA, (10.0,) * 3).error_bound()(vector(100.0)))
+
+
+def test_finite_derivative_for_equal_moments():
+    import jax
+
+    def floor(gain):
+        return observer((5.0, 5.0, 5.0), jnp.full(3, gain)).error_bound().floor
+
+    slope = jax.jacfwd(floor)(vector(10.0))
+    np.testing.assert_allclose(slope, -np.sqrt(3) * 1e-3 * 5.0 / 100.0, rtol=1e-10)

@@ -1,0 +1,180 @@
+"""Gradients of the noisy loss, bounds, the search and what is handed over."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario
+from ptsmc_jax.requirements import Requirement
+from tests.helpers import FIRST_FLIGHT, parts, vector
+from tuning import bounds, objective, optimise, report
+
+SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+
+
+@pytest.fixture(scope="module")
+def loss():
+    """ln RMS window error of 6 noisy trials over (eta, delta, l, t_f), and its derivative, compiled once."""
+    run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=23.0, reach=(23.0, 3.0))
+
+    def value(gains):
+        eta, delta, gain, t_f = gains
+        moved = bounds.with_gains(run, {"eta": eta, "delta": delta, "observer_gain": gain})
+        moved = replace(moved, controller=replace(moved.controller, t_f=t_f))
+
+        def fly(trial):
+            return montecarlo.one(moved, SPREAD, np.uint32(2), trial)[0].window_error
+
+        return 0.5 * jnp.log(jnp.mean(lanes.vmap(fly)(jnp.arange(6, dtype=jnp.uint32)) ** 2))
+
+    return jax.jit(value), jax.jit(jax.jacfwd(value))
+
+
+def central(value, at, k, h):
+    """Fourth-order central difference along one gain."""
+    steps = np.eye(at.size)[k] * h
+    f = [float(value(jnp.asarray(at + n * steps))) for n in (-2, -1, 1, 2)]
+    return (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
+
+
+def test_gradients_of_the_noisy_loss_agree_with_central_differences(loss):
+    value, slope = loss
+    rng = np.random.default_rng(11)
+    for _ in range(10):
+        at = np.array([rng.uniform(2.3, 5.0), rng.uniform(0.3, 2.5), rng.uniform(2.0, 80.0), rng.uniform(18.0, 21.0)])
+        exact = np.asarray(slope(jnp.asarray(at)))
+        numeric = np.array([central(value, at, k, 1e-4 * at[k]) for k in range(4)])
+        np.testing.assert_allclose(exact, numeric, rtol=1e-4, atol=1e-4 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("delta", [0.5, 1.0, 2.0])
+def test_loss_and_gradient_are_finite_and_continuous_where_delta_is_a_multiple_of_the_period(loss, delta):
+    value, slope = loss
+    points = [jnp.asarray([3.2, delta + nudge, 12.0, 20.0]) for nudge in (-1e-7, 0.0, 1e-7)]
+    values, slopes = np.array([value(p) for p in points]), np.array([slope(p) for p in points])
+    assert np.all(np.isfinite(slopes))
+    # continuous: what is left is the slope (and the curvature) times the nudge
+    np.testing.assert_allclose(values, values[1], atol=2e-7 * np.abs(slopes).max() + 1e-12)
+    # the first period vanishes there, and with it its share of the noise: the slope is one of its two sides'
+    sides = [np.abs(slopes[1] - slopes[k]).max() for k in (0, 2)]
+    assert min(sides) < 1e-4 * np.abs(slopes).max()
+    assert max(sides) < 0.05 * np.abs(slopes).max()
+
+
+def test_forward_and_reverse_mode_agree():
+    run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.5)
+
+    def value(gains):
+        moved = bounds.with_gains(run, {"eta": gains[0], "delta": gains[1], "observer_gain": gains[2]})
+        metrics = rollout.simulate(moved, np.uint32(0), np.uint32(1)).metrics
+        return jnp.log(metrics.window_error) + metrics.peak_torque
+
+    at = jnp.asarray([3.0, 0.53, 10.0])
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(value))(at), jax.jit(jax.grad(value))(at), rtol=1e-9)
+
+
+def test_bounds_map_reals_into_the_interval_and_back():
+    some = bounds.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
+    assert list(some.logarithmic) == [False, True, True]
+    rng = np.random.default_rng(0)
+    for z in rng.normal(size=(20, 3)) * 3:
+        gains = np.asarray(some.gains(jnp.asarray(z)))
+        assert np.all((gains > some.lower) & (gains < some.upper))
+        np.testing.assert_allclose(some.free(gains, edge=1e-9), z, rtol=1e-6)
+    for extreme in (-1e3, 1e3):
+        gains = np.asarray(some.gains(jnp.full(3, extreme)))
+        assert np.all((gains >= np.array(some.lower) * (1 - 1e-12)) & (gains <= np.array(some.upper) * (1 + 1e-12)))
+    assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
+
+
+def problem(**limits):
+    run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
+    run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
+    return objective.Problem(
+        parts=run,
+        dispersion=SPREAD,
+        seed=jnp.uint32(3),
+        trials=jnp.arange(8, dtype=jnp.uint32),
+        limits=vector(list(limits.values())),
+        averaged=8,
+        names=("eta", "delta"),
+        metrics=tuple(limits),
+    )
+
+
+def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
+    some = problem(peak_torque=0.7, effort=5.0)
+    f, c = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
+    np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(flown.metrics.window_error**2)), rtol=1e-10)
+    np.testing.assert_allclose(c[0] + 1, flown.metrics.peak_torque / 0.7, rtol=1e-10)
+    np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
+
+
+def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
+    some = problem(peak_torque=0.7)
+    near = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))
+
+    def f(gains):
+        return objective.measure(replace(some, dispersion=near), gains)
+
+    (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jacfwd(f)(vector([3.0, 0.7]))
+    np.testing.assert_allclose(value, np.log(objective.FAILED))
+    assert np.all(np.asarray(over) == objective.FAILED - 1)
+    assert np.all(np.isfinite(slope))
+
+
+def test_search_finds_the_constrained_optimum(monkeypatch):
+    """Against a brute-force scan of the same problem, screening for harder trials left out."""
+    monkeypatch.setattr(optimise, "SCREENED", 16)
+    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    some = problem(peak_torque=0.9)
+    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    wanted = (Requirement("peak_torque", 0.9),)
+    seen = []
+    found = optimise.search(some, limits, wanted, np.array([3.0, 0.5]), 3, 40, 1, lambda *told: seen.append(told))
+    assert found.dropped == []
+    assert found.worst[0] <= 1.0
+    assert len(seen) == len(found.history)
+    final = replace(some, trials=jnp.asarray(found.trials))
+
+    @jax.jit
+    def scan(points):
+        return jax.lax.map(lambda gains: objective.measure(final, gains), points)
+
+    grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 25), np.geomspace(0.2, 5.0, 41)), axis=-1).reshape(-1, 2)
+    f, c = scan(jnp.asarray(grid))
+    best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= 0.0].min())
+    assert found.rms <= best * 1.01
+    f, c = objective.measure(final, jnp.asarray(found.gains))
+    np.testing.assert_allclose(np.exp(f), found.rms, rtol=1e-9)
+    assert np.asarray(c).max() <= 0.0
+
+
+def test_starts_begin_with_the_scenarios_own_gains_and_differ():
+    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    z = optimise.starting_points(problem(), limits, np.array([3.0, 0.5]), 4, 7)
+    assert z.shape == (4, 2)
+    np.testing.assert_allclose(limits.gains(jnp.asarray(z[0])), [3.0, 0.5], rtol=1e-9)
+    assert len(np.unique(z, axis=0)) == 4
+
+
+def test_as_flown_judges_on_the_flight_clock_with_the_exact_sign():
+    flown = report.as_flown(scenario.read(FIRST_FLIGHT))
+    assert flown.loop.clock == "flight"
+    assert flown.controller.sign_width == 0.0
+
+
+def test_statistics_count_failures_and_average_the_rest():
+    run = parts(20.0, 3.0, 0.5, period=0.2, t_end=21.0)
+    wide = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
+    trials = montecarlo.run(run, wide, 5, np.arange(64))
+    told = report.statistics(trials)
+    assert told["trials"] == 64
+    assert 0 < told["counts"]["singular"] < 64
+    errors = trials.metrics.window_error[trials.ok]
+    np.testing.assert_allclose(told["window_error"]["rms"], np.sqrt(np.mean(errors**2)))
+    np.testing.assert_allclose(told["peak_torque"]["max"], trials.metrics.peak_torque[trials.ok].max())
