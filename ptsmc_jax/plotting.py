@@ -160,7 +160,7 @@ def tradeoff(sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | Non
     for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), _STYLES, markers, strict=False):
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
         axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
-        text = f"{label}: RMS {rms:.2g}, mean peak {mean:.2g} N m"
+        text = f"{label}: RMS {rms:.2e}, mean peak {mean:.3g} N m"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
     if limit is not None:
         axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} N m")

@@ -135,7 +135,18 @@ def test_from_rotation_vector_is_scipys():
     np.testing.assert_allclose(got, expected, rtol=0, atol=8 * EPS)
 
 
-SIZES = [0.0, 1e-160, 1e-9, 1e-6, *(1e-3 * (1 + x) for x in (-1e-6, -1e-15, 1e-15, 1e-6)), 0.0099, 0.5, 3.0, math.pi, 6.0]
+SIZES = [
+    0.0,
+    1e-160,
+    1e-9,
+    1e-6,
+    *(1e-3 * (1 + x) for x in (-1e-6, -1e-15, 1e-15, 1e-6)),
+    0.0099,
+    0.5,
+    3.0,
+    math.pi,
+    6.0,
+]
 
 
 @pytest.mark.parametrize("size", SIZES)  # the series hands over at 1e-3

@@ -236,6 +236,9 @@ def test_samples_are_uncorrelated(sheet):
         values = (values - values.mean(axis=0)) / values.std(axis=0)
         for lag in range(1, 51):
             assert np.abs(np.mean(values[lag:] * values[:-lag], axis=0)).max() < limit
+        # and no column with another's next sample: 128^2 pairs
+        crossed = values[1:].T @ values[:-1] / len(values)
+        assert np.abs(crossed).max() < -stats.norm.ppf(ALARM / 2 / crossed.size) / math.sqrt(len(sheet))
 
 
 def test_neighbouring_seeds_are_uncorrelated():

@@ -40,7 +40,7 @@ FLOORS = {
         objective
         optimise
         report single
-        cli
+        cli table
     """,
 }
 FLOOR = {

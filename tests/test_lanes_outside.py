@@ -115,6 +115,7 @@ ROWS = [
     ("axes in a pytree", lambda p: p[0] * p[1][1] + p[1][2], ((S, {1: X, 2: FIXED}),), ((0, {1: 0, 2: None}),)),
     ("None among the leaves", lambda p, q: p[0] + q["x"], ((X, None), {"x": FIXED, "y": None}), (0, None)),
     ("Python numbers", lambda x, a, n: x * a + n, (X, 2.0, 3), (0, None, None)),
+    ("Python numbers are weakly typed", lambda x, a: x * a, (X.astype(jnp.float32), 2.0), (0, None)),
     ("NumPy arrays", lambda x, a: x * a, (np.asarray(X), np.ones(3)), (0, None)),
     ("one trial", law, (X[:1], M[:1], S[:1]), 0),
     ("many trials", law, (jnp.tile(X, (40, 1)), M[0], jnp.arange(200.0)), (0, None, 0)),
@@ -189,10 +190,22 @@ def test_loops_run_on_vectors_over_the_trials():
     assert set(shapes_in_loops(traced.jaxpr)) == {(), (TRIALS,)}
 
 
-def test_what_no_trial_touches_is_computed_once():
-    traced = jax.make_jaxpr(lanes.vmap(time_and_state))(S)
+def time_and_state_in_a_call(s):
+    step = jax.jit(lambda t, x: (t + 0.1, x + jnp.exp(-t) * x))
+    return lax.scan(lambda c, _: (step(*c), c), (0.0, s), None, 6)
+
+
+@pytest.mark.parametrize("run", [time_and_state, time_and_state_in_a_call])
+def test_what_no_trial_touches_is_computed_once(run):
+    traced = jax.make_jaxpr(lanes.vmap(run))(S)
     (scan,) = [eqn for eqn in traced.jaxpr.eqns if eqn.primitive.name == "scan"]
     exponentials = [eqn for eqn in scan.params["jaxpr"].jaxpr.eqns if eqn.primitive.name == "exp"]
     assert [eqn.outvars[0].aval.shape for eqn in exponentials] == [()]
-    (times, states) = jax.eval_shape(lanes.vmap(time_and_state), S)[1]
+    (times, states) = jax.eval_shape(lanes.vmap(run), S)[1]
     assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))
+
+
+def test_large_arrays_are_not_taken_apart():
+    few, many = (len(jax.make_jaxpr(lanes.vmap(lambda t: 2 * t + 1))(draw(n)).eqns) for n in (65, 64))
+    assert few < 5
+    assert many >= 2 * 64

@@ -29,10 +29,11 @@ POLISHED = 3  # starts that are polished
 POLISH_STEPS = 40  # iterations of each, at most
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
-CANDIDATES = 32  # points flown for each start that is chosen
+CANDIDATES = 32  # points flown for each start that is chosen, a multiple of TOGETHER
+TOGETHER = 8  # of them in one batch
 CHARGE, APART = 3.0, 0.15
-MARGIN = 0.005  # limits are approached to within this share, so that the exact forms stay below them
-SCREENED = 16384  # trials looked through for those that a limit depends on
+MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
+SCREENED = 4096  # trials looked through for those that a limit depends on
 HARDEST = 8  # of them that join the constraints
 ROUNDS = 2  # searches again with hardest trials added, at most
 
@@ -71,7 +72,9 @@ def starting_points(problem: Problem, bounds: Bounds, own: np.ndarray, starts: i
     share = qmc.LatinHypercube(len(bounds.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
     share = 0.02 + 0.96 * share
     z = np.log(share / (1.0 - share))
-    f, c = map(np.asarray, _fly(problem, bounds, z, len(jax.local_devices())))
+    batches = z.reshape(-1, TOGETHER, z.shape[1])
+    flown = _fly(problem, bounds, batches, _divisor(len(batches)))
+    f, c = (np.asarray(v).reshape(len(z), *v.shape[2:]) for v in flown)
     merit = f + CHARGE * np.log1p(c.max(axis=(1, 2), initial=0.0))
     order = [k for k in np.argsort(merit) if np.isfinite(merit[k])]
     chosen: list[int] = []
@@ -223,19 +226,24 @@ def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
 def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """F and c of many points, without derivatives; their number is a multiple of the devices'."""
+    """Measures f and c of (batches, points, gains) free reals, without derivatives, batch after batch."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
     whole, spread = PartitionSpec(), PartitionSpec("device")
 
     def share(problem: Problem, z: jax.Array) -> tuple:
-        return jax.lax.map(lambda z: measure(problem, bounds.gains(z)), z, batch_size=8)
+        return jax.lax.map(jax.vmap(lambda z: measure(problem, bounds.gains(z))), z)
 
     return jax.shard_map(share, mesh=mesh, in_specs=(whole, spread), out_specs=spread, check_vma=False)(problem, z)
 
 
+def _divisor(count: int) -> int:
+    """The most local devices that share `count` things evenly."""
+    return max(d for d in range(1, len(jax.local_devices()) + 1) if count % d == 0)
+
+
 def _evaluate(problem: Problem, bounds: Bounds, z: np.ndarray) -> tuple[np.ndarray, ...]:
     """For each start: gains, f, c and their derivatives by z; starts shared out over as many devices as divide them."""
-    devices = max(d for d in range(1, len(jax.local_devices()) + 1) if len(z) % d == 0)
+    devices = _divisor(len(z))
     # plain arrays in and out: what came back spread over the devices would be compiled for anew
     gains, f, c, f_slope, c_slope = map(np.asarray, _compiled(problem, bounds, z, devices))
     return gains, f, c, f_slope, c_slope

@@ -1,0 +1,37 @@
+# Two commands matter: `make tune` (gains for the paper's spacecraft) and `make test`.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+SCENARIO := scenarios/first_flight.toml
+OUT := out/tune-first_flight
+
+.PHONY: tune test setup table clean
+
+tune: $(VENV)/.installed
+	$(BIN)/ptsmc tune $(SCENARIO) --out $(OUT)
+	@echo "Tuned gains: $(OUT)/tuned.toml; figures: $(OUT)/figures; all numbers: $(OUT)/summary.json"
+
+test: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+table: $(VENV)/.installed
+	$(BIN)/python -m tuning.table
+
+setup: $(VENV)/.installed-dev
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("ptsmc-jax needs Python 3.11 or newer; name one with make PYTHON=...") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
