@@ -148,11 +148,24 @@ def graded(
     200 graded steps and at most t_f/200 each leave 1e-8 in the states of the paper's cases, and the error falls with
     the fourth power. Explicit steps must resolve the smooth sign: rate `layer` tau before the hand-over, `layer` after.
     """
-    rapid = 0.3 / max(frequency, 1e-12)
-    max_step = min(t_f / 200.0, rapid, 1.5 / max(layer * t_f, 1e-12))
-    before = 200 + math.ceil((t_f - delta) / max_step)
-    hold_step = min(0.1 / max(1.0, k1 / 2.0), rapid, 1.5 / max(layer, 1e-12))
-    after = math.ceil((t_end - t_f + delta) / hold_step)
+    max_step, _ = _largest_steps(t_f, k1, frequency, layer)
+    before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, k1, frequency, layer))
     times = np.asarray(saves, dtype=float).reshape(-1)
     end, width, largest = (jnp.asarray(float(v)) for v in (t_end, window, max_step))
     return Graded(end, width, largest, jnp.asarray(times), before, after)
+
+
+def graded_steps(
+    t_f: float, delta: float, t_end: float, k1: float, frequency: float, layer: float
+) -> tuple[float, float]:
+    """How many steps `graded` takes before and after the hand-over, before rounding up; may be infinite."""
+    before, after = _largest_steps(t_f, k1, frequency, layer)
+    with np.errstate(divide="ignore"):
+        return 200.0 + float(np.divide(t_f - delta, before)), float(np.divide(t_end - t_f + delta, after))
+
+
+def _largest_steps(t_f: float, k1: float, frequency: float, layer: float) -> tuple[float, float]:
+    """Largest step before and after the hand-over [s]."""
+    rapid = 0.3 / max(frequency, 1e-12)
+    before = min(t_f / 200.0, rapid, 1.5 / max(layer * t_f, 1e-12))
+    return before, min(0.1 / max(1.0, k1 / 2.0), rapid, 1.5 / max(layer, 1e-12))

@@ -62,7 +62,8 @@ def _pairs(key: Key, sample: Whole, count: int) -> list[tuple[Array, Array]]:
 
 def _unit(word: Array) -> Array:
     kind = jnp.result_type(float)
-    return (word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32)
+    below_one = np.nextafter(kind.type(1.0), kind.type(0.0))  # float32 would round the largest words up to 1
+    return jnp.minimum((word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32), below_one)
 
 
 def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:

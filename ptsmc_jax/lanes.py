@@ -21,7 +21,7 @@ from jaxtyping import Array
 _LARGEST = 64
 
 _ELEMENTWISE = set(
-    """abs acos acosh add and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp convert_element_type
+    """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type
     copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p
     logistic lt max min mul ne neg nextafter not or population_count pow real reduce_precision rem round rsqrt
     select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan
@@ -45,20 +45,28 @@ class _Lane:
     def __init__(self, shape: tuple[int, ...], parts: np.ndarray | None = None, dense: Array | None = None):
         self.shape, self._parts, self._dense = shape, parts, dense
 
+    # What is computed here is not kept: inside a loop's body it belongs to that body alone.
+
     @property
     def parts(self) -> np.ndarray:
         """Object array of the value's shape, each entry (trial,) or, where equal in all trials, ()."""
-        if self._parts is None:
-            assert self._dense is not None
-            self._parts = _object_array(self.shape, (self._dense[(slice(None), *i)] for i in np.ndindex(*self.shape)))
-        return self._parts
+        if self._parts is not None:
+            return self._parts
+        dense = self._dense
+        assert dense is not None
+        return _object_array(self.shape, (dense[(slice(None), *i)] for i in np.ndindex(*self.shape)))
+
+    def apart(self) -> "_Lane":
+        """The same value taken apart now, unless it is too large for that."""
+        small = self._parts is None and np.prod(self.shape, dtype=int) <= _LARGEST
+        return _Lane(self.shape, self.parts, self._dense) if small else self
 
     def dense(self, trials: int) -> Array:
         """(trial, *shape) array."""
-        if self._dense is None:
-            flat = [jnp.broadcast_to(part, (trials,)) for part in self.parts.flat]
-            self._dense = jnp.stack(flat, axis=-1).reshape((trials, *self.shape)) if self.shape else flat[0]
-        return self._dense
+        if self._dense is not None:
+            return self._dense
+        flat = [jnp.broadcast_to(part, (trials,)) for part in self.parts.flat]
+        return jnp.stack(flat, axis=-1).reshape((trials, *self.shape)) if self.shape else flat[0]
 
 
 def vmap(function: Callable, in_axes: Any = 0) -> Callable:
@@ -74,6 +82,8 @@ def vmap(function: Callable, in_axes: Any = 0) -> Callable:
         )
         leaves, tree = jax.tree.flatten(args)
         leaves = [jnp.asarray(leaf) for leaf in leaves]
+        if any(on and not leaf.shape for leaf, on in zip(leaves, mapped_over, strict=True)):
+            raise ValueError("a number has no axis to map over")
         sizes = {leaf.shape[0] for leaf, on in zip(leaves, mapped_over, strict=True) if on}
         if len(sizes) != 1:
             raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
@@ -84,7 +94,8 @@ def vmap(function: Callable, in_axes: Any = 0) -> Callable:
         closed, out = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, one))
         trials = sizes.pop()
         values = [
-            _Lane(leaf.shape[1:], dense=leaf) if on else leaf for leaf, on in zip(leaves, mapped_over, strict=True)
+            _Lane(leaf.shape[1:], dense=leaf).apart() if on else leaf
+            for leaf, on in zip(leaves, mapped_over, strict=True)
         ]
         results = _evaluate(closed.jaxpr, closed.consts, values, trials)
         return jax.tree.unflatten(jax.tree.structure(out), [_dense(value, trials) for value in results])
@@ -123,18 +134,24 @@ def _parts(value: Any) -> np.ndarray:
 
 def _evaluate(jaxpr: core.Jaxpr, consts: Sequence, args: Sequence, trials: int) -> list:
     """Values of the outputs of a trace, for arguments that are lanes or plain arrays."""
-    known: dict = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+    known: dict = {}
+
+    def write(variables: Sequence, values: Sequence) -> None:
+        for variable, value in zip(variables, values, strict=True):
+            empty = isinstance(value, _Lane) and 0 in value.shape  # nothing in it that could differ
+            known[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
 
     def read(atom: Any) -> Any:
         return atom.val if isinstance(atom, core.Literal) else known[atom]
 
+    write([*jaxpr.constvars, *jaxpr.invars], [*consts, *args])
     for eqn in jaxpr.eqns:
         values = [read(atom) for atom in eqn.invars]
         if not any(isinstance(value, _Lane) for value in values):
             results = _bind(eqn, values)
         else:
             results = _apply(eqn, values, trials)
-        known.update(zip(eqn.outvars, results, strict=True))
+        write(eqn.outvars, results)
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -161,7 +178,8 @@ def _apply(eqn: Any, values: list, trials: int) -> Sequence:
             return [_structural(eqn, values)]
         if name in _REDUCTIONS:
             return [_reduction(eqn, values[0])]
-        if name == "dot_general" and not any(params["dimension_numbers"][1]):
+        numeric = eqn.outvars[0].aval.dtype != bool
+        if name == "dot_general" and numeric and not any(params["dimension_numbers"][1]):
             return [_contraction(eqn, values)]
     dense = jax.vmap(lambda *v: _bind(eqn, v), [0 if isinstance(v, _Lane) else None for v in values])(
         *(v.dense(trials) if isinstance(v, _Lane) else v for v in values)
@@ -208,10 +226,11 @@ def _fold(operation: Callable, items: Iterable) -> Array:
 
 def _contraction(eqn: Any, values: list) -> _Lane:
     (left_axes, right_axes), _ = eqn.params["dimension_numbers"]
-    left, right = (_parts(v) for v in values)
+    kind = eqn.outvars[0].aval.dtype
+    left, right = (np.vectorize(lambda part: lax.convert_element_type(part, kind), [object])(_parts(v)) for v in values)
     left = np.moveaxis(left, left_axes, range(-len(left_axes), 0))
     right = np.moveaxis(right, right_axes, range(-len(right_axes), 0))
-    kept_left, kept_right = left.shape[: -len(left_axes)], right.shape[: -len(right_axes)]
+    kept_left, kept_right = (array.shape[: array.ndim - len(left_axes)] for array in (left, right))
     left, right = left.reshape((*kept_left, -1)), right.reshape((*kept_right, -1))
     shape = (*kept_left, *kept_right)
     items = (
@@ -228,6 +247,7 @@ def _scan(eqn: Any, values: list, trials: int) -> list:
     body, constants, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
     consts, init, xs = values[:constants], values[constants : constants + carried], values[constants + carried :]
 
+    consts = [value.apart() if isinstance(value, _Lane) else value for value in consts]
     # which carries depend on the trial: those that start so, and those that a pass through the body makes so
     differs = [isinstance(value, _Lane) for value in init]
     while True:
@@ -267,9 +287,9 @@ def _scan(eqn: Any, values: list, trials: int) -> list:
     results = [gather(c, s, d) for c, s, d in zip(last, carry_shapes, differs, strict=True)]
     for y, shape, laned in zip(ys, out_shapes[carried:], outputs[carried:], strict=True):
         if laned:  # (component) of (time, trial) -> (trial, time, *shape)
-            dense = jnp.stack(y, axis=-1) if shape else y[0][..., None]
-            dense = jnp.moveaxis(dense, 0, 1).reshape((trials, params["length"], *shape))
-            y = _Lane((params["length"], *shape), dense=dense)
+            rows_of = (params["length"], *shape)
+            dense = None if 0 in rows_of else jnp.moveaxis(jnp.stack(y, axis=-1), 0, 1).reshape((trials, *rows_of))
+            y = _Lane(rows_of, np.empty(rows_of, dtype=object) if dense is None else None, dense)
         results.append(y)
     return results
 

@@ -57,11 +57,17 @@ def spacecraft(inertia: object) -> Spacecraft:
 
 def check_inertia(inertia: object) -> np.ndarray:
     """The (3, 3) inertia tensor [kg m^2] that `spacecraft` would use; raises ValueError as it does."""
-    tensor = np.asarray(inertia, dtype=float)
+    try:
+        tensor = np.asarray(inertia)
+        if not np.issubdtype(tensor.dtype, np.number):
+            raise TypeError
+        tensor = tensor.astype(float)
+    except (ValueError, TypeError):  # rows of different lengths, or no numbers
+        tensor = np.zeros(0)
     if tensor.shape == (3,):
         tensor = np.diag(tensor)
     if tensor.shape != (3, 3):
-        raise ValueError("allowed are three principal moments or a symmetric 3x3 tensor")
+        raise ValueError("allowed are three principal moments or a symmetric 3x3 tensor [kg m^2]")
     if not np.all(np.isfinite(tensor)):
         raise ValueError("every entry must be a finite number")
     scale = np.abs(tensor).max()

@@ -19,6 +19,7 @@ from ptsmc_jax.rollout import SINGULAR_CLEARANCE, Parts
 from ptsmc_jax.schema import NOT_YET, Scenario, ScenarioError, wrong
 
 MOST_STEPS = 200_000
+MOST_SUBSTEPS = 50
 
 
 @dataclass(frozen=True)
@@ -129,10 +130,11 @@ def _resolve(scenario: Scenario) -> Scenario:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
     tune = scenario.tune
     if tune is not None:
-        shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
+        shortest = loop.period if loop.mode == "sampled" else 0.0
+        lower = max(shortest, min(0.05, t_f / 4))
         default = {
             "eta": (2.05, 8.0),
-            "delta": (min(shortest, t_f / 4), min(5.0, t_f / 2)),
+            "delta": (lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)),
             "observer_gain": (0.5, 300.0),
             "k1": (0.1, 10.0),
             "sign_width": (1e-5, 1e-1),
@@ -169,6 +171,8 @@ def _check_available(scenario: Scenario) -> None:
     if tune is not None:
         if tune.objective != "rms":
             refuse("tune.objective", tune.objective, '"rms"')
+        if tune.level is not None:
+            raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
         if "t_f" in tune.free:
             refuse("tune.free", tune.free, "eta, delta, observer_gain, k1, sign_width")
 
@@ -178,9 +182,8 @@ def _check(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     try:
         plants.check_inertia(scenario.spacecraft.inertia)
-    except (ValueError, TypeError) as error:
-        reason = str(error) if isinstance(error, ValueError) else "numbers only"
-        raise ScenarioError(f"spacecraft.inertia is {schema.show(scenario.spacecraft.inertia)}: {reason}") from None
+    except ValueError as error:
+        raise ScenarioError(f"spacecraft.inertia is {schema.show(scenario.spacecraft.inertia)}: {error}") from None
     quaternion(scenario.initial, "initial")
     quaternion(scenario.reference, "reference")
     t_f, delta, sampled = controller.t_f, controller.delta, loop.mode == "sampled"
@@ -299,7 +302,10 @@ def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
         else:
             timing = clock.flight(loop.period, loop.t_end)
         # RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s
-        substeps = max(1, math.ceil(loop.period * max(frequency / 4, body_rate) / 0.025))
+        needed = loop.period * max(frequency / 4, body_rate) / 0.025
+        if needed > MOST_SUBSTEPS:
+            raise _too_fast(scenario, loop.period * frequency / 4 / 0.025 > MOST_SUBSTEPS)
+        substeps = max(1, math.ceil(needed))
     return Parts(
         plant=model,
         disturbance=disturbance,
@@ -331,15 +337,29 @@ def _grid(
     # s' = -(tau/2) |T J^-1| K2 tanh(s/width) + ...: the rate of the boundary layer at tau = t_f, and in hold
     switching = float(jnp.linalg.norm(observer.model.inertia_inverse) * jnp.maximum(bound.floor, bound.start))
     layer = switching / (2.0 * table.sign_width) if table.sign_width > 0 else 0.0
-    grid = clock.graded(reach.t_f, reach.smallest_delta, loop.t_end, loop.window, table.k1, frequency, layer, saves)
-    if grid.before + grid.after > MOST_STEPS:
-        raise wrong(
-            "controller.sign_width",
-            table.sign_width,
-            f"larger, or 0 for the exact sign: the continuous loop would need {grid.before + grid.after} steps "
-            f"to resolve it, and at most {MOST_STEPS} are allowed",
-        )
-    return grid
+    steps = clock.graded_steps(reach.t_f, reach.smallest_delta, loop.t_end, table.k1, frequency, layer)
+    if not sum(steps) <= MOST_STEPS:
+        raise _too_many(scenario, sum(steps), layer * reach.t_f, frequency)
+    return clock.graded(reach.t_f, reach.smallest_delta, loop.t_end, loop.window, table.k1, frequency, layer, saves)
+
+
+def _too_fast(scenario: Scenario, disturbance: bool) -> ScenarioError:
+    """Refusal of a sampled run in which too much happens within one period."""
+    asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
+    if disturbance and isinstance(scenario.disturbance, schema.SinusoidDisturbance):
+        return wrong("disturbance.frequency", scenario.disturbance.frequency, f"lower: {asks}")
+    return wrong("loop.period", scenario.loop.period, f"shorter for these body rates: {asks}")
+
+
+def _too_many(scenario: Scenario, steps: float, layer: float, frequency: float) -> ScenarioError:
+    """Refusal of a continuous run that would need too many steps, in the name of what asks for them."""
+    table, loop = scenario.controller, scenario.loop
+    asks = f"the continuous loop would need {steps:.6g} steps, and at most {MOST_STEPS} are allowed"
+    if isinstance(scenario.disturbance, schema.SinusoidDisturbance) and 0.3 * layer < 1.5 * frequency:
+        return wrong("disturbance.frequency", scenario.disturbance.frequency, f"lower: {asks}")
+    if table.sign_width > 0.0 and layer * table.t_f > steps / 10:
+        return wrong("controller.sign_width", table.sign_width, f"larger, or 0 for the exact sign: {asks}")
+    return wrong("loop.t_end", loop.t_end, f"earlier: {asks}")
 
 
 def _disturbance(scenario: Scenario) -> tuple[Any, float]:

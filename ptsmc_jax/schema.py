@@ -4,6 +4,7 @@ Only the shape of a scenario is known here; `scenario.py` checks keys against ea
 """
 
 import difflib
+import json
 import math
 import tomllib
 import types
@@ -32,7 +33,7 @@ def show(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return '"' + value + '"'
+        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, float):
         return repr(value)
     if isinstance(value, list | tuple):
@@ -320,7 +321,7 @@ def _table(name: str, raw: Mapping[str, Any]) -> Table:
         return _fields(name, raw, _TABLES[name])
     kinds = _KINDS[name]
     kind = raw.get("kind", next(iter(kinds)))
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         allowed = " or ".join(show(k) for k, struct in kinds.items() if struct is not None)
         raise wrong(f"{name}.kind", kind, allowed)
     struct = kinds[kind]
@@ -364,13 +365,27 @@ def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
 
 
 def _value(key: str, value: Any, kind: Any) -> Any:
+    value = _plain(value)
     bad = _not_finite(value)
     if bad is not None:
         raise wrong(key, value, f"{_description(kind)}, and {bad!r} is no finite number")
+    if _holds_truth(value):  # numpy, which reads the inertia, takes true for 1
+        raise wrong(key, value, _description(kind))
     try:
         return msgspec.convert(value, kind, strict=True)
     except msgspec.ValidationError:
         raise wrong(key, value, _description(kind)) from None
+
+
+def _plain(value: Any) -> Any:
+    """Python numbers and tuples for lists and numpy's."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
+def _holds_truth(value: Any) -> bool:
+    return isinstance(value, bool) or (isinstance(value, tuple) and any(map(_holds_truth, value)))
 
 
 def _not_finite(value: Any) -> float | None:

@@ -1,15 +1,15 @@
 import math
 
-import helpers
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import vector
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import dispersions, lanes, signals
+from tests import helpers
+from tests.helpers import vector
 
 ALARM = 1e-6  # with other seeds a check would fail once in a million; they are fixed
 EPS = np.finfo(float).eps

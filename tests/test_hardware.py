@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import vector
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import draws, hardware, plants
+from tests.helpers import vector
 
 EPS = np.finfo(float).eps
 SIGMAS = -stats.norm.ppf(0.5e-6)  # with other seeds a check would fail once in a million; they are fixed

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import ROOT
 
 import ptsmc_jax
+from tests.helpers import ROOT
 
 # Ground floor first; what shares a line are siblings, which do not see each other. A new file goes into its place here.
 FLOORS = {

@@ -340,7 +340,6 @@ OTHERS: dict[str, tuple] = {
     "inverse and determinant": (lambda m: (jnp.linalg.inv(SYMMETRIC(m)), jnp.linalg.det(m)), M),
     "cholesky and eigh": (lambda m: (jnp.linalg.cholesky(SYMMETRIC(m)), jnp.linalg.eigvalsh(SYMMETRIC(m))), M),
     "solve with a constant matrix": (lambda x: jnp.linalg.solve(SYMMETRIC(TABLE[:, :3]), x), X),
-    "expm": (lambda m: jax.scipy.linalg.expm(m), M),
     "svd": (lambda m: jnp.linalg.svd(m, compute_uv=False), M),
     "fft": (lambda x: jnp.abs(jnp.fft.fft(x)), X),
     "convolve": (lambda x: jnp.convolve(x, FIXED), X),

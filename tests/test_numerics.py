@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import vector
 from jax import lax
 from scipy.linalg import expm
 
 from ptsmc_jax import numerics
+from tests.helpers import vector
 
 EPS = np.finfo(float).eps
 
@@ -185,16 +185,20 @@ def test_phi_functions_of_any_matrix(size):
             np.testing.assert_allclose(got, exact, rtol=0, atol=tolerance)
 
 
+def phi_corners(rate):
+    return jnp.stack([phi[0, 0] for phi in numerics.phi_functions(-rate * jnp.eye(2), 3)])
+
+
+phi_jacobians = [jax.jit(jacobian(phi_corners)) for jacobian in (jax.jacfwd, jax.jacrev)]
+
+
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 1e-3, 0.8, 4.0, 40.0, 1e4, 1e6])
 def test_gradients_of_phi_functions(rate):
-    def values(rate):
-        return jnp.stack([phi[0, 0] for phi in numerics.phi_functions(-rate * jnp.eye(2), 3)])
-
     expected = [-phi_exact(-rate, order, slope=True) for order in range(4)]
     # a few eps for each of up to 40 doublings, relative to the largest slope
     tolerance = 200 * EPS * np.abs(expected).max()
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        got = np.asarray(jax.jit(jacobian(values))(vector(rate)))
+    for jacobian in phi_jacobians:
+        got = np.asarray(jacobian(vector(rate)))
         assert np.all(np.abs(got - expected) <= tolerance)
 
 
@@ -231,7 +235,7 @@ def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
 
     errors = []
     for count in (10, 20, 40, 80):
-        linear = numerics.decay(matrix, vector(1.5 / count))
+        linear = decay(matrix, vector(1.5 / count))
 
         def step(t, y, dt, linear=linear):
             return numerics.etdrk4(rate, linear, t, y[0], y[1], dt)[:2]
@@ -243,16 +247,27 @@ def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
 
 
 RATES = 10.0 ** np.arange(-6, 7)
+decay = jax.jit(numerics.decay)
+
+
+@jax.jit
+def forced(linear, m, g, dt):
+    """A step under a constant forcing g."""
+    return numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
+
+
+def waving(t, y, dt):
+    """A step under the forcing cos t; the coefficients travel with the state."""
+    y, m, linear = y
+    step = numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
+    return *step[:2], linear
 
 
 @pytest.mark.parametrize("rate", RATES)
 def test_etdrk4_is_exact_for_a_constant_forcing_however_stiff(rate):
     rates, dt = rate * np.array([1.0, 1.5, 3.0]), 0.05
     m, g = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7])
-    linear = numerics.decay(vector(np.diag(rates)), vector(dt))
-    y, got, *_ = numerics.etdrk4(
-        lambda t, y, m: (jnp.zeros(1), vector(g), None), linear, vector(0.0), jnp.zeros(1), vector(m), vector(dt)
-    )
+    y, got = forced(decay(vector(np.diag(rates)), vector(dt)), vector(m), vector(g), vector(dt))
     decayed, gained = np.exp(-rates * dt) * m, -np.expm1(-rates * dt) / rates * g
     # relative to what came in, a few eps; to what has decayed, an eps of the exponent too
     tolerance = 20 * EPS * ((1 + rates * dt) * np.abs(decayed) + np.abs(gained))
@@ -263,12 +278,8 @@ def test_etdrk4_is_exact_for_a_constant_forcing_however_stiff(rate):
 @pytest.mark.parametrize("rate", [1e-6, 1.0, 1e3, 1e6])
 def test_etdrk4_follows_a_smooth_forcing_however_stiff(rate):
     # m' = -rate m + cos t; the step integrates the quadratic through the forcing at its start, middle and end
-    linear = numerics.decay(vector([[rate]]), vector(0.05))
-
-    def step(t, y, dt):
-        return numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y[0], y[1], dt)[:2]
-
-    end = march(step, (jnp.zeros(1), vector([rate / (1 + rate**2)])), vector(5.0), 100)[1][0]
+    start = (jnp.zeros(1), vector([rate / (1 + rate**2)]), decay(vector([[rate]]), vector(0.05)))
+    end = march(waving, start, vector(5.0), 100)[1][0]
     exact = (rate * math.cos(5.0) + math.sin(5.0)) / (1 + rate**2)
     # |(s)(s-h/2)(s-h)|/3! <= h^3/124.7, weighed by (1 - exp(-rate T)) / rate <= min(1/rate, T)
     assert abs(end - exact) <= 0.05**3 / 124 * min(1 / rate, 5.0) + 200 * EPS * min(1 / rate, 5.0)
@@ -301,16 +312,19 @@ def test_etdrk4_hands_out_its_first_and_third_stage():
             np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)  # numbers near 1, a dozen roundings
 
 
+@jax.jit
+@partial(jax.grad, argnums=(0, 1))
+def step_slopes(rate, dt):
+    linear = numerics.decay(rate * jnp.eye(2), dt)
+    return numerics.etdrk4(
+        lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
+    )[1][0]
+
+
 @pytest.mark.parametrize("rate", [0.0, *RATES])
 def test_gradients_of_a_step_in_the_rate_and_the_length(rate):
-    def step(rate, dt):
-        linear = numerics.decay(rate * jnp.eye(2), dt)
-        return numerics.etdrk4(
-            lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
-        )[1][0]
-
     dt = 0.05
-    got = jax.jit(jax.grad(step, argnums=(0, 1)))(vector(rate), vector(dt))
+    got = step_slopes(vector(rate), vector(dt))
     x = -rate * dt
     in_rate = -dt * math.exp(x) - 0.3 * dt * dt * phi_exact(x, 1, slope=True)
     in_dt = (0.3 - rate) * math.exp(x)

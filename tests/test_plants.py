@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FULL_INERTIA, PAPER_INERTIA, vector
 from jax import lax
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import numerics, plants
+from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
 EPS = np.finfo(float).eps
 

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import vector
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import attitude, signals
+from tests.helpers import vector
 
 EPS = np.finfo(float).eps
 START = Rotation.from_rotvec([0.4, -1.0, 2.0])

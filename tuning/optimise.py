@@ -147,8 +147,8 @@ class _Best:
         self.rms, self.over = np.full(starts, np.inf), np.full(starts, np.inf)
 
     def offer(self, z: np.ndarray, rms: np.ndarray, worst: np.ndarray, allowed: np.ndarray) -> None:
-        """Keep what is better; arrays over starts."""
-        over = np.maximum(worst.max(axis=1, initial=0.0) - 1.0, 0.0)
+        """Keep what is better; arrays over starts. Admissible is what keeps nearly the whole margin from the limits."""
+        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - 0.9 * MARGIN), 0.0)
         better = allowed & ((over < self.over) | ((over == self.over) & (rms < self.rms)))
         self.z[better], self.rms[better], self.over[better] = z[better], rms[better], over[better]
 

@@ -1,0 +1,667 @@
+import contextlib
+import copy
+import re
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import clock, dispersions, hardware, schema, signals, store
+from ptsmc_jax.scenario import Reach, from_tables, quaternion, read, replace, study
+from ptsmc_jax.schema import ScenarioError
+from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector
+
+SAMPLED = 'loop.mode = "sampled"\n'
+EULER = "initial = { euler_deg = [1, 2, 3], sequence = %s }"
+UNIT, ONE_KEY = (
+    "unit quaternion",
+    "exactly one of quat_xyzw, quat_wxyz, rotvec_deg, mrp, dcm_body_to_inertial, euler_deg",
+)
+INERTIA, CLEAR = "three principal moments or a symmetric 3x3", "|q4| of at least 0.001"
+NOT_YET = "is not available yet; allowed is "
+
+# scenario file; what its one sentence must say of key and value; what it must say is allowed
+BAD = [
+    ("controller.eta = 2.0", "controller.eta is 2.0", "greater than 2"),
+    ("controller.eta = -3", "controller.eta is -3", "greater than 2"),
+    ("controller.eta = nan", "controller.eta is nan", "greater than 2 (Theorem 1), and nan is no finite number"),
+    ("controller.eta = '3'", 'controller.eta is "3"', "a number greater than 2"),
+    ("controller.eta = true", "controller.eta is true", "a number greater than 2"),
+    ("controller.eta = 2020-01-01", "controller.eta is 2020-01-01", "a number greater than 2"),
+    ("controller.delta = 0.0", "controller.delta is 0.0", "greater than 0"),
+    ("controller.delta = -0.1", "controller.delta is -0.1", "greater than 0"),
+    ("controller.delta = 30.0", "controller.delta is 30.0", "less than controller.t_f, 30.0"),
+    ("controller.delta = 31", "controller.delta is 31", "less than controller.t_f, 30.0"),
+    ("controller.t_f = 0.05", "controller.delta is 0.05", "less than controller.t_f, 0.05"),
+    ("controller.t_f = 0", "controller.t_f is 0", "greater than 0"),
+    ("controller.k1 = 0.0", "controller.k1 is 0.0", "greater than 0"),
+    ("controller.sign_width = -1e-3", "controller.sign_width is -0.001", "at least 0"),
+    ("controller.sign_width = 1e-9", "controller.sign_width is 1e-09", "larger, or 0 for the exact sign"),
+    ("controller.disturbance_rate_bound = -1.0", "controller.disturbance_rate_bound is -1.0", "at least 0"),
+    ("controller.initial_estimate_error = -1.0", "controller.initial_estimate_error is -1.0", "at least 0"),
+    ("controller.error = 'none'", 'controller.error is "none"', '"additive"'),
+    ("controller.etta = 3.0", "controller.etta is not a known key", "nearest known one is controller.eta"),
+    ("contrller.eta = 3.0", "[contrller] is not a known table", "nearest known one is [controller]"),
+    ("eta = 3.0", "[eta] is not a known table", "nearest known one is ["),
+    ("controller = 3", "controller is 3", "a table"),
+    ("[[loop]]\nt_end = 40.0", "loop is [{ t_end = 40.0 }]", "a table"),
+    ("controller.kind = 'pid'", 'controller.kind is "pid"', '"prescribed_time"'),
+    ("controller.kind = ['prescribed_time']", 'controller.kind is ["prescribed_time"]', '"prescribed_time"'),
+    ("plant.kind = { a = 1 }", "plant.kind is { a = 1 }", '"spacecraft"'),
+    ("plant.kind = 'car'", 'plant.kind is "car"', '"spacecraft"'),
+    ('plant.kind = "a\\nb"', 'plant.kind is "a', '"spacecraft"'),
+    ("plant.kind = 3", "plant.kind is 3", '"spacecraft"'),
+    ("observer.kind = 'kalman'", 'observer.kind is "kalman"', '"nonlinear"'),
+    ("observer.gain = [10.0, 0.0, 10.0]", "observer.gain is [10.0, 0.0, 10.0]", "three numbers greater than 0"),
+    ("observer.gain = 10.0", "observer.gain is 10.0", "three numbers greater than 0"),
+    ("disturbance.kind = 'white'", 'disturbance.kind is "white"', '"sinusoid" or "none" or "constant"'),
+    ("disturbance = { kind = 'none', bias = [0, 0, 0] }", "disturbance.bias is not a known key", "disturbance.kind"),
+    ("disturbance.amplitude = [0.1, 0.1]", "disturbance.amplitude is [0.1, 0.1]", "three numbers"),
+    ("disturbance.frequency = [1e9, 0, 0]", "disturbance.frequency is [1000000000.0, 0", ""),
+    # times
+    ("loop.t_end = 29.0", "loop.t_end is 29.0", "at least controller.t_f + loop.window, 31.0"),
+    ("loop.t_end = 30.5", "loop.window is 1.0", "at most loop.t_end - controller.t_f, 0.5"),
+    ("loop = { t_end = 35.0, window = 6.0 }", "loop.window is 6.0", "at most loop.t_end - controller.t_f, 5.0"),
+    ("loop.t_end = 1e9", "loop.t_end is 1000000000.0", ""),
+    ("loop.window = 0.0", "loop.window is 0.0", "greater than 0"),
+    ("loop.settling_angle = 0", "loop.settling_angle is 0", "greater than 0"),
+    ("loop.period = -0.05", "loop.period is -0.05", "greater than 0"),
+    ("loop.mode = 'discrete'", 'loop.mode is "discrete"', '"continuous" or "sampled"'),
+    ("loop.clock = 'wall'", 'loop.clock is "wall"', '"anchored" or "flight"'),
+    (SAMPLED + "controller.delta = 0.04", "controller.delta is 0.04", "one control period, loop.period = 0.05"),
+    (SAMPLED + "loop.period = 0.1", "controller.delta is 0.05", "one control period, loop.period = 0.1"),
+    (SAMPLED + "loop.period = 1e-5", "loop.period is 1e-05", "at least loop.t_end / 200000"),
+    # inertia
+    ("spacecraft.inertia = [10.0, 12.0]", "spacecraft.inertia is [10.0, 12.0]", INERTIA),
+    ("spacecraft.inertia = 10.0", "spacecraft.inertia is 10.0", INERTIA),
+    ("spacecraft.inertia = []", "spacecraft.inertia is []", INERTIA),
+    ("spacecraft.inertia = 'ten'", 'spacecraft.inertia is "ten"', INERTIA),
+    ("spacecraft.inertia = ['a', 12, 14]", 'spacecraft.inertia is ["a", 12, 14]', INERTIA),
+    ("spacecraft.inertia = ['10', '12', '14']", 'spacecraft.inertia is ["10", "12", "14"]', INERTIA),
+    ("spacecraft.inertia = [true, 1, 1]", "spacecraft.inertia is [true, 1, 1]", INERTIA),
+    ("spacecraft.inertia = { x = 1 }", "spacecraft.inertia is { x = 1 }", INERTIA),
+    ("spacecraft.inertia = [nan, 12, 14]", "spacecraft.inertia is [nan, 12, 14]", INERTIA),
+    ("spacecraft.inertia = [[1, 2], [3]]", "spacecraft.inertia is [[1, 2], [3]]", INERTIA),
+    ("spacecraft.inertia = [[9, 0, 0], [0, 9, 0]]", "spacecraft.inertia is [[9, 0, 0], [0, 9, 0]]", INERTIA),
+    ("spacecraft.inertia = [[9, 1, 0], [0, 9, 0], [0, 0, 9]]", "spacecraft.inertia is [[9, 1, 0], [0", "symmetric"),
+    ("spacecraft.inertia = [0, 0, 0]", "spacecraft.inertia is [0, 0, 0]", "positive definite"),
+    ("spacecraft.inertia = [-1.0, 12, 14]", "spacecraft.inertia is [-1.0, 12, 14]", "positive definite"),
+    ("spacecraft.inertia = [[5, 6, 0], [6, 5, 0], [0, 0, 9]]", "spacecraft.inertia is [[5, 6", "positive definite"),
+    ("spacecraft.inertia = [1.0, 2.0, 3.5]", "spacecraft.inertia is [1.0, 2.0, 3.5]", "sum of the other two, 3"),
+    # attitudes
+    ("initial.quat_xyzw = [0, 0, 0, 1.000002]", "initial.quat_xyzw is [0.0, 0.0, 0.0, 1.000002]", UNIT),
+    ("initial.quat_wxyz = [0.999998, 0, 0, 0]", "initial.quat_wxyz is [0.999998, 0.0, 0.0, 0.0]", UNIT),
+    ("initial.quat_xyzw = [0, 0, 0, 0]", "initial.quat_xyzw is [0.0, 0.0, 0.0, 0.0]", "norm is 0, allowed is 1"),
+    ("reference.quat_wxyz = [0, 0, 0, 0]", "reference.quat_wxyz is [0.0, 0.0, 0.0, 0.0]", "norm is 0, allowed is 1"),
+    ("initial.quat_xyzw = [0, 0, 1]", "initial.quat_xyzw is [0, 0, 1]", "four numbers"),
+    ("initial.quat_xyzw = '0, 0, 0, 1'", 'initial.quat_xyzw is "0, 0, 0, 1"', "four numbers"),
+    ("initial.rotvec_deg = [1.0]", "initial.rotvec_deg is [1.0]", "three numbers"),
+    ("initial.mrp = [0.1, 0.1, inf]", "initial.mrp is [0.1, 0.1, inf]", "three numbers, and inf is no finite number"),
+    ("initial = { mrp = [0, 0, 0], quat_wxyz = [1, 0, 0, 0] }", "attitude keys quat_wxyz and mrp", ONE_KEY),
+    ("reference = { mrp = [0, 0, 0], rotvec_deg = [0, 0, 0] }", "attitude keys rotvec_deg and mrp", ONE_KEY),
+    ("initial.dcm_body_to_inertial = [[1, 0, 0], [0, 1, 0]]", "dcm_body_to_inertial is [[1", "three rows of three"),
+    (
+        "initial.dcm_body_to_inertial = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]",
+        "initial.dcm_body_to_inertial is [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]",
+        "determinant +1",
+    ),
+    (
+        "initial.dcm_body_to_inertial = [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]",
+        "initial.dcm_body_to_inertial is [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.1]]",
+        "orthonormal within 1e-6",
+    ),
+    ("initial.euler_deg = [1, 2, 3]", "initial.euler_deg needs initial.sequence", "three axes"),
+    ("initial.sequence = 'ZYX'", 'initial.sequence is "ZYX"', "euler_deg only"),
+    ("reference = { mrp = [0, 0, 0], sequence = 'ZYX' }", 'reference.sequence is "ZYX"', "euler_deg only"),
+    (EULER % "'ZYQ'", 'initial.sequence is "ZYQ"', "three axes in SciPy's notation"),
+    (EULER % "'ZYx'", 'initial.sequence is "ZYx"', "three axes in SciPy's notation"),
+    (EULER % "'XXY'", 'initial.sequence is "XXY"', "three axes in SciPy's notation"),
+    (EULER % "'ZY'", 'initial.sequence is "ZY"', "three axes in SciPy's notation"),
+    (EULER % "''", 'initial.sequence is ""', "three axes in SciPy's notation"),
+    (EULER % "3", "initial.sequence is 3", "three axes in SciPy's notation"),
+    ("initial.rate = [0.0, 0.0]", "initial.rate is [0.0, 0.0]", "three numbers"),
+    ("initial.rat = [0.0, 0.0, 0.0]", "initial.rat is not a known key", "nearest known one is initial.rate"),
+    ("reference.rate = [0.0, 0.0, 0.1]", "reference.rate is not a known key", "nearest known one is reference."),
+    ("reference.kind = 'orbit'", 'reference.kind is "orbit"', '"fixed" or "spin"'),
+    ("reference.kind = ['fixed']", 'reference.kind is ["fixed"]', '"fixed" or "spin"'),
+    # out of the additive law's reach: 180 degrees from the inertial identity, and paths through there
+    ("initial.quat_xyzw = [1, 0, 0, 0]", "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]", CLEAR),
+    ("initial.quat_wxyz = [0, 0, 0.6, 0.8]", "initial.quat_wxyz is [0.0, 0.0, 0.6, 0.8]", CLEAR),
+    ("initial.rotvec_deg = [0, 180, 0]", "initial.rotvec_deg is [0.0, 180.0, 0.0]", CLEAR),
+    ("initial.mrp = [0, 0, 1]", "initial.mrp is [0.0, 0.0, 1.0]", CLEAR),
+    (
+        "initial.dcm_body_to_inertial = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]",
+        "dcm_body_to_inertial is [[1.0",
+        CLEAR,
+    ),
+    (
+        "initial = { euler_deg = [0, 180, 0], sequence = 'ZYX' }",
+        "initial.euler_deg is [0.0, 180.0, 0.0]",
+        CLEAR,
+    ),
+    (
+        # from rest at the origin of the errors |v| peaks at t_f rate/2 / (e eta): 1.1 here
+        "initial = { mrp = [0, 0, 0], rate = [0.6, 0, 0] }",
+        "initial.mrp is [0.0, 0.0, 0.0] with initial.rate = [0.6, 0.0, 0.0]",
+        "path keeps |q4| above 0.001",
+    ),
+    ("reference.quat_xyzw = [1, 0, 0, 0]", "reference.kind is", "stays away from it until t_end"),
+    # q_f4 = cos(0.1 t / 2) is zero at 31.4 s, before t_end = 40 s
+    ("reference = { kind = 'spin', rate = [0, 0.1, 0] }", 'reference.kind is "spin"', "stays away from it until t_end"),
+    # hardware, dispersion, requirements
+    ("hardware.attitude_noise = 2e-5", "hardware.attitude_noise needs the sampled loop", 'loop.mode is "continuous"'),
+    (SAMPLED + "hardware.rate_noise = -1e-6", "hardware.rate_noise is -1e-06", "at least 0"),
+    (SAMPLED + "hardware.attitude_nois = 1e-6", "hardware.attitude_nois is not a", "hardware.attitude_noise"),
+    (SAMPLED + "hardware.delay = 1.5", "hardware.delay is 1.5", "a whole number, at least 0"),
+    ("dispersion.attitude = 'uniform'", 'dispersion.attitude is "uniform"', '{ kind = "uniform" }'),
+    ("dispersion.attitude.kind = 'gauss'", 'dispersion.attitude.kind is "gauss"', '"axis_angle" or "uniform" or'),
+    ("dispersion.attitude.kind = ['normal']", 'dispersion.attitude.kind is ["normal"]', '"axis_angle" or "uniform"'),
+    ("dispersion.attitude.min_deg = -1.0", "dispersion.attitude.min_deg is -1.0", "from 0 to 180 degrees"),
+    ("dispersion.attitude.max_deg = 181.0", "dispersion.attitude.max_deg is 181.0", "from 0 to 180 degrees"),
+    ("dispersion.attitude = { min_deg = 9, max_deg = 8 }", "dispersion.attitude.min_deg is 9.0", "at most max_deg, 8"),
+    ("dispersion.attitude = { kind = 'normal', std_deg = -1 }", "dispersion.attitude.std_deg is -1", "at least 0"),
+    ("dispersion.attitude = { kind = 'uniform', min_deg = 9 }", "dispersion.attitude.min_deg is not", "attitude.kind"),
+    ("dispersion.atitude = {}", "dispersion.atitude is not a known key", "nearest known one is dispersion.attitude"),
+    ("dispersion.rate.kind = 'uniform'", 'dispersion.rate.kind is "uniform"', '"normal"'),
+    ("requirements.window_eror = 1e-4", "requirements.window_eror is not a known metric", "one is window_error"),
+    ("requirements.window_error = 0.0", "requirements.window_error is 0.0", "greater than 0"),
+    ("requirements.window_error = inf", "requirements.window_error is inf", "a number greater than 0, and inf"),
+    ("requirements.window_error = '1e-4'", 'requirements.window_error is "1e-4"', "a number greater than 0"),
+    ("requirements.window_error = { quantile = 0.9 }", "requirements.window_error is { quantile = 0.9 }", "`limit`"),
+    ("requirements.window_error = { limit = 1, quantile = 1.0 }", ".quantile is 1.0", "a number between 0 and 1"),
+    # tuning
+    ("tune.free = []", "tune.free is []", "some of eta, delta, observer_gain, k1, sign_width"),
+    ("tune.free = 'eta'", 'tune.free is "eta"', "a list of some of eta, delta, observer_gain, k1, sign_width"),
+    ("tune.free = ['gain']", 'tune.free is ["gain"]', "some of eta, delta, observer_gain, k1, sign_width"),
+    ("tune.free = ['eta', 'eta']", 'tune.free is ["eta", "eta"]', "names each gain once"),
+    ("tune.objective = 'mean'", 'tune.objective is "mean"', '"rms"'),
+    ("tune.level = 0.9", "tune.level is 0.9", ""),  # of no use without objective = "cvar"
+    ("tune.trials = 0", "tune.trials is 0", "a whole number, at least 1"),
+    ("tune.starts = 1.5", "tune.starts is 1.5", "a whole number, at least 1"),
+    ("tune.steps = -1", "tune.steps is -1", "a whole number, at least 1"),
+    ("tune.bound = {}", "tune.bound is not a known key", "nearest known one is tune.bounds"),
+    ("tune.bounds = [1, 2]", "tune.bounds is [1, 2]", "two numbers for each gain"),
+    ("tune.bounds.eta = 3.0", "tune.bounds is { eta = 3.0 }", "two numbers for each gain"),
+    ("tune.bounds.eta = [3.0]", "tune.bounds is { eta = [3.0] }", "two numbers for each gain"),
+    ("tune.bounds.eta = ['3', '4']", 'tune.bounds is { eta = ["3", "4"] }', "two numbers for each gain"),
+    ("tune.bounds.eta = [3.0, inf]", "tune.bounds is { eta = [3.0, inf] }", "inf is no finite number"),
+    ("tune.bounds.eta = [3.0, 3.0]", "tune.bounds.eta is [3.0, 3.0]", "the lower bound first and below the upper"),
+    ("tune.bounds.eta = [5.0, 3.0]", "tune.bounds.eta is [5.0, 3.0]", "the lower bound first and below the upper"),
+    ("tune.bounds.eta = [2.0, 8.0]", "tune.bounds.eta is [2.0, 8.0]", "above 2.0"),
+    ("tune.bounds.etta = [3.0, 8.0]", "tune.bounds.etta is not a known gain", "nearest known one is eta"),
+    ("tune.bounds.k1 = [0.5, 2.0]", "tune.bounds.k1 bounds a gain that is not free", 'tune.free is ["eta", "delta",'),
+    ("tune.bounds.delta = [0.0, 3.0]", "tune.bounds.delta is [0.0, 3.0]", "above 0.0 and below 30.0"),
+    ("tune.bounds.delta = [0.1, 30.0]", "tune.bounds.delta is [0.1, 30.0]", "above 0.0 and below 30.0"),
+    (SAMPLED + "tune.bounds.delta = [0.04, 3.0]", "tune.bounds.delta is [0.04, 3.0]", "from 0.05 and below 30.0"),
+    ("tune.bounds.observer_gain = [0.0, 9.0]", "tune.bounds.observer_gain is [0.0, 9.0]", "above 0.0"),
+    ("tune = { free = ['k1'], bounds = { k1 = [-1.0, 9.0] } }", "tune.bounds.k1 is [-1.0, 9.0]", "above 0.0"),
+    (
+        "tune = { free = ['sign_width'], bounds = { sign_width = [0, 9] } }",
+        "tune.bounds.sign_width is [0.0",
+        "above 0.0",
+    ),
+    # what the contract knows and the project cannot do yet
+    ("plant.kind = 'chain'", 'plant.kind = "chain"', NOT_YET + '"spacecraft"'),
+    ("reference.kind = 'sinusoid'", 'reference.kind = "sinusoid"', NOT_YET + '"fixed" or "spin"'),
+    ("reference.kind = 'slew'", 'reference.kind = "slew"', NOT_YET + '"fixed" or "spin"'),
+    ("controller.kind = 'pd'", 'controller.kind = "pd"', NOT_YET + '"prescribed_time"'),
+    ("controller.kind = 'terminal'", 'controller.kind = "terminal"', NOT_YET + '"prescribed_time"'),
+    ("controller.kind = 'fixed_time'", 'controller.kind = "fixed_time"', NOT_YET + '"prescribed_time"'),
+    ("controller.error = 'multiplicative'", 'controller.error = "multiplicative"', NOT_YET + '"additive"'),
+    ("observer.kind = 'none'", 'observer.kind = "none"', NOT_YET + '"nonlinear"'),
+    ("observer.kind = 'finite_time'", 'observer.kind = "finite_time"', NOT_YET + '"nonlinear"'),
+    ("observer.kind = 'prescribed_time'", 'observer.kind = "prescribed_time"', NOT_YET + '"nonlinear"'),
+    *(
+        (SAMPLED + f"hardware.{key} = 1", f"hardware.{key} = 1", NOT_YET + "attitude_noise and rate_noise")
+        for key in ("torque_limit", "torque_rate_limit", "torque_lag", "torque_step", "delay", "rate_bias")
+    ),
+    *(
+        (f"dispersion.{key} = {{}}", f"dispersion.{key} = {{ kind = ", NOT_YET + "attitude")
+        for key in ("rate", "inertia", "disturbance_phase")
+    ),
+    (
+        "requirements.effort = { limit = 9.0, quantile = 0.9 }",
+        "requirements.effort = { limit = 9.0",
+        NOT_YET + "a number",
+    ),
+    (
+        "requirements.effort = { limit = 9.0, confidence = 0.9 }",
+        "requirements.effort = { limit = 9.0, confidence = 0.9 }",
+        NOT_YET + "a number",
+    ),
+    ("tune.objective = 'worst'", 'tune.objective = "worst"', NOT_YET + '"rms"'),
+    ("tune = { objective = 'cvar', level = 0.9 }", 'tune.objective = "cvar"', NOT_YET + '"rms"'),
+    ("tune.free = ['t_f']", 'tune.free = ["t_f"]', NOT_YET + "eta, delta, observer_gain, k1, sign_width"),
+]
+# what has no place in a sentence for somebody who wrote a scenario file
+JARGON = re.compile(r"\n|Traceback|Error|Errno|could not convert|array element|np\.|tuple|\bNone\b|float64")
+
+
+def check_sentence(said, of_what, allowed):
+    assert of_what in said
+    assert allowed in said
+    assert not JARGON.search(said)
+    assert len(said) < 400
+
+
+@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD, ids=[text for text, _, _ in BAD])
+def test_bad_input_ends_in_one_sentence(text, of_what, allowed):
+    with pytest.raises(ScenarioError) as caught:
+        study(from_tables(tomllib.loads(text)))
+    check_sentence(str(caught.value), of_what, allowed)
+
+
+def test_disturbance_too_fast_for_the_sampled_loop_is_refused():
+    # 1e6 rad/s in a period of 0.05 s would need 500 000 substeps, and each is compiled
+    with pytest.raises(ScenarioError, match=r"disturbance\.frequency|loop\.period"):
+        study(from_tables(tomllib.loads(SAMPLED + "disturbance.frequency = [1e6, 0, 0]")))
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+@pytest.mark.parametrize(
+    "key",
+    """controller.t_f controller.eta controller.delta controller.k1 controller.sign_width loop.t_end loop.window
+    controller.disturbance_rate_bound controller.initial_estimate_error loop.period loop.settling_angle
+    spacecraft.inertia observer.gain disturbance.amplitude disturbance.frequency disturbance.phase initial.rate
+    initial.rotvec_deg initial.mrp""".split(),
+)
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
+@pytest.mark.parametrize("size", ["1e300", "1e-300"])
+def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
+    three = key.split(".")[0] in ("spacecraft", "observer", "disturbance", "initial")
+    tables = tomllib.loads(f"loop.mode = '{mode}'\n{key} = {[float(size)] * 3 if three else size}")
+    with contextlib.suppress(ScenarioError):
+        study(from_tables(tables))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "controller.eta = 2.001",
+        "controller.delta = 29.9",
+        "loop = { t_end = 31.0 }",
+        "loop = { t_end = 31.1, window = 1.1 }",  # 30 + 1.1 is not 31.1 in binary
+        SAMPLED + "controller = { delta = 0.3, t_f = 20 }\nloop.period = 0.3",
+        "spacecraft.inertia = [1, 2, 3]",  # a flat plate
+        "initial.quat_xyzw = [0, 0, 0, 1.0000009]",
+        "initial.quat_xyzw = [0, 0, 0, -1]",
+        "initial.rotvec_deg = [0, 0, 179.8]",  # q4 = 1.7e-3
+        "initial = { mrp = [0, 0, 0], rate = [0.5, 0, 0] }",  # |v| peaks at 0.92
+        "reference = { kind = 'spin', rate = [0, 0.078, 0] }",  # q_f4 = cos(1.56) = 0.011 at t_end
+        "dispersion.attitude = { min_deg = 9, max_deg = 9 }",
+        "requirements.effort = { limit = 9.0 }",
+        "controller.sign_width = 0",
+        "hardware = {}\nrequirements = {}\ndispersion = {}\ntune.bounds = {}",
+    ],
+)
+def test_what_is_just_allowed_is_taken(text):
+    study(from_tables(tomllib.loads(text)))
+
+
+@pytest.mark.parametrize("text", ["period = 6.0\n[controller]\ndelta = 6.0", "[controller]\nt_f = 0.15\ndelta = 0.05"])
+def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
+    tables = tomllib.loads(f"[loop]\nmode = 'sampled'\n{text}")
+    from_tables(tables)
+    bounds = from_tables({**tables, "tune": {}}).tune
+    assert bounds is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "t_end"), [("", 40.0), ("controller.t_f = 12.5", 22.5), ("loop.t_end = 33.0", 33.0)], ids=str
+)
+def test_t_end_is_ten_seconds_after_t_f_unless_said(text, t_end):
+    assert from_tables(tomllib.loads(text)).loop.t_end == t_end
+
+
+# Attitudes. Hand computed: "ZYX" turns by 90 degrees about z, then about the new x: q = q_z q_x; "zyx" about the fixed
+# axes, so q = q_x q_z; x -> y -> z -> x is 120 degrees about (1, 1, 1), mrp tan(30 degrees) / sqrt(3); its matrix
+# holds the body axes as columns.
+BY_HAND = [
+    ({"quat_xyzw": [0.6, 0.0, 0.0, 0.8]}, [0.6, 0.0, 0.0, 0.8]),
+    ({"quat_wxyz": [0.8, 0.6, 0.0, 0.0]}, [0.6, 0.0, 0.0, 0.8]),
+    ({"rotvec_deg": [0.0, 0.0, 90.0]}, [0.0, 0.0, 0.5**0.5, 0.5**0.5]),
+    ({"mrp": [1 / 3, 1 / 3, 1 / 3]}, [0.5, 0.5, 0.5, 0.5]),
+    ({"dcm_body_to_inertial": [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]}, [0.5, 0.5, 0.5, 0.5]),
+    ({"euler_deg": [90.0, 0.0, 90.0], "sequence": "ZYX"}, [0.5, 0.5, 0.5, 0.5]),
+    ({"euler_deg": [90.0, 0.0, 90.0], "sequence": "zyx"}, [0.5, -0.5, 0.5, 0.5]),
+]
+# a few dozen roundings of numbers of order one
+ROUNDING = 1e-14
+
+
+def attitude_of(scenario, table):
+    return quaternion(getattr(scenario, table), table)
+
+
+@pytest.mark.parametrize("table", ["initial", "reference"])
+@pytest.mark.parametrize(("said", "expected"), BY_HAND, ids=[str(said) for said, _ in BY_HAND])
+def test_attitudes_by_hand(table, said, expected):
+    scenario = from_tables({table: said})
+    np.testing.assert_allclose(attitude_of(scenario, table), expected, atol=ROUNDING)
+    parts = study(scenario).parts
+    q = parts.initial.q if table == "initial" else parts.reference(parts.t_end).q
+    np.testing.assert_allclose(q, expected, atol=ROUNDING)
+
+
+def every_parametrisation(rotation):
+    """All that a file may say for the rotation from body to inertial vectors, from its matrix and vector by NumPy."""
+    matrix = rotation.as_matrix()
+    vector = rotation.as_rotvec()
+    angle = np.linalg.norm(vector)
+    axis = vector / angle
+    v, s = axis * np.sin(angle / 2), np.cos(angle / 2)
+    yield {"quat_xyzw": [*v, s]}
+    yield {"quat_xyzw": [*-v, -s]}
+    yield {"quat_wxyz": [s, *v]}
+    yield {"rotvec_deg": list(np.rad2deg(vector))}
+    yield {"mrp": list(axis * np.tan(angle / 4))}
+    yield {"dcm_body_to_inertial": matrix.tolist()}
+    for sequence in ("ZYX", "zyx", "XYZ", "ZXZ", "zxz", "YXY"):
+        yield {"euler_deg": list(rotation.as_euler(sequence, degrees=True)), "sequence": sequence}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_every_attitude_key_gives_the_same_attitude(seed):
+    rotation = Rotation.random(rng=seed)
+    for said in every_parametrisation(rotation):
+        for table in ("initial", "reference"):
+            q = attitude_of(from_tables({table: {key: plain(value) for key, value in said.items()}}), table)
+            # the body axes in inertial axes; Euler angles near their own singularity lose a digit or two
+            np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), rotation.as_matrix(), atol=1e-12)
+            assert abs(np.linalg.norm(q) - 1.0) < ROUNDING
+
+
+def plain(value):
+    return np.asarray(value).tolist()
+
+
+def test_a_table_without_an_attitude_keeps_the_default_one():
+    scenario = from_tables({"initial": {"rate": [0.0, 0.0, 0.1]}, "reference": {"kind": "spin"}})
+    np.testing.assert_allclose(attitude_of(scenario, "initial"), PAPER_ATTITUDE, atol=ROUNDING)
+    np.testing.assert_array_equal(attitude_of(scenario, "reference"), [0.0, 0.0, 0.0, 1.0])
+    assert scenario.initial.rate == (0.0, 0.0, 0.1)
+
+
+# Parts
+EVERYTHING = """
+[spacecraft]
+inertia = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
+[initial]
+rotvec_deg = [0.0, 0.0, 90.0]
+rate = [0.01, 0.02, 0.03]
+[reference]
+kind = "spin"
+rotvec_deg = [90.0, 0.0, 0.0]
+rate = [0.001, 0.002, 0.003]
+[disturbance]
+amplitude = [1e-3, 2e-3, 3e-3]
+frequency = [0.1, 0.2, 0.3]
+phase = [1.0, 2.0, 3.0]
+bias = [4e-3, 5e-3, 6e-3]
+[controller]
+t_f = 20.0
+eta = 4.0
+delta = 0.5
+k1 = 1.5
+sign_width = 2e-3
+disturbance_rate_bound = 3e-3
+initial_estimate_error = 4e-3
+[observer]
+gain = [10.0, 20.0, 30.0]
+[loop]
+mode = "sampled"
+period = 0.25
+t_end = 33.0
+window = 2.0
+settling_angle = 5e-3
+[hardware]
+attitude_noise = 2e-5
+rate_noise = 1e-6
+[dispersion]
+attitude = { kind = "axis_angle", min_deg = 90.0, max_deg = 180.0 }
+[requirements]
+effort = 6.0
+peak_torque = { limit = 0.5 }
+"""
+
+
+def test_every_key_reaches_its_part():
+    scenario = from_tables(tomllib.loads(EVERYTHING))
+    ready = study(scenario)
+    parts = ready.parts
+    half = 0.5**0.5
+    expected = [
+        (parts.plant.inertia, scenario.spacecraft.inertia),
+        (parts.controller.model.inertia, scenario.spacecraft.inertia),
+        (parts.observer.model.inertia, scenario.spacecraft.inertia),
+        (parts.plant.inertia @ parts.plant.inertia_inverse, np.eye(3)),
+        (parts.initial.q, [0.0, 0.0, half, half]),
+        (parts.initial.w, [0.01, 0.02, 0.03]),
+        (parts.reference.q, [half, 0.0, 0.0, half]),
+        (parts.reference.rate, [0.001, 0.002, 0.003]),
+        (parts.disturbance.amplitude, [1e-3, 2e-3, 3e-3]),
+        (parts.disturbance.frequency, [0.1, 0.2, 0.3]),
+        (parts.disturbance.phase, [1.0, 2.0, 3.0]),
+        (parts.disturbance.bias, [4e-3, 5e-3, 6e-3]),
+        (parts.controller.t_f, 20.0),
+        (parts.controller.eta, 4.0),
+        (parts.controller.delta, 0.5),
+        (parts.controller.k1, 1.5),
+        (parts.controller.sign_width, 2e-3),
+        (parts.observer.disturbance_rate_bound, 3e-3),
+        (parts.observer.initial_error, 4e-3),
+        (parts.observer.gain, [10.0, 20.0, 30.0]),
+        (parts.t_end, 33.0),
+        (parts.window, 2.0),
+        (parts.settling_angle, 5e-3),
+    ]
+    for value, wanted in expected:
+        np.testing.assert_allclose(value, wanted, atol=ROUNDING)
+    assert isinstance(parts.sensors, hardware.Sensors)
+    assert (float(parts.sensors.attitude_noise), float(parts.sensors.rate_noise)) == (2e-5, 1e-6)
+    assert isinstance(parts.clock, clock.Anchored)
+    assert (float(parts.clock.period), float(parts.clock.t_end)) == (0.25, 33.0)
+    assert isinstance(ready.dispersion.attitude, dispersions.AxisAngle)
+    np.testing.assert_allclose(ready.dispersion.attitude.smallest, np.pi / 2, rtol=ROUNDING)
+    np.testing.assert_allclose(ready.dispersion.attitude.largest, np.pi, rtol=ROUNDING)
+    assert [(r.metric, r.limit) for r in ready.requirements] == [("effort", 6.0), ("peak_torque", 0.5)]
+
+
+def test_kinds_choose_parts():
+    def parts_of(text):
+        return study(from_tables(tomllib.loads(text))).parts
+
+    assert isinstance(parts_of("").clock, clock.Graded)
+    assert isinstance(parts_of(SAMPLED + "loop.clock = 'flight'").clock, clock.Flight)
+    assert isinstance(parts_of("").reference, signals.Fixed)
+    assert parts_of(SAMPLED).sensors is None
+    steady = parts_of("disturbance = { kind = 'constant', amplitude = [1.0, 2.0, 3.0] }")
+    np.testing.assert_array_equal(steady.disturbance(steady.t_end), [1.0, 2.0, 3.0])
+    still = parts_of("disturbance.kind = 'none'")
+    np.testing.assert_array_equal(still.disturbance(still.t_end), [0.0, 0.0, 0.0])
+    one = parts_of(SAMPLED + "hardware.rate_noise = 1e-6").sensors
+    assert one is not None
+    assert (float(one.attitude_noise), float(one.rate_noise)) == (0.0, 1e-6)
+
+
+def test_kinds_of_dispersion():
+    def drawn(text):
+        return study(from_tables(tomllib.loads(text))).dispersion.attitude
+
+    assert drawn("") is None
+    assert isinstance(drawn("dispersion.attitude.kind = 'uniform'"), dispersions.UniformAttitude)
+    normal = drawn("dispersion.attitude = { kind = 'normal', std_deg = 90.0 }")
+    assert isinstance(normal, dispersions.NormalAttitude)
+    np.testing.assert_allclose(normal.std, np.pi / 2, rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("mode", ["anchored", "flight"])
+def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
+    scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
+    parts = study(scenario, reach=Reach(t_f=35.0, delta=4.0, smallest_delta=0.05, gain=1.0)).parts
+    for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
+        ticks = parts.clock.ticks(vector(t_f), vector(delta))
+        assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
+        assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
+
+
+def test_read_reads_the_scenario_that_comes_with_the_project():
+    scenario = read(FIRST_FLIGHT)
+    assert (scenario.controller.t_f, scenario.loop.mode, scenario.loop.t_end) == (35.0, "sampled", 45.0)
+    assert scenario.requirements == {"peak_torque": 0.5}
+
+
+# replace
+def test_replace_changes_what_is_said_and_keeps_the_rest():
+    before = from_tables(tomllib.loads(EVERYTHING))
+    kept = schema.dump(before)
+    after = schema.dump(
+        replace(before, controller__eta=5.0, observer__gain=[1.0, 2.0, 3.0], requirements={"effort": 7.0})
+    )
+    expected = copy.deepcopy(kept)
+    expected["controller"]["eta"] = 5.0
+    expected["observer"]["gain"] = [1.0, 2.0, 3.0]
+    expected["requirements"] = {"effort": 7.0}
+    assert after == expected
+    assert schema.dump(before) == kept
+
+
+def test_replace_by_none_returns_a_key_to_its_default():
+    scenario = replace(from_tables({}), controller__t_f=20.0, loop__t_end=None)
+    assert scenario.loop.t_end == 30.0
+    turned = replace(scenario, initial__quat_xyzw=None, initial__rotvec_deg=[0.0, 0.0, 90.0])
+    assert turned.initial == schema.Initial(rotvec_deg=(0.0, 0.0, 90.0))
+
+
+def test_replace_adds_a_table():
+    tune = replace(from_tables({}), tune__steps=5).tune
+    assert tune is not None
+    assert (tune.steps, tune.trials) == (5, 256)
+
+
+@pytest.mark.parametrize(
+    ("changes", "of_what", "allowed"),
+    [
+        ({"controller__eta": 2.0}, "controller.eta is 2.0", "greater than 2"),
+        ({"controller__delta": 40.0}, "controller.delta is 40.0", "less than controller.t_f, 30.0"),
+        ({"controller__etta": 3.0}, "controller.etta is not a known key", "controller.eta"),
+        ({"contrller__eta": 3.0}, "[contrller] is not a known table", "[controller]"),
+        ({"controller__t_f": 45.0}, "loop.t_end is 40.0", "at least controller.t_f + loop.window, 46.0"),
+        ({"initial__mrp": [0.0, 0.0, 0.0]}, "initial has the attitude keys quat_xyzw and mrp", ONE_KEY),
+        ({"hardware__rate_noise": 1e-6}, "hardware.rate_noise needs the sampled loop", 'loop.mode is "continuous"'),
+    ],
+    ids=str,
+)
+def test_replace_checks(changes, of_what, allowed):
+    with pytest.raises(ScenarioError) as caught:
+        replace(from_tables({}), **changes)
+    check_sentence(str(caught.value), of_what, allowed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "plain_changes"),
+    [
+        ({"controller__eta": np.float64(4.0)}, {"controller__eta": 4.0}),
+        ({"controller__eta": np.int64(4)}, {"controller__eta": 4.0}),
+        ({"initial__rate": np.array([0.0, 0.0, 0.1])}, {"initial__rate": [0.0, 0.0, 0.1]}),
+        ({"spacecraft__inertia": np.array([8.0, 9.0, 10.0])}, {"spacecraft__inertia": [8.0, 9.0, 10.0]}),
+    ],
+    ids=str,
+)
+def test_replace_takes_numpy_numbers_as_numbers(changes, plain_changes):
+    scenario = from_tables({})
+    assert schema.dump(replace(scenario, **changes)) == schema.dump(replace(scenario, **plain_changes))
+
+
+# Round trip
+def numbers(low, high):
+    return st.floats(low, high, allow_subnormal=False)
+
+
+def threes(low, high):
+    return st.lists(numbers(low, high), min_size=3, max_size=3)
+
+
+def tables_of(optional, **needed):
+    return st.fixed_dictionaries({key: st.just(value) for key, value in needed.items()}, optional=optional)
+
+
+def unit(values):
+    return (np.asarray(values) / np.linalg.norm(values)).tolist()
+
+
+FOURS = st.lists(numbers(-1.0, 1.0), min_size=4, max_size=4).filter(lambda v: np.linalg.norm(v) > 0.01).map(unit)
+MATRICES = threes(-1.0, 1.0).map(lambda v: Rotation.from_mrp(v).as_matrix().tolist())
+ATTITUDES = st.one_of(
+    st.fixed_dictionaries({"quat_xyzw": FOURS}),
+    st.fixed_dictionaries({"quat_wxyz": FOURS}),
+    st.fixed_dictionaries({"rotvec_deg": threes(-360.0, 360.0)}),
+    st.fixed_dictionaries({"mrp": threes(-1e3, 1e3)}),
+    st.fixed_dictionaries({"dcm_body_to_inertial": MATRICES}),
+    st.fixed_dictionaries({"euler_deg": threes(-180.0, 180.0), "sequence": st.sampled_from(["ZYX", "zxz"])}),
+)
+# of any a, b, c > 0 the moments b + c, c + a and a + b are a rigid body's
+MOMENTS = threes(0.1, 1e3).map(lambda v: [v[1] + v[2], v[2] + v[0], v[0] + v[1]])
+TENSORS = st.tuples(MOMENTS, MATRICES).map(lambda v: np.asarray(v[1]) @ np.diag(v[0]) @ np.asarray(v[1]).T)
+AMPLITUDE = {"amplitude": threes(-1.0, 1.0)}
+NOISE = {"attitude_noise": numbers(0.0, 1e-3), "rate_noise": numbers(0.0, 1e-3)}
+DRAWN = st.sampled_from([{"kind": "uniform"}, {"min_deg": 1.0}, {"kind": "normal", "std_deg": 1e-7}])
+
+
+@st.composite
+def valid_scenarios(draw):
+    t_f, window = draw(numbers(1.0, 100.0)), draw(numbers(1e-3, 20.0))
+    delta = draw(numbers(t_f * 1e-2, t_f * 0.9))
+    sampled = draw(st.booleans())
+    bounds = {"eta": [2.1, 3.3], "delta": [delta, (delta + t_f) / 2], "observer_gain": [1e-7, 1e22]}
+    times = {
+        "clock": st.sampled_from(["anchored", "flight"]),
+        "t_end": numbers(t_f + window + 1e-6, t_f + window + 100.0),
+        "settling_angle": numbers(1e-9, 1.0),
+    }
+    gains = {"eta": numbers(2.01, 9.0), "k1": numbers(1e-9, 9.0), "sign_width": numbers(0.0, 1.0)}
+    tables = {
+        "spacecraft": st.fixed_dictionaries(
+            {"inertia": st.one_of(MOMENTS, TENSORS.map(lambda tensor: ((tensor + tensor.T) / 2).tolist()))}
+        ),
+        "initial": ATTITUDES.flatmap(lambda attitude: tables_of({"rate": threes(-0.1, 0.1)}, **attitude)),
+        "reference": ATTITUDES.flatmap(lambda attitude: tables_of({"rate": threes(-1, 1)}, kind="spin", **attitude)),
+        "disturbance": st.one_of(
+            st.just({"kind": "none"}),
+            tables_of(AMPLITUDE, kind="constant"),
+            tables_of({**AMPLITUDE, "phase": threes(-9.0, 9.0), "bias": threes(-1e22, 1e22)}),
+        ),
+        "observer": tables_of({"gain": threes(1e-3, 1e3)}),
+        "requirements": tables_of({"effort": numbers(1e-9, 1e9), "peak_torque": st.just({"limit": 0.5})}),
+        "hardware": tables_of(NOISE if sampled else {}),
+        "dispersion": tables_of({"attitude": DRAWN}),
+        "tune": tables_of({"trials": st.integers(1, 999), "steps": st.integers(1, 9)}, bounds=bounds),
+    }
+    needed = {
+        "controller": tables_of(gains, t_f=t_f, delta=delta),
+        "loop": tables_of(
+            times, mode="sampled" if sampled else "continuous", period=draw(numbers(delta * 0.1, delta)), window=window
+        ),
+    }
+    return draw(st.fixed_dictionaries(needed, optional=tables))
+
+
+def is_in(said, dumped):
+    if isinstance(said, dict):
+        return all(is_in(value, dumped.get(key, {})) for key, value in said.items())
+    return said == dumped
+
+
+@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@given(tables=valid_scenarios())
+def test_what_is_dumped_loads_to_the_same_scenario(tmp_path_factory, tables):
+    scenario = from_tables(tables)
+    dumped = schema.dump(scenario)
+    path = tmp_path_factory.getbasetemp() / "scenario.toml"
+    store.write_toml(path, dumped)
+    again = read(path)
+    assert again == scenario
+    assert is_in(tables, schema.dump(again))  # to the last bit

@@ -1,0 +1,276 @@
+import copy
+import math
+import re
+
+import pytest
+
+from ptsmc_jax import schema
+from ptsmc_jax.metrics import CATALOGUE
+from ptsmc_jax.scenario import from_tables
+from ptsmc_jax.schema import ScenarioError
+
+# design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
+DEFAULTS = {
+    "plant": {"kind": "spacecraft"},
+    "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
+    "initial": {
+        "quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258],
+        "rate": [0.0, 0.0, 0.0],
+    },
+    "reference": {"kind": "fixed", "quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
+    "disturbance": {
+        "kind": "sinusoid",
+        "amplitude": [0.01, 0.01, 0.01],
+        "frequency": [0.1, 0.1, 0.1],
+        "phase": [0.0, 0.0, 0.0],
+        "bias": [0.0, 0.0, 0.0],
+    },
+    "controller": {
+        "kind": "prescribed_time",
+        "error": "additive",
+        "t_f": 30.0,
+        "eta": 3.0,
+        "delta": 0.05,
+        "k1": 1.0,
+        "sign_width": 1e-3,
+        "disturbance_rate_bound": 1e-3,
+        "disturbance_bound": 0.01,
+        "initial_estimate_error": 0.0,
+    },
+    "observer": {"kind": "nonlinear", "gain": [10.0, 10.0, 10.0]},
+    "loop": {
+        "mode": "continuous",
+        "period": 0.05,
+        "clock": "anchored",
+        "t_end": 40.0,
+        "window": 1.0,
+        "settling_angle": 1e-3,
+    },
+}
+TUNE_DEFAULTS = {
+    "free": ["eta", "delta", "observer_gain"],
+    "bounds": {"eta": [2.05, 8.0], "delta": [0.05, 5.0], "observer_gain": [0.5, 300.0]},
+    "objective": "rms",
+    "trials": 256,
+    "starts": 8,
+    "steps": 150,
+}
+
+ATTITUDES = [
+    {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
+    {"quat_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    {"rotvec_deg": [10.0, 20.0, 30.0]},
+    {"mrp": [0.1, 0.2, 0.3]},
+    {"dcm_body_to_inertial": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
+    {"euler_deg": [10.0, 20.0, 30.0], "sequence": "ZYX"},
+]
+# every key of every table, one table at a time so that what is made wrong in it is all that is wrong
+COMPLETE = [
+    *({name: table} for name, table in DEFAULTS.items()),
+    *({"initial": {**attitude, "rate": [0.0, 0.0, 0.1]}} for attitude in ATTITUDES),
+    *({"reference": {"kind": "fixed", **attitude}} for attitude in ATTITUDES),
+    *({"reference": {"kind": "spin", **attitude, "rate": [0.0, 0.0, 0.01]}} for attitude in ATTITUDES),
+    {"spacecraft": {"inertia": [[10.0, 1.0, 0.0], [1.0, 12.0, 0.5], [0.0, 0.5, 14.0]]}},
+    {"disturbance": {"kind": "constant", "amplitude": [0.01, 0.01, 0.01]}},
+    {"disturbance": {"kind": "none"}},
+    {
+        "hardware": {
+            "torque_limit": 0.5,
+            "torque_rate_limit": 5.0,
+            "torque_lag": 0.1,
+            "torque_step": 1e-4,
+            "delay": 1,
+            "attitude_noise": 2e-5,
+            "rate_noise": 1e-6,
+            "rate_bias": 1e-6,
+        }
+    },
+    {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 140.0}}},
+    {"dispersion": {"attitude": {"kind": "normal", "std_deg": 3.0}}},
+    {"dispersion": {"attitude": {"kind": "uniform"}}},
+    {"dispersion": {"rate": {"kind": "normal", "std": 0.01}}},
+    {"dispersion": {"inertia": {"kind": "relative_normal", "std": 0.05}}},
+    {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
+    {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
+    {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
+    {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
+]
+
+
+def leaves(tables, path=()):
+    if isinstance(tables, dict | list):
+        for key, value in tables.items() if isinstance(tables, dict) else enumerate(tables):
+            yield from leaves(value, (*path, key))
+    else:
+        yield path, tables
+
+
+def value_at(tables, path):
+    for key in path:
+        tables = tables[key]
+    return tables
+
+
+def changed(tables, path, value):
+    """The tables with this value at the path."""
+    tables = copy.deepcopy(tables)
+    value_at(tables, path[:-1])[path[-1]] = value
+    return tables
+
+
+def key_of(path):
+    """The key that an error names: bounds are named as a whole."""
+    key = ".".join(part for part in path if isinstance(part, str))
+    return "tune.bounds" if key.startswith("tune.bounds") else key
+
+
+def at_each(wanted):
+    return [
+        pytest.param(tables, path, id=".".join(map(str, path)))
+        for tables in COMPLETE
+        for path, value in leaves(tables)
+        if wanted(path, value)
+    ]
+
+
+def refusal(tables):
+    try:
+        from_tables(tables)
+    except ScenarioError as error:
+        return str(error)
+    pytest.fail(f"accepted: {tables}")
+
+
+each_number = pytest.mark.parametrize(("tables", "path"), at_each(lambda _, value: isinstance(value, int | float)))
+each_key = pytest.mark.parametrize(("tables", "path"), at_each(lambda path, _: isinstance(path[-1], str)))
+each_list = pytest.mark.parametrize(
+    ("tables", "path"), at_each(lambda path, _: path[-1] == 0 and not {"inertia", "free"} & set(path))
+)
+
+
+def test_defaults_are_the_papers_case_one():
+    assert schema.dump(from_tables({})) == DEFAULTS
+    assert schema.dump(from_tables({"tune": {}}))["tune"] == TUNE_DEFAULTS
+
+
+def test_off_when_absent():
+    scenario = schema.parse({}, CATALOGUE)
+    assert scenario.hardware is scenario.dispersion is scenario.tune is None
+    assert scenario.requirements == {}
+
+
+def test_tables_of_these_tests_name_every_key_there_is():
+    named = {struct: set() for struct in every_struct(schema.Table)}
+
+    def visit(parsed, raw):
+        if isinstance(raw, dict):
+            if isinstance(parsed, schema.Table):
+                named[type(parsed)] |= set(raw)
+            for key, value in raw.items():
+                visit(getattr(parsed, key) if isinstance(parsed, schema.Table) else parsed[key], value)
+
+    for tables in COMPLETE:
+        visit(schema.parse(tables, CATALOGUE), tables)
+    named.pop(schema.Attitude)  # the base of others
+    assert named == {struct: set(struct.__struct_fields__) for struct in named}
+
+
+def every_struct(base):
+    for struct in base.__subclasses__():
+        yield from (struct, *every_struct(struct))
+
+
+@each_number
+def test_no_number_may_be_nan_or_infinite(tables, path):
+    for bad in (math.nan, math.inf, -math.inf):
+        said = refusal(changed(tables, path, bad))
+        assert said.startswith(f"{key_of(path)} is ")
+        assert f"{bad} is no finite number" in said
+
+
+@each_number
+def test_a_number_is_no_boolean_quoted_number_list_or_table(tables, path):
+    for bad, shown in ((True, "true"), ("1.0", '"1.0"'), ([1.0], "[1.0]"), ({}, "{")):
+        said = refusal(changed(tables, path, bad))
+        assert said.startswith(f"{key_of(path)} is ")
+        assert shown in said
+        # booleans and strings are numbers to numpy: said must be that they are none, not what follows from them
+        assert re.search("number|angle|three principal moments", said)
+
+
+@each_list
+def test_lists_of_wrong_length(tables, path):
+    right = value_at(tables, path[:-1])
+    for wrong in ([], right[:-1], [*right, 0.0]):
+        said = refusal(changed(tables, path[:-1], wrong))
+        assert said.startswith(f"{key_of(path)} is ")
+        assert schema.show(wrong) in said
+        assert re.search("must be .*(two|three|four) ", said)
+
+
+@pytest.mark.parametrize("name", schema.Scenario.__struct_fields__)
+def test_misspelt_table_names_the_nearest(name):
+    misspelt = name.replace(name[2], "", 1)
+    assert refusal({misspelt: {}}) == f"[{misspelt}] is not a known table; the nearest known one is [{name}]"
+
+
+@each_key
+def test_misspelt_key_names_the_nearest(tables, path):
+    *table, key = path
+    said = refusal(changed(tables, [*table, f"{key}_"], 1.0))
+    assert said.startswith(f"{'.'.join(table)}.{key}_ is not a known ")
+    assert said.endswith(f"the nearest known one is {'.'.join(path)}") or (
+        table[0] == "requirements" and said.endswith(f"the nearest known one is {key}")
+    )
+
+
+@pytest.mark.parametrize("name", schema.Scenario.__struct_fields__)
+def test_a_table_is_a_table(name):
+    assert refusal({name: 3}) == f"{name} is 3, but must be a table"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (True, "true"),
+        (3, "3"),
+        (1e-3, "0.001"),
+        ("ZYX", '"ZYX"'),
+        ('a"b\nc', r'"a\"b\nc"'),
+        ((1.0, [2, "x"]), '[1.0, [2, "x"]]'),
+        ({"kind": "normal", "std": 0.1}, '{ kind = "normal", std = 0.1 }'),
+    ],
+)
+def test_values_are_shown_as_a_scenario_file_would_write_them(value, shown):
+    assert schema.show(value) == shown
+
+
+def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
+    dumped = schema.dump(from_tables({"hardware": {"rate_noise": 0.0}, "loop": {"mode": "sampled"}}))
+    assert dumped["hardware"] == {"rate_noise": 0.0}
+    assert {"requirements", "tune", "dispersion"}.isdisjoint(dumped)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[controller\neta = 3.0", "is no valid TOML"),
+        (b"[controller]\neta = 3.0\neta = 4.0", "is no valid TOML"),
+        (b"\x00", "is no valid TOML"),
+        (b"\xff\xfe", "cannot be read as text"),
+        (None, "cannot be read"),
+    ],
+    ids=["unclosed", "twice", "null", "binary", "directory"],
+)
+def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
+    path = tmp_path / "some.toml"
+    path.mkdir() if content is None else path.write_bytes(content)
+    with pytest.raises(ScenarioError) as caught:
+        schema.load(path)
+    assert f"the scenario file {path} {said}" in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ScenarioError) as caught:
+        schema.load(tmp_path / "none.toml")
+    assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} is not there"

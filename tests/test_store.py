@@ -1,0 +1,249 @@
+import csv
+import json
+import math
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ptsmc_jax import store
+from ptsmc_jax.requirements import Requirement
+
+
+def test_a_folder_is_whole_or_not_there(tmp_path):
+    def broken(folder):
+        (folder / "a.txt").write_text("half")
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        store.write(tmp_path / "new", broken)
+    assert list(tmp_path.iterdir()) == []
+
+    existing = tmp_path / "old"
+    existing.mkdir()
+    (existing / "a.txt").write_text("before")
+    with pytest.raises(RuntimeError):
+        store.write(existing, broken)
+    assert [p.name for p in tmp_path.iterdir()] == ["old"]
+    assert (existing / "a.txt").read_text() == "before"
+
+
+def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path):
+    (tmp_path / "out" / "figures").mkdir(parents=True)
+    (tmp_path / "out" / "mine.txt").write_text("keep")
+    (tmp_path / "out" / "figures" / "a.png").write_text("old")
+
+    def fill(folder):
+        (folder / "figures").mkdir()
+        (folder / "figures" / "a.png").write_text("new")
+
+    store.write(tmp_path / "out", fill)
+    assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
+    assert (tmp_path / "out" / "figures" / "a.png").read_text() == "new"
+
+
+def test_check_refuses_files_and_full_folders(tmp_path):
+    store.check(tmp_path / "new", force=False)
+    store.check(tmp_path, force=False)  # empty
+    (tmp_path / "file").write_text("")
+    with pytest.raises(store.RefusedError, match="which is a file"):
+        store.check(tmp_path / "file", force=True)
+    with pytest.raises(store.RefusedError, match="--force"):
+        store.check(tmp_path, force=False)
+    store.check(tmp_path, force=True)
+
+
+def test_json_has_null_for_what_is_not_finite_and_csv_reads_back_exactly(tmp_path):
+    store.write_json(tmp_path / "a.json", {"x": math.nan, "y": [np.float64(1 / 3), math.inf], "z": np.arange(2)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": None, "y": [1 / 3, None], "z": [0, 1]}
+    rows = [[0.1, 1 / 3], [1e-300, -2.5e17]]
+    store.write_csv(tmp_path / "a.csv", ["t", "x"], np.array(rows).tolist())
+    with (tmp_path / "a.csv").open() as file:
+        header, *body = csv.reader(file)
+    assert header == ["t", "x"]
+    assert [[float(v) for v in row] for row in body] == rows
+
+
+def test_only_the_same_scenario_seed_and_command_is_known_again(tmp_path):
+    tables = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}
+    store.write_toml(tmp_path / "scenario.toml", tables)
+    store.write_json(tmp_path / "versions.json", store.versions("tune", 5))
+    store.write_json(tmp_path / "summary.json", {"status": "met"})
+    assert store.previous(tmp_path, "tune", tables, 5) == {"status": "met"}
+    assert store.previous(tmp_path, "tune", tables, 6) is None
+    assert store.previous(tmp_path, "simulate", tables, 5) is None
+    assert store.previous(tmp_path, "tune", {"controller": {"eta": 3.1, "gain": [1.0, 2.0]}}, 5) is None
+    assert store.previous(tmp_path / "none", "tune", tables, 5) is None
+
+
+def test_verdicts_count_failures_and_missing_values():
+    limit = Requirement("settling_time", 30.0)
+    good = limit.verdict(np.array([29.0, 30.0]), np.array([True, True]))
+    assert good.met
+    assert (good.worst, good.margin, good.failures) == (30.0, 1.0, 0)
+    never = limit.verdict(np.array([29.0, np.nan]), np.array([True, True]))
+    assert (never.met, never.failures) == (False, 1)
+    assert np.isnan(never.worst)
+    failed = limit.verdict(np.array([29.0, 1.0, 31.0]), np.array([True, False, True]))
+    assert (failed.met, failed.failures, failed.trials) == (False, 2, 3)
+    assert "NOT met, 2 of 3 trials" in str(failed)
+
+
+def tree(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def fill(folder):
+    (folder / "figures").mkdir()
+    (folder / "figures" / "a.png").write_text("new")
+    (folder / "summary.json").write_text("new")
+
+
+@pytest.mark.parametrize("before", ["nothing", "an empty folder", "a folder below new ones"])
+def test_write_makes_the_folder_and_nothing_beside_it(tmp_path, before):
+    folder = tmp_path / ("a/b/out" if before == "a folder below new ones" else "out")
+    if before == "an empty folder":
+        folder.mkdir()
+    store.write(folder, fill)
+    assert tree(folder) == {"figures/a.png": b"new", "summary.json": b"new"}
+    assert [p.name for p in folder.parent.iterdir()] == ["out"]
+    assert folder.stat().st_mode & 0o777 == 0o755  # the temporary folder's mode would lock others out
+
+
+@pytest.mark.parametrize("stop", [RuntimeError, KeyboardInterrupt, OSError])
+def test_write_stopped_halfway_leaves_nothing_and_touches_nothing(tmp_path, stop):
+    def stopped(folder):
+        fill(folder)
+        raise stop
+
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "summary.json").write_text("before")
+    for name in ("new", "old"):
+        with pytest.raises(stop):
+            store.write(tmp_path / name, stopped)
+    assert tree(tmp_path) == {"old/summary.json": b"before"}
+    assert [p.name for p in tmp_path.iterdir()] == ["old"]
+
+
+def test_fill_never_works_in_the_folder_itself(tmp_path):
+    (tmp_path / "out").mkdir()
+    seen = []
+
+    def look(folder):
+        seen.append((folder != tmp_path / "out", list(folder.iterdir()), list((tmp_path / "out").iterdir())))
+        fill(folder)
+
+    store.write(tmp_path / "out", look)
+    assert seen == [(True, [], [])]
+
+
+def test_check_names_the_folder_and_what_is_allowed(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(store.RefusedError) as caught:
+        store.check(tmp_path / "file", force=False)
+    assert str(caught.value) == f"--out is {tmp_path / 'file'}, which is a file; allowed is a new folder"
+    with pytest.raises(store.RefusedError) as caught:
+        store.check(tmp_path, force=False)
+    assert str(caught.value).startswith(f"--out is {tmp_path}, which holds something already; allowed is a new folder")
+    with pytest.raises(store.RefusedError, match="file"):  # a folder cannot be made below a file
+        store.check(tmp_path / "file" / "out", force=False)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("kind", [float, np.float64, np.float32, np.array, jnp.asarray, lambda x: np.array([[x]])])
+def test_json_has_null_for_every_kind_of_nan(tmp_path, bad, kind):
+    store.write_json(tmp_path / "a.json", {"nested": [{"value": kind(bad)}, (kind(bad), kind(1.5))]})
+    text = (tmp_path / "a.json").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    plain = json.loads(text)
+    flat = np.array([plain["nested"][0]["value"], *plain["nested"][1]], dtype=object).ravel().tolist()
+    assert [np.ravel(value).tolist() for value in flat] == [[None], [None], [1.5]]
+
+
+ANY_FLOAT = st.floats(allow_nan=False)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@given(st.lists(st.tuples(ANY_FLOAT, ANY_FLOAT), max_size=5))
+def test_csv_and_json_numbers_read_back_to_the_last_bit(tmp_path_factory, rows):
+    folder = tmp_path_factory.getbasetemp()
+    for body in (rows, [(np.float64(a), np.asarray(b)) for a, b in rows]):
+        store.write_csv(folder / "a.csv", ["t", "x"], body)
+        with (folder / "a.csv").open(newline="") as file:
+            header, *read = csv.reader(file)
+        assert header == ["t", "x"]
+        assert [tuple(map(float, row)) for row in read] == rows
+    finite = [value for row in rows for value in row if math.isfinite(value)]
+    store.write_json(folder / "a.json", finite)
+    assert json.loads((folder / "a.json").read_text()) == finite
+
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=9)
+SCALAR = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), TEXT)
+ARRAY = st.recursive(st.lists(SCALAR, max_size=4), lambda inner: st.lists(inner, max_size=3), max_leaves=6)
+TABLES = st.dictionaries(TEXT, st.one_of(SCALAR, ARRAY, st.dictionaries(TEXT, st.one_of(SCALAR, ARRAY), max_size=3)))
+
+
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@given(TABLES)
+def test_toml_reads_back_the_same_whatever_is_written(tmp_path_factory, tables):
+    path = tmp_path_factory.getbasetemp() / "a.toml"
+    store.write_toml(path, tables)
+    read = tomllib.loads(path.read_text(encoding="utf-8"))
+    # as text, where 1 is neither 1.0 nor true
+    assert json.dumps(read, sort_keys=True) == json.dumps(tables, sort_keys=True)
+
+
+def test_toml_has_arrays_on_one_line(tmp_path):
+    store.write_toml(tmp_path / "a.toml", {"a": {"x": [1.0, 0.25], "w": ["a", "b"]}})
+    lines = (tmp_path / "a.toml").read_text().splitlines()
+    assert lines == ["[a]", "x = [1.0, 0.25]", 'w = ["a", "b"]']
+
+
+def finished(folder, tables):
+    folder.mkdir()
+    store.write_toml(folder / "scenario.toml", tables)
+    store.write_json(folder / "versions.json", store.versions("tune", 5))
+    store.write_json(folder / "summary.json", {"status": "met"})
+
+
+@pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json"])
+@pytest.mark.parametrize("content", [None, "", "{", "\x00"])
+def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, content):
+    tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
+    finished(tmp_path / "out", tables)
+    assert store.previous(tmp_path / "out", "tune", tables, 5) == {"status": "met"}
+    (tmp_path / "out" / name).unlink() if content is None else (tmp_path / "out" / name).write_text(content)
+    assert store.previous(tmp_path / "out", "tune", tables, 5) is None
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {},
+        {"controller": {}},
+        {"controller": {"eta": 3.0000000000000004}},
+        {"controller": {"eta": 3.0, "delta": 0.05}},
+        {"controller": {"eta": 3.0}, "loop": {"t_end": 40.0}},
+    ],
+    ids=str,
+)
+def test_any_other_scenario_is_not_known(tmp_path, other):
+    tables = {"controller": {"eta": 3.0}}
+    finished(tmp_path / "out", tables)
+    assert store.previous(tmp_path / "out", "tune", tables, 5) is not None
+    assert store.previous(tmp_path / "out", "tune", other, 5) is None
+
+
+def test_versions_name_what_made_a_result():
+    made = store.versions("simulate", 7, trial=3)
+    assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)
+    assert all(
+        made[name].split(".")[0].isdigit() for name in ("python", "ptsmc-jax", "jax", "jaxlib", "numpy", "scipy")
+    )
+    assert made["platform"]
+    assert made["machine"]
