@@ -7,9 +7,11 @@ import sys
 import numpy as np
 import pytest
 
-from ptsmc_jax import metrics, scenario
-from tests.helpers import FIRST_FLIGHT, ROOT
-from tuning import cli
+from ptsmc_jax import metrics, scenario, store
+from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT
+from tests.test_scenario import BAD as BAD_SCENARIOS
+from tests.test_scenario import check_sentence
+from tuning import cli, single
 
 SHORT = """
 [controller]
@@ -177,3 +179,193 @@ def test_the_readme_scenario_is_read(tmp_path):
     (tmp_path / "readme.toml").write_text(block)
     scenario.read(tmp_path / "readme.toml")
     scenario.read(FIRST_FLIGHT)
+
+
+@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD_SCENARIOS, ids=[row[0] for row in BAD_SCENARIOS])
+def test_a_bad_scenario_ends_the_command_with_one_sentence(command, tmp_path, text, of_what, allowed):
+    (tmp_path / "bad.toml").write_text(text)
+    before = sorted(tmp_path.rglob("*"))
+    status, out, err = command("simulate", "bad.toml", "--no-figures")
+    assert (status, out) == (2, "")
+    assert err.startswith("ptsmc: ")
+    assert err.endswith("\n")
+    check_sentence(err[:-1], of_what, allowed)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+WHOLE = "a whole number from 0 to 4294967295"
+
+
+@pytest.mark.parametrize(
+    ("args", "of_what", "allowed"),
+    [
+        *(
+            (("simulate", f"--{option}", value), f"--{option} is {value}", WHOLE)
+            for option in ("seed", "trial")
+            for value in ("-1", "4294967296", "1.5", "many", "1e3", "true")
+        ),
+        (("tune", "--seed", "-1"), "--seed is -1", WHOLE),
+        (("simulate", "--seed"), "--seed", "requires an argument"),
+        (("simulate", "--out"), "--out", "requires an argument"),
+        (("simulate", "--sed", "1"), "--sed", "--seed"),
+        (("simulate", "--loud"), "--loud", ""),
+        (("tune", "--trial", "1"), "--trial", ""),
+        (("simulate", "--quiet=perhaps"), "--quiet", "perhaps"),
+        (("simulate", "s.toml", "t.toml"), "t.toml", ""),
+        (("simulat",), "simulat", "simulate"),
+        (("montecarlo", "s.toml"), "montecarlo", "simulate, tune"),
+        (("simulate", "--out", "s.toml"), "--out is s.toml", "a new folder"),
+        (("simulate", "--out", "s.toml", "--force"), "--out is s.toml", "a new folder"),
+        (("simulate", "--out", "s.toml/below"), "--out is s.toml/below", "a new folder"),
+        (("tune", "--out", "."), "--out is .", "a new folder, or --force"),
+    ],
+    ids=str,
+)
+def test_a_bad_option_ends_the_command_with_one_sentence(command, tmp_path, args, of_what, allowed):
+    before = tree(tmp_path)
+    status, out, err = command(*args, "--no-figures")
+    assert (status, out) == (2, "")
+    assert err.startswith("ptsmc: ")
+    check_sentence(err[:-1], of_what, allowed)
+    assert tree(tmp_path) == before
+
+
+def rows_of(folder):
+    return np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1)
+
+
+def test_the_papers_case_one_without_a_file(command, tmp_path):
+    assert command("simulate", "--quiet", "--no-figures") == (0, "", "")
+    folder = tmp_path / "out" / "simulate-default"
+    assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}
+    assert scenario.read(folder / "scenario.toml") == scenario.from_tables({})
+    rows = rows_of(folder)
+    # by hand: s = t_f v' + eta v with v' = 0, and theory.md 3.3 for the torque, u = -2 eta^2 J v / (q4 t_f^2);
+    # the products of a few numbers, so a few roundings
+    v, q4 = PAPER_ATTITUDE[:3], PAPER_ATTITUDE[3]
+    torque = -2 * 3.0**2 * np.array([10.0, 12.0, 14.0]) * v / (q4 * 30.0**2)
+    np.testing.assert_allclose(rows[0], [0.0, *PAPER_ATTITUDE, *[0.0] * 6, *torque, *3.0 * v], atol=1e-14)
+    assert (rows[0, 0], rows[-1, 0]) == (0.0, 40.0)
+    assert np.all(np.diff(rows[:, 0]) > 0)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 1:5], axis=1), 1.0, atol=1e-14)
+    # t_f is a node: what the summary says of it stands in the history, whose numbers are exact
+    summary = json.loads((folder / "summary.json").read_text())
+    (at_t_f,) = rows[rows[:, 0] == 30.0]
+    assert summary["terminal_error"] == pytest.approx(np.linalg.norm(at_t_f[1:4]), rel=1e-12)
+    after = np.linalg.norm(rows[rows[:, 0] >= 30.0][:, 1:4], axis=1)
+    assert summary["hold_error"] == pytest.approx(after.max(), rel=1e-12)
+    assert summary["peak_rate"] == pytest.approx(np.linalg.norm(rows[:, 5:8], axis=1).max(), rel=1e-12)
+    momentum = np.linalg.norm(rows[:, 5:8] * [10.0, 12.0, 14.0], axis=1)
+    assert summary["peak_momentum"] == pytest.approx(momentum.max(), rel=1e-12)
+
+
+@pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.6000001'])
+def test_the_last_row_is_at_t_end_wherever_the_samples_fall(command, tmp_path, timing):
+    (tmp_path / "s.toml").write_text(SHORT.replace("t_end = 6.5", timing))
+    assert command("simulate", "s.toml", "--quiet", "--no-figures")[0] == 0
+    rows = rows_of(tmp_path / "out" / "simulate-s")
+    assert (rows[0, 0], rows[-1, 0]) == (0.0, float(timing.split("t_end = ")[1]))
+    assert np.all(np.diff(rows[:, 0]) > 0)
+
+
+def test_seed_and_trial_name_a_run(command, tmp_path):
+    def fly(name, *options):
+        assert command("simulate", "s.toml", "--out", name, "--quiet", "--no-figures", *options) == (0, "", "")
+        return rows_of(tmp_path / name)
+
+    nominal, zero, three = fly("a"), fly("b", "--trial", 0), fly("c", "--trial", 3, "--seed", 4294967295)
+    np.testing.assert_array_equal(fly("d", "--trial", 3, "--seed", 4294967295), three)
+    np.testing.assert_allclose(nominal[0, 1:5], PAPER_ATTITUDE, atol=1e-15)  # as in the file, normalised
+    starts = [nominal[0, 1:5], zero[0, 1:5], three[0, 1:5], fly("e", "--trial", 3)[0, 1:5]]
+    assert len({tuple(q) for q in starts}) == 4
+    np.testing.assert_array_equal(fly("f", "--seed", 1)[0, 1:5], nominal[0, 1:5])
+    assert np.any(fly("g", "--seed", 1)[-1] != nominal[-1])  # another noise
+
+
+def test_a_run_that_fails_says_so(command, tmp_path):
+    # noise of 10 rad tells the law nothing: it cannot keep away from its singularity
+    (tmp_path / "s.toml").write_text(SHORT.replace("attitude_noise = 2e-5", "attitude_noise = 10.0"))
+    status, out, err = command("simulate", "s.toml", "--no-figures")
+    assert (status, err) == (1, "")
+    text = (tmp_path / "out" / "simulate-s" / "summary.json").read_text()
+    assert "NaN" not in text
+    summary = json.loads(text)
+    assert summary["status"] in ("diverged", "singular")
+    assert summary["reason"]
+    assert 0.0 <= summary["bad_time"] <= 6.5
+    assert f"status: {summary['status']}, {summary['reason']}, at " in out
+    assert summary["verdicts"]["peak_torque"]["met"] is False
+
+
+@pytest.mark.parametrize("met", [True, False])
+def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
+    tables = scenario.schema.dump(scenario.read(tmp_path / "s.toml"))
+    folder = tmp_path / "done"
+    folder.mkdir()
+    store.write_toml(folder / "scenario.toml", tables)
+    store.write_json(folder / "versions.json", store.versions("tune", 5))
+    store.write_json(folder / "summary.json", {"status": "met" if met else "not met"})
+    before = tree(folder)
+    run = ("tune", "s.toml", "--out", "done", "--quiet")
+    assert command(*run, "--seed", 5) == (0 if met else 1, "", "")
+    assert command(*run, "--seed", 6)[0] == 2
+    assert command("simulate", *run[1:], "--seed", 5)[0] == 2
+    assert tree(folder) == before
+
+
+def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(single, "write", stop)
+    status, out, err = command("simulate", "s.toml")
+    assert (status, out, err) == (130, "", "ptsmc: interrupted; nothing was written\n")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
+    def broken(*_):
+        raise ValueError("ours")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
+    monkeypatch.setattr(single, "fly", broken)
+    monkeypatch.setattr(sys, "argv", ["ptsmc", "simulate"])
+    with pytest.raises(ValueError, match="ours"):
+        cli.main()
+
+
+def test_figures_only_where_wanted_and_force_keeps_what_is_not_ours(command, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    assert command("simulate", "s.toml", "--out", "mine", "--quiet", "--no-figures")[0] == 2
+    assert command("simulate", "s.toml", "--out", "mine", "--quiet", "--no-figures", "--force")[0] == 0
+    made = {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}
+    assert set(tree(tmp_path / "mine")) == {"notes.txt", *made}
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize("args", [[], ["simulate", "--help"], ["tune", "--help"], ["--help"]], ids=str)
+def test_every_help_is_told_without_jax(args):
+    told = in_a_process(*args, then="assert 'jax' not in sys.modules")
+    assert (told.returncode, told.stderr) == (0, "")
+    assert "Usage: ptsmc" in told.stdout
+
+
+def test_a_process_exits_as_the_contract_says(tmp_path):
+    (tmp_path / "s.toml").write_text(SHORT.replace("peak_torque = 30.0", "peak_torque = 0.01"))
+    not_met = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
+    assert (not_met.returncode, not_met.stdout, not_met.stderr) == (1, "", "")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdicts"]["peak_torque"]["met"] is False
+    (tmp_path / "s.toml").write_text("controller.eta = 2")
+    bad = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "other")
+    assert (bad.returncode, bad.stdout) == (2, "")
+    assert bad.stderr == "ptsmc: controller.eta is 2, but must be a number greater than 2 (Theorem 1)\n"
+    assert not (tmp_path / "other").exists()
+
+
+def in_a_process(*args, then=""):
+    """`ptsmc ...` as a user runs it; `then` is checked at its end."""
+    code = f"import sys, atexit\nfrom tuning.cli import main\ntry: main()\nfinally:\n    {then or 'pass'}"
+    command = [sys.executable, "-c", code, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)

@@ -615,7 +615,7 @@ DRAWN = st.sampled_from([{"kind": "uniform"}, {"min_deg": 1.0}, {"kind": "normal
 def valid_scenarios(draw):
     t_f, window = draw(numbers(1.0, 100.0)), draw(numbers(1e-3, 20.0))
     delta = draw(numbers(t_f * 1e-2, t_f * 0.9))
-    sampled = draw(st.booleans())
+    mode = draw(st.sampled_from(["continuous", "sampled"]))
     bounds = {"eta": [2.1, 3.3], "delta": [delta, (delta + t_f) / 2], "observer_gain": [1e-7, 1e22]}
     times = {
         "clock": st.sampled_from(["anchored", "flight"]),
@@ -628,7 +628,9 @@ def valid_scenarios(draw):
             {"inertia": st.one_of(MOMENTS, TENSORS.map(lambda tensor: ((tensor + tensor.T) / 2).tolist()))}
         ),
         "initial": ATTITUDES.flatmap(lambda attitude: tables_of({"rate": threes(-0.1, 0.1)}, **attitude)),
-        "reference": ATTITUDES.flatmap(lambda attitude: tables_of({"rate": threes(-1, 1)}, kind="spin", **attitude)),
+        "reference": ATTITUDES.flatmap(
+            lambda attitude: st.one_of(st.just(attitude), tables_of({"rate": threes(-1, 1)}, kind="spin", **attitude))
+        ),
         "disturbance": st.one_of(
             st.just({"kind": "none"}),
             tables_of(AMPLITUDE, kind="constant"),
@@ -636,15 +638,13 @@ def valid_scenarios(draw):
         ),
         "observer": tables_of({"gain": threes(1e-3, 1e3)}),
         "requirements": tables_of({"effort": numbers(1e-9, 1e9), "peak_torque": st.just({"limit": 0.5})}),
-        "hardware": tables_of(NOISE if sampled else {}),
+        "hardware": tables_of(NOISE if mode == "sampled" else {}),
         "dispersion": tables_of({"attitude": DRAWN}),
         "tune": tables_of({"trials": st.integers(1, 999), "steps": st.integers(1, 9)}, bounds=bounds),
     }
     needed = {
         "controller": tables_of(gains, t_f=t_f, delta=delta),
-        "loop": tables_of(
-            times, mode="sampled" if sampled else "continuous", period=draw(numbers(delta * 0.1, delta)), window=window
-        ),
+        "loop": tables_of(times, mode=mode, period=draw(numbers(delta * 0.1, delta)), window=window),
     }
     return draw(st.fixed_dictionaries(needed, optional=tables))
 
