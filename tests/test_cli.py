@@ -138,7 +138,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
 
     for module, name, value in ((optimise, "SCREENED", 32), (optimise, "CANDIDATES", 8), (report, "FRESH", 40)):
         monkeypatch.setattr(module, name, value)
-    status, out, _ = command("tune", "s.toml", "--out", "t")
+    status, _, _ = command("tune", "s.toml", "--out", "t")
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
     assert status == (0 if summary["status"] == "met" else 1)
     assert {"gains", "training", "fresh", "paper", "verdicts"} <= set(summary)
@@ -167,7 +167,13 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
 
 def test_help_and_version_do_not_load_jax():
     for option in ("--help", "--version"):
-        code = f"import sys; sys.argv = ['ptsmc', '{option}']\nimport tuning.cli\ntry: tuning.cli.main()\nexcept SystemExit: pass\nassert 'jax' not in sys.modules"
+        code = (
+            f"import sys; sys.argv = ['ptsmc', '{option}']\n"
+            "import tuning.cli\n"
+            "try: tuning.cli.main()\n"
+            "except SystemExit: pass\n"
+            "assert 'jax' not in sys.modules"
+        )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 0, done.stderr
         assert done.stdout
