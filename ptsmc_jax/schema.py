@@ -52,6 +52,7 @@ ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description=
 Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
 Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
 Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
+Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 
 
@@ -64,11 +65,7 @@ class Plant(Table, frozen=True):
 
 
 class Spacecraft(Table, frozen=True):
-    inertia: Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")] = (
-        10.0,
-        12.0,
-        14.0,
-    )
+    inertia: Inertia = (10.0, 12.0, 14.0)
 
 
 class Attitude(Table, frozen=True):
@@ -193,14 +190,11 @@ class Limit(Table, frozen=True):
 
 Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f"]
 FREE: tuple[str, ...] = typing.get_args(Free)
+FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")]
 
 
 class Tune(Table, frozen=True):
-    free: Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")] = (
-        "eta",
-        "delta",
-        "observer_gain",
-    )
+    free: FreeGains = ("eta", "delta", "observer_gain")
     bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}
     objective: Literal["rms", "worst", "cvar"] = "rms"
     level: Quantile | None = None

@@ -50,6 +50,9 @@ def previous(folder: Path, command: str, scenario: Mapping[str, Any], seed: int)
 
 def check(folder: Path, force: bool) -> None:
     """Raise RefusedError where this folder must not be written to."""
+    above = next((parent for parent in folder.parents if parent.exists() and not parent.is_dir()), None)
+    if above is not None:
+        raise RefusedError(f"--out is {folder}, which lies below the file {above}; allowed is a new folder")
     if folder.exists() and not folder.is_dir():
         raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
     if folder.is_dir() and any(folder.iterdir()) and not force:

@@ -203,37 +203,39 @@ WHOLE = "a whole number from 0 to 4294967295"
 
 
 @pytest.mark.parametrize(
-    ("args", "of_what", "allowed"),
+    ("args", "named"),
     [
         *(
-            (("simulate", f"--{option}", value), f"--{option} is {value}", WHOLE)
+            (("simulate", f"--{option}", value), (f"--{option}", value, WHOLE))
             for option in ("seed", "trial")
             for value in ("-1", "4294967296", "1.5", "many", "1e3", "true")
         ),
-        (("tune", "--seed", "-1"), "--seed is -1", WHOLE),
-        (("simulate", "--seed"), "--seed", "requires an argument"),
-        (("simulate", "--out"), "--out", "requires an argument"),
-        (("simulate", "--sed", "1"), "--sed", "--seed"),
-        (("simulate", "--loud"), "--loud", ""),
-        (("tune", "--trial", "1"), "--trial", ""),
-        (("simulate", "--quiet=perhaps"), "--quiet", "perhaps"),
-        (("simulate", "s.toml", "t.toml"), "t.toml", ""),
-        (("simulat",), "simulat", "simulate"),
-        (("montecarlo", "s.toml"), "montecarlo", "simulate, tune"),
-        (("simulate", "--out", "s.toml"), "--out is s.toml", "a new folder"),
-        (("simulate", "--out", "s.toml", "--force"), "--out is s.toml", "a new folder"),
-        (("simulate", "--out", "s.toml/below"), "--out is s.toml/below", "a new folder"),
-        (("tune", "--out", "."), "--out is .", "a new folder, or --force"),
+        (("tune", "--seed", "-1"), ("--seed is -1", WHOLE)),
+        (("simulate", "--seed"), ("--seed", "requires an argument")),
+        (("simulate", "--out"), ("--out", "requires an argument")),
+        (("simulate", "--sed", "1"), ("--sed", "--seed")),
+        (("simulate", "--loud"), ("--loud",)),
+        (("tune", "--trial", "1"), ("--trial",)),
+        (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
+        (("simulate", "s.toml", "t.toml"), ("t.toml",)),
+        (("simulat",), ("simulat", "simulate, tune")),
+        (("montecarlo", "s.toml"), ("montecarlo", "simulate, tune")),
+        (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
+        (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
+        (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),
+        (("tune", "--out", "."), ("--out is .", "a new folder, or --force")),
     ],
-    ids=str,
+    ids=lambda part: " ".join(part),
 )
-def test_a_bad_option_ends_the_command_with_one_sentence(command, tmp_path, args, of_what, allowed):
-    before = tree(tmp_path)
+def test_a_bad_option_ends_the_command_with_one_sentence(command, tmp_path, args, named):
+    before = sorted(tmp_path.rglob("*"))
     status, out, err = command(*args, "--no-figures")
     assert (status, out) == (2, "")
     assert err.startswith("ptsmc: ")
-    check_sentence(err[:-1], of_what, allowed)
-    assert tree(tmp_path) == before
+    assert err.endswith("\n")
+    for part in named:
+        check_sentence(err[:-1], part, "")
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def rows_of(folder):
@@ -265,7 +267,7 @@ def test_the_papers_case_one_without_a_file(command, tmp_path):
     assert summary["peak_momentum"] == pytest.approx(momentum.max(), rel=1e-12)
 
 
-@pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.6000001'])
+@pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.4700001'])
 def test_the_last_row_is_at_t_end_wherever_the_samples_fall(command, tmp_path, timing):
     (tmp_path / "s.toml").write_text(SHORT.replace("t_end = 6.5", timing))
     assert command("simulate", "s.toml", "--quiet", "--no-figures")[0] == 0
@@ -299,7 +301,7 @@ def test_a_run_that_fails_says_so(command, tmp_path):
     assert summary["status"] in ("diverged", "singular")
     assert summary["reason"]
     assert 0.0 <= summary["bad_time"] <= 6.5
-    assert f"status: {summary['status']}, {summary['reason']}, at " in out
+    assert f"status: {summary['status']}, {summary['reason']}, at " in " ".join(out.split())
     assert summary["verdicts"]["peak_torque"]["met"] is False
 
 
@@ -372,6 +374,6 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
 
 def in_a_process(*args, then=""):
     """`ptsmc ...` as a user runs it; `then` is checked at its end."""
-    code = f"import sys, atexit\nfrom tuning.cli import main\ntry: main()\nfinally:\n    {then or 'pass'}"
+    code = f"import sys\nfrom tuning.cli import main\ntry: main()\nfinally:\n    {then or 'pass'}"
     command = [sys.executable, "-c", code, *map(str, args)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)

@@ -18,13 +18,14 @@ app = App(
     help="Prescribed-time sliding mode control for spacecraft attitude: simulate it, tune its gains.",
     version=ptsmc_jax.__version__,
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
 )
 
 ScenarioFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
 ]
 Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME.")]
-Seed = Annotated[int, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
+Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
@@ -40,9 +41,9 @@ def simulate(
     /,
     *,
     out: Out = None,
-    seed: Seed = 0,
+    seed: Seed = "0",
     trial: Annotated[
-        int | None, Parameter(help="Draw this trial's dispersions; without it the run is nominal.")
+        str | None, Parameter(help="Draw this trial's dispersions; without it the run is nominal.")
     ] = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -52,9 +53,8 @@ def simulate(
 
     Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
     """
-    _whole("--seed", seed)
-    if trial is not None:
-        _whole("--trial", trial)
+    key = _whole("--seed", seed)
+    number = None if trial is None else _whole("--trial", trial)
     loaded, folder = _prepare(scenario, "simulate", out)
     from ptsmc_jax import store
 
@@ -62,8 +62,8 @@ def simulate(
     from ptsmc_jax.scenario import study
     from tuning import single
 
-    run = single.fly(study(loaded), seed, trial)
-    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures))
+    run = single.fly(study(loaded), key, number)
+    store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
         _show_run(run, folder)
     return 0 if run.met else 1
@@ -75,7 +75,7 @@ def tune(
     /,
     *,
     out: Out = None,
-    seed: Seed = 0,
+    seed: Seed = "0",
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -84,14 +84,14 @@ def tune(
 
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input.
     """
-    _whole("--seed", seed)
+    key = _whole("--seed", seed)
     loaded, folder = _prepare(scenario, "tune", out)
     from ptsmc_jax import schema, store
     from ptsmc_jax.scenario import replace, study
 
     if loaded.tune is None:
         loaded = replace(loaded, tune={})
-    done = None if force else store.previous(folder, "tune", schema.dump(loaded), seed)
+    done = None if force else store.previous(folder, "tune", schema.dump(loaded), key)
     if done is not None:
         if not quiet:
             _show_tuning(done, folder, "already done")
@@ -101,10 +101,10 @@ def tune(
     from tuning import report
 
     with _Progress(quiet) as told:
-        result: Tuning = report.tune(loaded, seed, told)
-    store.write(folder, lambda making: report.write(making, loaded, result, seed, figures))
+        result: Tuning = report.tune(loaded, key, told)
+    store.write(folder, lambda making: report.write(making, loaded, result, key, figures))
     if not quiet:
-        _show_tuning(report.summary(result, seed), folder, "done")
+        _show_tuning(report.summary(result, key), folder, "done")
     return 0 if result.met else 1
 
 
@@ -139,9 +139,10 @@ def _fail(sentence: str) -> None:
     sys.exit(2)
 
 
-def _whole(option: str, value: int) -> None:
-    if not 0 <= value < 2**32:
+def _whole(option: str, value: str) -> int:
+    if not (value.isascii() and value.isdigit() and int(value) < 2**32):
         raise UsageError(f"{option} is {value}, but must be a whole number from 0 to {2**32 - 1}")
+    return int(value)
 
 
 def _prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Scenario, Path]":
@@ -199,7 +200,8 @@ def _show_run(run: Any, folder: Path) -> None:
     for name, (unit, meaning) in CATALOGUE.items():
         value = run.metrics[name]
         table.add_row(name, "never" if value != value else f"{value:.5g}", unit, meaning)
-    console.print(f"status: {run.status}" + (f", {run.reason}, at {run.bad_time:.4g} s" if run.reason else ""))
+    what = f", {run.reason}, at {run.bad_time:.4g} s" if run.reason else ""
+    console.print(f"status: {run.status}{what}", soft_wrap=True)
     console.print(table)
     for verdict in run.verdicts:
         console.print(str(verdict), soft_wrap=True)
