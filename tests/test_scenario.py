@@ -151,6 +151,8 @@ BAD = [
     ("reference.quat_xyzw = [1, 0, 0, 0]", "reference.kind is", "stays away from it until t_end"),
     # q_f4 = cos(0.1 t / 2) is zero at 31.4 s, before t_end = 40 s
     ("reference = { kind = 'spin', rate = [0, 0.1, 0] }", 'reference.kind is "spin"', "stays away from it until t_end"),
+    # zero every odd multiple of 1.005 s, never nearer than 0.005 s to a multiple of 0.01 s
+    ("reference = { kind = 'spin', rate = [0, 3.12596, 0] }", 'reference.kind is "spin"', "away from it until t_end"),
     # hardware, dispersion, requirements
     ("hardware.attitude_noise = 2e-5", "hardware.attitude_noise needs the sampled loop", 'loop.mode is "continuous"'),
     (SAMPLED + "hardware.rate_noise = -1e-6", "hardware.rate_noise is -1e-06", "at least 0"),
@@ -283,7 +285,7 @@ def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
         "controller.eta = 2.001",
         "controller.delta = 29.9",
         "loop = { t_end = 31.0 }",
-        "loop = { t_end = 31.1, window = 1.1 }",  # 30 + 1.1 is not 31.1 in binary
+        "controller.t_f = 20.1\nloop = { t_end = 21.2, window = 1.1 }",  # in binary 20.1 + 1.1 is above 21.2
         SAMPLED + "controller = { delta = 0.3, t_f = 20 }\nloop.period = 0.3",
         "spacecraft.inertia = [1, 2, 3]",  # a flat plate
         "initial.quat_xyzw = [0, 0, 0, 1.0000009]",
