@@ -259,7 +259,7 @@ def load(path: str | Path) -> dict[str, Any]:
         raise ScenarioError(f"the scenario file {path} is not there") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"the scenario file {path} cannot be read as text: {error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
         raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
 
 

@@ -258,9 +258,10 @@ def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
         (b"[controller]\neta = 3.0\neta = 4.0", "is no valid TOML"),
         (b"\x00", "is no valid TOML"),
         (b"\xff\xfe", "cannot be read as text"),
+        (b"x = " + 5000 * b"9", ""),  # more digits than Python turns into a number
         (None, "cannot be read"),
     ],
-    ids=["unclosed", "twice", "null", "binary", "directory"],
+    ids=["unclosed", "twice", "null", "binary", "digits", "directory"],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
     path = tmp_path / "some.toml"

@@ -140,7 +140,7 @@ def _fail(sentence: str) -> None:
 
 
 def _whole(option: str, value: str) -> int:
-    if not (value.isascii() and value.isdigit() and int(value) < 2**32):
+    if not (value.isascii() and value.isdigit() and len(value) <= 10 and int(value) < 2**32):
         raise UsageError(f"{option} is {value}, but must be a whole number from 0 to {2**32 - 1}")
     return int(value)
 
