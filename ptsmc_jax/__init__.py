@@ -18,7 +18,11 @@ _EXPORTS = {
     "Sinusoid": "signals",
     "Spin": "signals",
     "Target": "signals",
+    "Chain": "plants",
+    "chain": "plants",
     "PrescribedTime": "controllers",
+    "PrescribedTimeChain": "controllers",
+    "NoObserver": "observers",
     "NonlinearObserver": "observers",
     "Sensors": "hardware",
     "Parts": "rollout",
@@ -29,7 +33,7 @@ _EXPORTS = {
     "Metrics": "metrics",
     "Dispersion": "dispersions",
     "Requirement": "requirements",
-    "Scenario": "schema",
+    "Scenario": "tables",
     "ScenarioError": "schema",
     "Study": "scenario",
     "study": "scenario",
@@ -37,12 +41,16 @@ _EXPORTS = {
 
 if TYPE_CHECKING:
     from ptsmc_jax.controllers import PrescribedTime as PrescribedTime
+    from ptsmc_jax.controllers import PrescribedTimeChain as PrescribedTimeChain
     from ptsmc_jax.dispersions import Dispersion as Dispersion
     from ptsmc_jax.hardware import Sensors as Sensors
     from ptsmc_jax.metrics import Metrics as Metrics
     from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
+    from ptsmc_jax.observers import NoObserver as NoObserver
     from ptsmc_jax.plants import AttitudeState as AttitudeState
+    from ptsmc_jax.plants import Chain as Chain
     from ptsmc_jax.plants import Spacecraft as Spacecraft
+    from ptsmc_jax.plants import chain as chain
     from ptsmc_jax.plants import spacecraft as spacecraft
     from ptsmc_jax.requirements import Requirement as Requirement
     from ptsmc_jax.rollout import STATUS as STATUS
@@ -52,13 +60,13 @@ if TYPE_CHECKING:
     from ptsmc_jax.rollout import simulate_jit as simulate_jit
     from ptsmc_jax.scenario import Study as Study
     from ptsmc_jax.scenario import study as study
-    from ptsmc_jax.schema import Scenario as Scenario
     from ptsmc_jax.schema import ScenarioError as ScenarioError
     from ptsmc_jax.signals import Constant as Constant
     from ptsmc_jax.signals import Fixed as Fixed
     from ptsmc_jax.signals import Sinusoid as Sinusoid
     from ptsmc_jax.signals import Spin as Spin
     from ptsmc_jax.signals import Target as Target
+    from ptsmc_jax.tables import Scenario as Scenario
 
 
 def __getattr__(name: str) -> Any:

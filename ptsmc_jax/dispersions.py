@@ -13,7 +13,7 @@ from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.rollout import Parts
 
-INITIAL_ATTITUDE = "initial_attitude"
+INITIAL_ATTITUDE, INITIAL_STATE = "initial_attitude", "initial_state"
 
 
 @jax.tree_util.register_dataclass
@@ -61,13 +61,46 @@ class NormalAttitude:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class UniformState:
+    """Initial state of a chain, uniform about the nominal one."""
+
+    half_width: Leaf  # (n,)
+
+    def draw(self, key: draws.Key, nominal: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Initial state, (n,)."""
+        return nominal + self.half_width * (2.0 * draws.uniforms(key, nominal.shape[-1]) - 1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class NormalState:
+    """Initial state of a chain, normal about the nominal one."""
+
+    std: Leaf  # (n,)
+
+    def draw(self, key: draws.Key, nominal: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Initial state, (n,)."""
+        return nominal + self.std * draws.normals(key, nominal.shape[-1])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Dispersion:
     """Everything that is drawn for a trial; what is None stays nominal."""
 
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
+    state: UniformState | NormalState | None = None  # of a chain
+
+    @property
+    def varies(self) -> bool:
+        """Whether anything differs from trial to trial."""
+        return self.attitude is not None or self.state is not None
 
     def apply(self, parts: Parts, seed: Whole, trial: Whole) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
+        if self.state is not None:
+            key = draws.stream(seed, trial, INITIAL_STATE)
+            return replace(parts, initial=self.state.draw(key, parts.initial))
         if self.attitude is None:
             return parts
         key = draws.stream(seed, trial, INITIAL_ATTITUDE)

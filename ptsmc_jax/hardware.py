@@ -1,6 +1,7 @@
-"""What stands between the law and the spacecraft: here the attitude and rate sensors."""
+"""What stands between the law and the plant: here the sensors."""
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,23 @@ from ptsmc_jax.draws import Whole
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState
 
-ATTITUDE_NOISE, RATE_NOISE = "attitude_noise", "rate_noise"
+ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
+
+
+class Sensor(Protocol):
+    """What the rollout asks of a sensor; its noise belongs to (seed, trial, sample)."""
+
+    def keys(self, seed: Whole, trial: Whole) -> Any:
+        """Streams of a trial's noise."""
+        ...
+
+    def noise(self, keys: Any, sample: Int[Array, ""]) -> Any:
+        """Noise of one sample."""
+        ...
+
+    def measure(self, x: Any, noise: Any) -> Any:
+        """The state as measured."""
+        ...
 
 
 @jax.tree_util.register_dataclass
@@ -39,3 +56,23 @@ class Sensors:
         """The state as measured: attitude turned by a small rotation in body axes, rate with noise added."""
         turned = attitude.multiply(x.q, attitude.from_rotation_vector(noise[0]))
         return AttitudeState(turned, jnp.add(x.w, noise[1]))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StateSensor:
+    """All states of a chain sampled once a period, white noise, independent per state and sample."""
+
+    sigma: Leaf  # (n,) 1 sigma of each state
+
+    def keys(self, seed: Whole, trial: Whole) -> draws.Key:
+        """Stream of a trial's noise."""
+        return draws.stream(seed, trial, STATE_NOISE)
+
+    def noise(self, keys: draws.Key, sample: Int[Array, ""]) -> Float[Array, " n"]:
+        """Noise of one sample, (n,)."""
+        return self.sigma * draws.normals(keys, self.sigma.shape[-1], sample)
+
+    def measure(self, x: Float[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The states as measured."""
+        return x + noise

@@ -25,10 +25,24 @@ CATALOGUE = {
     "peak_rate": ("rad/s", "largest 2-norm of the body rate"),
     "peak_momentum": ("N m s", "largest 2-norm of the angular momentum"),
 }
+# The same for an integrator chain, whose x_1 is the error, in the states' own units; what it lacks is left out.
+CHAIN_CATALOGUE = {
+    "terminal_error": ("x1", "|x_1| at t_f"),
+    "window_error": ("x1", "RMS of |x_1| over the window after t_f"),
+    "hold_error": ("x1", "largest |x_1| from t_f to t_end"),
+    "peak_torque": ("u", "largest commanded input, before the actuator"),
+    "peak_torque_delivered": ("u", "largest delivered input"),
+    "saturated": ("-", "fraction of the time in which the delivered input is not the commanded one"),
+    "effort": ("u s", "integral of the magnitude of the delivered input"),
+    "settling_time": ("s", "time from which |x_1| stays below settling_angle"),
+    "chattering": ("u/s", "total variation of the delivered input per second after t_f"),
+    "peak_rate": ("x2", "largest |x_2|"),
+}
+CATALOGUES = {"spacecraft": CATALOGUE, "chain": CHAIN_CATALOGUE}  # by the kind of the plant
 
 
 class Metrics(NamedTuple):
-    """Metrics of a run, scalars; units and meaning in `CATALOGUE`. settling_time is NaN where it never settles."""
+    """Metrics of a run, scalars; units and meaning in `CATALOGUES`. settling_time is NaN where it never settles."""
 
     terminal_error: Array
     terminal_angle: Array
@@ -47,10 +61,10 @@ class Metrics(NamedTuple):
 class Sight(NamedTuple):
     """What the metrics see of the true state at one time."""
 
-    error: Array  # (3,) attitude error vector [-]
-    error_rate: Array  # (3,) [1/s]
-    angle: Array  # to the reference [rad]
-    rate: Array  # |w| [rad/s]
+    error: Array  # (m,) what the law drives to zero: the attitude error vector [-], for a chain x_1
+    error_rate: Array  # (m,) [1/s]
+    angle: Array  # to the reference [rad]; for a chain |x_1|
+    rate: Array  # `Plant.speed`, |w| [rad/s]
     momentum: Array  # |J w| [N m s]
 
 
@@ -61,7 +75,7 @@ class Span(NamedTuple):
     t_next: Array
     start: Sight
     end: Sight
-    commanded: tuple[Array, ...]  # (3,) each [N m]
+    commanded: tuple[Array, ...]  # (m,) each [N m]
     delivered: tuple[Array, ...]
     weights: tuple[float, ...]  # sum to 1
 
@@ -85,14 +99,14 @@ class Running(NamedTuple):
     saturated_for: Array
     effort: Array
     settled_at: Array
-    last_torque: Array  # (3,) delivered at the end of the last interval [N m]
-    variation: Array  # (3,) of the delivered torque after t_f [N m]
+    last_torque: Array  # (m,) delivered at the end of the last interval [N m]
+    variation: Array  # (m,) of the delivered torque after t_f [N m]
     peak_rate: Array
     peak_momentum: Array
 
 
-def begin(first: Sight, judged: Judged) -> Running:
-    """Accumulators at t = 0."""
+def begin(first: Sight, judged: Judged, inputs: int) -> Running:
+    """Accumulators at t = 0 for a plant with this many inputs."""
     zero = jnp.zeros_like(judged.t_f)
     return Running(
         square_error=zero,
@@ -102,8 +116,8 @@ def begin(first: Sight, judged: Judged) -> Running:
         saturated_for=zero,
         effort=zero,
         settled_at=jnp.where(_unsettled(first, judged), jnp.inf, 0.0),
-        last_torque=jnp.zeros(3),
-        variation=jnp.zeros(3),
+        last_torque=jnp.zeros(inputs),
+        variation=jnp.zeros(inputs),
         peak_rate=first.rate,
         peak_momentum=first.momentum,
     )
@@ -125,7 +139,7 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     effort = sum(w * jnp.sum(jnp.abs(v)) for w, _, v in nodes)
     # total variation after t_f: the jump at the start of the interval, then what happens inside
     jump = jnp.where(span.t > judged.t_f, jnp.abs(delivered[0] - running.last_torque), 0.0)
-    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros(3))
+    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
     variation = jump + jnp.where(span.t >= judged.t_f, inside, 0.0)
 
     # the angle falls below the threshold inside the interval: linear interpolation; stays above: not yet settled

@@ -1,7 +1,9 @@
 """Many trials of one set of parts: in blocks, over all local devices."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ class Trials:
     metrics: Metrics  # of arrays
     status: np.ndarray  # codes, see rollout.STATUS
     bad_time: np.ndarray  # first bad time [s], NaN if none
-    initial_q: np.ndarray  # (trials, 4) initial attitude as flown
+    initial: Any  # initial states as flown, arrays (trials, component)
 
     @property
     def ok(self) -> np.ndarray:
@@ -39,10 +41,10 @@ class Trials:
 
 
 def one(parts: Parts, dispersion: Dispersion, seed, trial) -> tuple:
-    """Metrics, status, bad time and initial attitude of one trial: pure, for any transformation."""
+    """Metrics, status, bad time and initial state of one trial: pure, for any transformation."""
     drawn = dispersion.apply(parts, seed, trial)
     result = rollout.simulate(drawn, seed, trial)
-    return result.metrics, result.status, result.bad_time, drawn.initial.q
+    return result.metrics, result.status, result.bad_time, drawn.initial
 
 
 def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> Trials:
@@ -62,12 +64,12 @@ def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> 
 
 @partial(jax.jit, static_argnames="devices")
 def _blocks(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, devices: int) -> tuple:
-    def share(parts, dispersion, seed, rows):
-        fly = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial))
-        return jax.lax.map(fly, rows)
+    fly = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial))
+    return spread(lambda rows: jax.lax.map(fly, rows), trials, devices)
 
+
+def spread(function: Callable, shared: jax.Array, devices: int) -> Any:
+    """function(shared) with the first axis of `shared`, and of the results, shared out over that many devices."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
-    spread, whole = PartitionSpec("device"), PartitionSpec()
-    return jax.shard_map(share, mesh=mesh, in_specs=(whole, whole, whole, spread), out_specs=spread, check_vma=False)(
-        parts, dispersion, seed, trials
-    )
+    axis = PartitionSpec("device")
+    return jax.shard_map(function, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)(shared)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import theory
+from ptsmc_jax.plants import Chain
 from ptsmc_jax.rollout import Log, Parts
 
 # Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
@@ -30,14 +31,17 @@ _RC: Any = {
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
-    return {
-        "attitude": attitude(parts, log),
+    figures = {
         "error": error(parts, log),
-        "rate": rate(parts, log),
-        "torque": torque(parts, log, limit),
         "sliding": sliding(parts, log),
-        "disturbance": disturbance(parts, log),
+        "convergence": convergence(parts, log),
+        "torque": torque(parts, log, limit),
     }
+    if np.any(log.d_hat):
+        figures["disturbance"] = disturbance(parts, log)
+    if isinstance(parts.plant, Chain):
+        return {"states": states(parts, log), **figures}
+    return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
@@ -48,22 +52,34 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     return [folder / f"{name}.png" for name in figures]
 
 
-def attitude(parts: Parts, log: Log) -> Figure:
+def attitude(parts: Parts, log: Log, title: str = "Attitude") -> Figure:
     """Quaternion and its reference over time."""
-    figure, axes = _figure("Attitude", "quaternion component [-]")
+    figure, axes = _figure(title, "quaternion component [-]")
     _components(axes, log.t, log.x.q, "q")
-    axes.plot(log.t, log.reference, color="0.6", lw=1.0, zorder=1)
+    axes.plot(log.t, log.reference.q, color="0.6", lw=1.0, zorder=1)
     axes.plot([], [], color="0.6", lw=1.0, label="reference")
     _mark(axes, parts)
     axes.legend(ncols=3, loc="best")
     return figure
 
 
+def states(parts: Parts, log: Log, title: str = "States") -> Figure:
+    """States of a chain over time."""
+    figure, axes = _figure(title, "state")
+    _components(axes, log.t, log.x, "x")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
 def error(parts: Parts, log: Log) -> Figure:
-    """2-norm of the attitude error vector on a log scale, with the window in which it is judged."""
-    figure, axes = _figure("Attitude error", "|$\\varepsilon_1$| [-]")
+    """2-norm of the error on a log scale with its bound, and the window in which it is judged."""
+    symbol, _, _ = _names(parts)
+    figure, axes = _figure("Error", symbol)
     size = np.linalg.norm(log.error, axis=1)
-    axes.semilogy(log.t, np.maximum(size, 1e-16), color=_STYLES[0][0])
+    axes.semilogy(log.t, np.maximum(size, 1e-16), color=_STYLES[0][0], label="flown")
+    before = log.t[log.t < float(parts.controller.hand_over)]
+    axes.plot(before, theory.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _mark(axes, parts)
@@ -80,18 +96,23 @@ def rate(parts: Parts, log: Log) -> Figure:
     return figure
 
 
-def torque(parts: Parts, log: Log, limit: float | None = None) -> Figure:
-    """Delivered torque over time, its largest value marked, the limit drawn where one is given [N m]."""
-    figure, axes = _figure("Control torque", "torque [N m]")
+def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
+    """Delivered torque or input over time, its largest value marked, the limit drawn where one is given."""
+    _, label, unit = _names(parts)
+    figure, axes = _figure(title or ("Control torque" if unit else "Control"), label)
     held = not hasattr(parts.clock, "max_step")
     _components(axes, log.t, log.u, "u", drawstyle="steps-post" if held else "default")
+    t, u, _ = (np.asarray(v) for v in theory.exact_path(parts))
+    axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+    axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
     row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
     peak = log.commanded[row, column]
-    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=f"peak {abs(peak):.3g} N m at {log.t[row]:.4g} s")
+    marked = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
+    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=marked)
     if limit is not None:
         for sign in (-1.0, 1.0):
             axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
-        axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} N m")
+        axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")
     _mark(axes, parts)
     axes.legend()
     return figure
@@ -99,25 +120,70 @@ def torque(parts: Parts, log: Log, limit: float | None = None) -> Figure:
 
 def sliding(parts: Parts, log: Log) -> Figure:
     """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
-    figure, axes = _figure("Sliding variable", "|s| [-]")
+    figure, axes = _figure("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
     _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
     before = log.t[log.t < float(parts.controller.hand_over)]
-    axes.plot(before, theory.sliding_envelope(parts, before), color="0.5", lw=1.2, label="envelope of |s|, no noise")
+    axes.plot(before, theory.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
     axes.set_yscale("log")
     _mark(axes, parts)
     axes.legend()
     return figure
 
 
+def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees it") -> Figure:
+    """Error and s against the time to go, both on log axes, with the exact motion and the slopes of theory."""
+    symbol, _, unit = _names(parts)
+    law, n = parts.controller, parts.controller.order
+    t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
+    figure, axes = _figure(title, f"{symbol} and |s|" if unit else "$|x_1|$ and |s|")
+    before = log.t < float(law.hand_over) * (1 - 1e-12)
+    t = np.asarray(log.t)[before]
+    tau = t_f - t
+    flown = {
+        symbol.split(" [")[0]: (np.linalg.norm(log.error, axis=1)[before], eta, _STYLES[0]),
+        "|s|": (np.linalg.norm(log.s, axis=1)[before], eta + n - 2, _STYLES[1]),
+    }
+    exact = theory.exact_sizes(parts, t)
+    bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in flown.values())
+    for (name, (size, _, (colour, style))), ideal in zip(flown.items(), exact, strict=True):
+        axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, flown")
+        axes.loglog(tau, ideal, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+    # slopes of theory as short lines over the error and, where it differs, under s
+    span = t_f * np.array([0.3, max(0.03, delta / t_f)])
+    above = 6.0 * float(np.interp(-span[0], -tau, np.maximum(*exact)))
+    guides = [(above, eta, "$\\eta$", 6)]
+    if n > 2:
+        guides.append((float(np.interp(-span[0], -tau, np.minimum(*exact))) / 30.0, eta + n - 2, "$\\eta+n-2$", -14))
+    for start, slope, name, shift in guides:
+        line = start * (span / span[0]) ** slope
+        axes.loglog(span, line, color="black", lw=1.0)
+        axes.annotate(f"slope {name} = {slope:g}", (np.sqrt(span[0] * span[1]), np.sqrt(line[0] * line[1])),
+                      fontsize=10, xytext=(6, shift), textcoords="offset points",
+                      ha="left" if shift > 0 else "right")  # fmt: skip
+    axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+    axes.set_xlabel("time to go $t_f - t$ [s]")
+    axes.set_ylim(bottom=bottom / 3)
+    axes.invert_xaxis()
+    axes.legend(loc="lower left")
+    return figure
+
+
 def disturbance(parts: Parts, log: Log) -> Figure:
     """Estimated and true disturbance over time."""
-    figure, axes = _figure("Disturbance and its estimate", "torque [N m]")
+    figure, axes = _figure("Disturbance and its estimate", _names(parts)[1].replace("input", "disturbance"))
     _components(axes, log.t, log.d_hat, "\\hat d")
     axes.plot(log.t, log.disturbance, color="0.6", lw=1.0, zorder=1)
     axes.plot([], [], color="0.6", lw=1.0, label="true $d_i$")
     _mark(axes, parts)
     axes.legend(ncols=2)
     return figure
+
+
+def _names(parts: Parts) -> tuple[str, str, str]:
+    """Labels of the error and the input, and the input's unit behind a number."""
+    if isinstance(parts.plant, Chain):
+        return "$|x_1|$", "input u", ""
+    return "|$\\varepsilon_1$| [-]", "torque [N m]", " N m"
 
 
 def tuning_history(
@@ -174,7 +240,7 @@ def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
         figure = Figure(figsize=(8.0, 4.5), layout="constrained")
         axes = figure.subplots()
         axes.set(xlabel=_TIME, ylabel=ylabel)
-        axes.set_title(title, loc="left")
+        axes.set_title(title, loc="left", pad=14)
     return figure, axes
 
 

@@ -1,6 +1,6 @@
-"""Scenario files: every table, key, type, range and default; what is wrong in a file, in one sentence.
+"""Scenario files read and written: what is wrong in one, in one sentence.
 
-Only the shape of a scenario is known here; `scenario.py` checks keys against each other and builds the parts.
+Only single tables and keys are looked at here; `checks.py` looks at keys against each other.
 """
 
 import difflib
@@ -11,10 +11,12 @@ import types
 import typing
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
-from msgspec import Meta
+
+from ptsmc_jax import tables
+from ptsmc_jax.tables import ATTITUDE_KEYS, TABLES, Kinds, Limit, Positive, Scenario, Table
 
 NOT_YET = "is not available yet"
 
@@ -43,252 +45,104 @@ def show(value: Any) -> str:
     return str(value)
 
 
-Number = Annotated[float, Meta(description="a number")]
-Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
-NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
-Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
-Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
-ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
-Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
-Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
-Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
-Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
-Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
-
-
-class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
-    """A table of a scenario file."""
-
-
-class Plant(Table, frozen=True):
-    kind: Literal["spacecraft"] = "spacecraft"
-
-
-class Spacecraft(Table, frozen=True):
-    inertia: Inertia = (10.0, 12.0, 14.0)
-
-
-class Attitude(Table, frozen=True):
-    """Exactly one of the attitude keys; `euler_deg` goes with `sequence`."""
-
-    quat_xyzw: Four | None = None
-    quat_wxyz: Four | None = None
-    rotvec_deg: Three | None = None
-    mrp: Three | None = None
-    dcm_body_to_inertial: Matrix | None = None
-    euler_deg: Three | None = None
-    sequence: Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None = None
-
-
-ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
-
-
-class Initial(Attitude, frozen=True):
-    rate: Three = (0.0, 0.0, 0.0)
-
-
-class FixedReference(Attitude, frozen=True):
-    kind: Literal["fixed"] = "fixed"
-
-
-class SpinReference(Attitude, frozen=True):
-    kind: Literal["spin"] = "spin"
-    rate: Three = (0.0, 0.0, 0.0)
-
-
-class NoDisturbance(Table, frozen=True):
-    kind: Literal["none"] = "none"
-
-
-class ConstantDisturbance(Table, frozen=True):
-    kind: Literal["constant"] = "constant"
-    amplitude: Three = (0.01, 0.01, 0.01)
-
-
-class SinusoidDisturbance(Table, frozen=True):
-    kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: Three = (0.01, 0.01, 0.01)
-    frequency: Three = (0.1, 0.1, 0.1)
-    phase: Three = (0.0, 0.0, 0.0)
-    bias: Three = (0.0, 0.0, 0.0)
-
-
-class Controller(Table, frozen=True):
-    kind: Literal["prescribed_time"] = "prescribed_time"
-    error: Literal["additive", "multiplicative"] = "additive"
-    t_f: Positive = 30.0
-    eta: Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 1)")] = 3.0
-    delta: Positive = 0.05
-    k1: Positive = 1.0
-    sign_width: NotNegative = 1e-3
-    disturbance_rate_bound: NotNegative = 1e-3
-    disturbance_bound: NotNegative = 0.01
-    initial_estimate_error: NotNegative = 0.0
-
-
-class NonlinearObserver(Table, frozen=True):
-    kind: Literal["nonlinear"] = "nonlinear"
-    gain: ThreePositive = (10.0, 10.0, 10.0)
-
-
-class Loop(Table, frozen=True):
-    mode: Literal["continuous", "sampled"] = "continuous"
-    period: Positive = 0.05
-    clock: Literal["anchored", "flight"] = "anchored"
-    t_end: Positive | None = None
-    window: Positive = 1.0
-    settling_angle: Positive = 1e-3
-
-
-class Hardware(Table, frozen=True):
-    torque_limit: Positive | None = None
-    torque_rate_limit: Positive | None = None
-    torque_lag: Positive | None = None
-    torque_step: Positive | None = None
-    delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
-    attitude_noise: NotNegative | None = None
-    rate_noise: NotNegative | None = None
-    rate_bias: NotNegative | None = None
-
-
-class UniformAttitude(Table, frozen=True):
-    kind: Literal["uniform"] = "uniform"
-
-
-class AxisAngle(Table, frozen=True):
-    kind: Literal["axis_angle"] = "axis_angle"
-    min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
-    max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
-
-
-class NormalAttitude(Table, frozen=True):
-    kind: Literal["normal"] = "normal"
-    std_deg: NotNegative = 1.0
-
-
-class NormalRate(Table, frozen=True):
-    kind: Literal["normal"] = "normal"
-    std: NotNegative = 0.01
-
-
-class RelativeInertia(Table, frozen=True):
-    kind: Literal["relative_normal"] = "relative_normal"
-    std: NotNegative = 0.05
-
-
-class UniformPhase(Table, frozen=True):
-    kind: Literal["uniform"] = "uniform"
-
-
-class Limit(Table, frozen=True):
-    """A requirement in full: metric <= limit in this share of the trials, with this one-sided confidence."""
-
-    limit: Positive
-    quantile: Quantile | None = None
-    confidence: Quantile | None = None
-
-
-Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f"]
-FREE: tuple[str, ...] = typing.get_args(Free)
-FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")]
-
-
-class Tune(Table, frozen=True):
-    free: FreeGains = ("eta", "delta", "observer_gain")
-    bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}
-    objective: Literal["rms", "worst", "cvar"] = "rms"
-    level: Quantile | None = None
-    trials: Count = 256
-    starts: Count = 8
-    steps: Count = 150
-
-
-class Dispersion(Table, frozen=True):
-    attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
-    rate: NormalRate | None = None
-    inertia: RelativeInertia | None = None
-    disturbance_phase: UniformPhase | None = None
-
-
-class Scenario(Table, frozen=True):
-    """A scenario as its file says it, every key resolved; tables that are None are off."""
-
-    plant: Plant = Plant()
-    spacecraft: Spacecraft = Spacecraft()
-    initial: Initial = Initial(
-        quat_xyzw=(0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258)
-    )
-    reference: FixedReference | SpinReference = FixedReference(quat_xyzw=(0.0, 0.0, 0.0, 1.0))
-    disturbance: NoDisturbance | ConstantDisturbance | SinusoidDisturbance = SinusoidDisturbance()
-    controller: Controller = Controller()
-    observer: NonlinearObserver = NonlinearObserver()
-    loop: Loop = Loop()
-    hardware: Hardware | None = None
-    dispersion: Dispersion | None = None
-    requirements: dict[str, float | Limit] = {}
-    tune: Tune | None = None
-
-
-# table: kinds, the default first; a kind without a struct is refused as not available yet
-_KINDS: dict[str, dict[str, type[Table] | None]] = {
-    "plant": {"spacecraft": Plant, "chain": None},
-    "reference": {"fixed": FixedReference, "spin": SpinReference, "sinusoid": None, "slew": None},
-    "disturbance": {"sinusoid": SinusoidDisturbance, "none": NoDisturbance, "constant": ConstantDisturbance},
-    "controller": {"prescribed_time": Controller, "pd": None, "terminal": None, "fixed_time": None},
-    "observer": {"nonlinear": NonlinearObserver, "none": None, "finite_time": None, "prescribed_time": None},
-    "dispersion.attitude": {"axis_angle": AxisAngle, "uniform": UniformAttitude, "normal": NormalAttitude},
-    "dispersion.rate": {"normal": NormalRate},
-    "dispersion.inertia": {"relative_normal": RelativeInertia},
-    "dispersion.disturbance_phase": {"uniform": UniformPhase},
-}
-_TABLES: dict[str, type[Table]] = {
-    "spacecraft": Spacecraft,
-    "initial": Initial,
-    "loop": Loop,
-    "hardware": Hardware,
-    "tune": Tune,
-}
-
-
 def load(path: str | Path) -> dict[str, Any]:
     """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
         return tomllib.loads(text)
     except FileNotFoundError:
         raise ScenarioError(f"the scenario file {path} is not there") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"the scenario file {path} cannot be read as text: {error}") from None
+    except IsADirectoryError:
+        raise ScenarioError(f"the scenario file {path} is a folder, but must be a TOML file") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f"the scenario file {path} is no text in UTF-8, but must be a TOML file") from None
+    except OSError as error:
+        raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
         raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
 
 
-def parse(raw: Mapping[str, Any], metrics: Collection[str]) -> Scenario:
-    """Scenario from raw tables, absent keys at their defaults; raises ScenarioError. `metrics`: known names."""
-    defaults = Scenario()
-    names = Scenario.__struct_fields__
-    found: dict[str, Any] = {}
+def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Scenario:
+    """Scenario from raw tables, absent keys at their defaults; raises ScenarioError.
+
+    metrics: names of the metrics by the kind of the plant.
+    """
     for name, table in raw.items():
-        if name not in names:
-            raise ScenarioError(f"[{name}] is not a known table; the nearest known one is [{nearest(name, names)}]")
-        if not isinstance(table, Mapping):
+        if name in Scenario.__struct_fields__ and not isinstance(table, Mapping):
             raise wrong(name, table, "a table")
-        if name == "requirements":
-            found[name] = {key: _requirement(key, value, metrics) for key, value in table.items()}
-        elif name == "dispersion":
-            found[name] = _dispersion(table)
+    kind = _plant_kind(raw.get("plant", {}))
+    layout = TABLES[kind]
+    for name in raw:
+        if name in layout or name == "requirements":
+            continue
+        others = [other for other, theirs in TABLES.items() if name in theirs]
+        if others:
+            raise ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
+        if not isinstance(raw[name], Mapping):
+            place = _place(name, layout)
+            raise ScenarioError(f"{name} = {show(raw[name])} stands outside a table; {place}")
+        known = (*layout, "requirements")
+        raise ScenarioError(f"[{name}] is not a known table; the nearest known one is [{nearest(name, known)}]")
+
+    plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
+    order = 0
+    if kind == "chain":  # x0 says the order where it is absent
+        given = raw.get("plant", {})
+        order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
+        if order < 2:
+            raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
+    fallback = tables.defaults(kind, order)
+    found: dict[str, Any] = {}
+    for name in layout:
+        if name not in raw and name in tables.OPTIONAL:
+            continue
+        given = raw.get(name, {})
+        if name == "dispersion":
+            found[name] = _dispersion(given, kind)
         else:
-            found[name] = _table(name, table)
-    for name, key in (("initial", "attitude"), ("reference", "attitude")):
-        default, given = getattr(defaults, name), found.get(name)
-        if given is not None:  # a table without an attitude keeps the default one
-            said = [key for key in ATTITUDE_KEYS if getattr(given, key) is not None]
-            if len(said) > 1:
-                two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
-                raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
-            if not said:
-                found[name] = msgspec.structs.replace(given, quat_xyzw=default.quat_xyzw)
+            found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name])
+    if kind == "chain" and "order" not in raw.get("plant", {}):
+        found["plant"] = msgspec.structs.replace(found["plant"], order=order)
+    for name in ("initial", "reference"):
+        if name in found:
+            _one_attitude(name, found[name])
+    found["requirements"] = {
+        key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
+    }
     return Scenario(**found)
+
+
+def _plant_kind(plant: Mapping[str, Any]) -> str:
+    kind = plant.get("kind", "spacecraft")
+    if not isinstance(kind, str) or kind not in TABLES:
+        raise wrong("plant.kind", kind, " or ".join(map(show, TABLES)))
+    return kind
+
+
+def _place(key: str, layout: Mapping[str, Any]) -> str:
+    """Where a key that stands outside a table may belong."""
+    keys = {field: name for name, table in layout.items() for struct in _structs(table)
+            for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
+    closest = nearest(key, keys)
+    return f"the nearest known key is {keys[closest]}.{closest}"
+
+
+def _structs(table: type[Table] | Kinds) -> list[type[Table]]:
+    return [struct for struct in table.values() if struct is not None] if isinstance(table, dict) else [table]
+
+
+def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A table with what is absent filled in; an attitude that is given replaces the default one."""
+    if any(key in given for key in ATTITUDE_KEYS):
+        fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
+    return {**fallback, **given}
+
+
+def _one_attitude(name: str, table: Any) -> None:
+    said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
+    if len(said) > 1:
+        two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
+        raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
@@ -310,10 +164,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)[0]
 
 
-def _table(name: str, raw: Mapping[str, Any]) -> Table:
-    if name not in _KINDS:
-        return _fields(name, raw, _TABLES[name])
-    kinds = _KINDS[name]
+def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Table:
+    if not isinstance(kinds, dict):
+        return _fields(name, raw, kinds)
     kind = raw.get("kind", next(iter(kinds)))
     if not isinstance(kind, str) or kind not in kinds:
         allowed = " or ".join(show(k) for k, struct in kinds.items() if struct is not None)
@@ -325,16 +178,17 @@ def _table(name: str, raw: Mapping[str, Any]) -> Table:
     return _fields(name, raw, struct)
 
 
-def _dispersion(raw: Mapping[str, Any]) -> Dispersion:
+def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
+    struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
     found = {}
     for key, table in raw.items():
-        if key not in Dispersion.__struct_fields__:
-            closest = nearest(key, Dispersion.__struct_fields__)
+        if key not in struct.__struct_fields__:
+            closest = nearest(key, struct.__struct_fields__)
             raise ScenarioError(f"dispersion.{key} is not a known key; the nearest known one is dispersion.{closest}")
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        found[key] = _table(f"dispersion.{key}", table)
-    return Dispersion(**found)
+        found[key] = _table(f"dispersion.{key}", table, tables.DISPERSIONS[key])
+    return struct(**found)
 
 
 def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:

@@ -54,13 +54,22 @@ class Spin:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Origin:
+    """The reference of an integrator chain: the origin, which needs no numbers."""
+
+    def __call__(self, t: Time) -> None:
+        """Nothing, at any time."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Constant:
     """A constant disturbance; zero serves as none."""
 
-    value: Leaf  # (3,) [N m]
+    value: Leaf  # (m,) [N m]
 
-    def __call__(self, t: Time) -> Float[Array, "3"]:
-        """Torque at t [s], (3,) [N m]."""
+    def __call__(self, t: Time) -> Float[Array, " m"]:
+        """Disturbance at t [s], (m,) [N m]."""
         return self.value
 
 
@@ -69,13 +78,13 @@ class Constant:
 class Sinusoid:
     """bias + amplitude sin(frequency t + phase), per axis."""
 
-    amplitude: Leaf  # (3,) [N m]
-    frequency: Leaf  # (3,) [rad/s]
-    phase: Leaf  # (3,) [rad]
-    bias: Leaf  # (3,) [N m]
+    amplitude: Leaf  # (m,) [N m]
+    frequency: Leaf  # (m,) [rad/s]
+    phase: Leaf  # (m,) [rad]
+    bias: Leaf  # (m,) [N m]
 
-    def __call__(self, t: Time) -> Float[Array, "3"]:
-        """Torque at t [s], (3,) [N m]."""
+    def __call__(self, t: Time) -> Float[Array, " m"]:
+        """Disturbance at t [s], (m,) [N m]."""
         return self.bias + self.amplitude * jnp.sin(self.frequency * t + self.phase)
 
 

@@ -1,5 +1,10 @@
-"""Exact solutions, envelopes and bounds: what theory says a run must do."""
+"""Exact solutions, envelopes, bounds and design rules of Theorems 1 to 3: what theory says a run must do.
 
+tau = t_f - t is the time to go, r = tau / t_f, L = ln(1/r). "Exact" means: a perfect estimate of the disturbance and
+K2 = 0. The paper writes ln(t_f - t) in (20)-(22) and (47)-(50) where its absolute value is meant.
+"""
+
+import math
 from typing import NamedTuple
 
 import jax
@@ -8,41 +13,136 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import numerics
+from ptsmc_jax import attitude, numerics
+from ptsmc_jax.controllers import expansion
+from ptsmc_jax.plants import Chain
 from ptsmc_jax.rollout import Parts
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
+GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): what the smooth sign gives away per component, in units of its width
 
 
 class ErrorMotion(NamedTuple):
-    """Attitude error vector, its derivative and s before the hand-over."""
+    """Attitude error vector, its derivatives and s before the hand-over."""
 
     error: Array  # [-]
     error_rate: Array  # [1/s]
     s: Array  # [-]
+    acceleration: Array  # [1/s^2]
+
+
+class ChainMotion(NamedTuple):
+    """States of a chain, s, and x_n' before the hand-over."""
+
+    x: Array  # (n,)
+    s: Array
+    acceleration: Array  # x_n', the input where f = 0, g = 1 and d = 0
 
 
 def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: Vector) -> ErrorMotion:
-    """Closed form of the second-order law before the hand-over for a perfect disturbance estimate and K2 = 0.
+    """Closed form of the second-order law before the hand-over, for each component of the attitude error vector.
 
-    x(t) = r^eta (x(0) + s(0) L), s(t) = s(0) r^eta, with r = (t_f - t)/t_f, L = ln(1/r), s(0) = t_f x'(0) + eta x(0):
-    each component of the attitude error vector, and the system (6). t, t_f [s], t < t_f; error, error_rate at t = 0.
+    x(t) = r^eta (x(0) + s(0) L), s(t) = s(0) r^eta, s(0) = t_f x'(0) + eta x(0). t, t_f [s], t < t_f; error and
+    error_rate are those at t = 0.
     """
-    r = (t_f - t) / t_f
-    log = -jnp.log(r)
+    tau = t_f - t
+    r = tau / t_f
     s0 = t_f * error_rate + eta * error
     decay = r**eta
-    x = decay * (error + s0 * log)
-    return ErrorMotion(x, (s0 * decay - eta * x) / (t_f - t), s0 * decay)
+    x, s = decay * (error - s0 * jnp.log(r)), s0 * decay
+    x_dot = (s - eta * x) / tau
+    return ErrorMotion(x, x_dot, s, -(eta - 1.0) * x_dot / tau - eta * s / tau**2)
 
 
-def first_torque(inertia: Float[Array, "3 3"], q: Float[Array, "4"], eta: Scalar, t_f: Scalar) -> Float[Array, "3"]:
-    """Torque at t = 0 [N m] from rest to the fixed reference identity, d_hat(0) = 0: -2 eta^2 J v / (q4 t_f^2).
+def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
+    """Closed form of law (52) on a chain of any order n before the hand-over, d = 0 and K = 0; x0: (n,) at t = 0.
 
-    inertia [kg m^2], t_f [s]. For a rotation by theta about n: 2 eta^2 |(J n)_i| tan(theta/2) / t_f^2 about axis i.
+    s(t) = s(0) r^(eta+n-2), and y = x_1 / tau^eta obeys y^(n-1) = s(0) t_f^-(eta+n-2) / tau, integrated n-1 times.
     """
-    return -2.0 * eta**2 * (inertia @ q[:3]) / (q[3] * t_f**2)
+    n = x0.shape[0]
+    s0 = _surface(t_f, eta, x0)
+    y = [free + s0 * forced for free, forced in zip(*_modes(t, t_f, eta, x0), strict=True)]
+    x = _from_modes(t, t_f, eta, y)
+    return ChainMotion(jnp.stack(x[:n]), s0 * ((t_f - t) / t_f) ** (eta + n - 2), x[n])
+
+
+def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, floor: Scalar) -> tuple[Vector, Vector]:
+    """Centre and half width, (n,) each, of the interval that holds x_1 .. x_n where |s|^2 <= s0^2 r^(..) + floor tau^n.
+
+    (20)-(22) and (47)-(50) with their constants, for any residual that `sliding_envelope` allows: the exact solution
+    without s is the centre, and each of the n-1 integrations of |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
+    """
+    n, tau = x0.shape[0], t_f - t
+    free, forced = _modes(t, t_f, eta, x0)
+    scale = jnp.sqrt(floor) * tau ** (n / 2)  # what the smooth sign leaves of |s|
+    widths = []
+    for j in range(n):
+        p = n - 2 - j
+        share = 1.0 / ((eta - n / 2 + j) * math.factorial(p)) if p >= 0 else 1.0
+        left = scale * share * tau**-j * (t_f / tau) ** eta
+        widths.append(jnp.abs(s0 * forced[j]) + left)
+    centre = _from_modes(t, t_f, eta, free)[:n]
+    half = _from_modes(t, t_f, eta, [*widths, jnp.zeros_like(tau)], jnp.abs)[:n]
+    return jnp.stack(centre), jnp.stack(half)
+
+
+def _surface(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
+    """S of (37) at t = 0."""
+    c = expansion(eta, x.shape[0])
+    return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
+
+
+def _modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
+    """y, y', .. y^(n) of y = x_1 / r^eta: what the initial state gives, and what s(0) = 1 gives besides."""
+    n, tau = x0.shape[0], t_f - t
+    rising = [jnp.ones_like(eta)]
+    for k in range(n):
+        rising.append(rising[-1] * (eta + k))
+    start = [
+        sum((math.comb(k, j) * x0[j] * rising[k - j] * t_f ** (j - k) for j in range(k + 1)), jnp.zeros_like(t))
+        for k in range(n - 1)
+    ]
+    free, forced = [], []
+    for j in range(n + 1):
+        terms = (start[k] * t ** (k - j) / math.factorial(k - j) for k in range(j, n - 1))
+        free.append(sum(terms, jnp.zeros_like(t)))
+        gained = _integral(t, t_f, n - 2 - j) if j < n - 1 else tau ** (n - 2 - j)
+        forced.append(t_f ** (2 - n) * gained)
+    return free, forced
+
+
+def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
+    """Integral over 0 < u < t of (t - u)^p / p! / (t_f - u) [s^p]."""
+    tau = t_f - t
+    total = (-tau) ** p * jnp.log(t_f / tau)
+    for j in range(1, p + 1):
+        total += math.comb(p, j) * (-tau) ** (p - j) * (t_f**j - tau**j) / j
+    return total / math.factorial(p)
+
+
+def _from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda v: v) -> list[Scalar]:
+    """x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule; size = abs: bounds on them from bounds on y."""
+    r = (t_f - t) / t_f
+    falling = [jnp.ones_like(eta)]
+    for k in range(len(y)):
+        falling.append(-falling[-1] * (eta - k))
+    slopes = [size(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
+    return [
+        sum((math.comb(k, j) * slopes[k - j] * y[j] for j in range(k + 1)), jnp.zeros_like(r)) for k in range(len(y))
+    ]
+
+
+def first_torque(
+    inertia: Float[Array, "3 3"], q: Float[Array, "4"], eta: Scalar, t_f: Scalar, q_f: Float[Array, "4"] | None = None
+) -> Float[Array, "3"]:
+    """Torque at t = 0 [N m] from rest to a fixed reference (None: identity), d_hat(0) = 0.
+
+    -2 eta^2 J T(q)^-1 (q_1 - q_1f) / t_f^2; for the identity -2 eta^2 J v / (q4 t_f^2), so a rotation by theta about n
+    takes 2 eta^2 |(J n)_i| tan(theta/2) / t_f^2 about axis i: it grows like 1/q4. inertia [kg m^2], t_f [s].
+    """
+    error = q[:3] if q_f is None else q[:3] - q_f[:3]
+    return -2.0 * eta**2 * (inertia @ attitude.t_inverse_times(q, error)) / t_f**2
 
 
 def later_peak_ratio(eta: Scalar) -> Scalar:
@@ -58,40 +158,144 @@ def later_peak_time(eta: Scalar, t_f: Scalar) -> Scalar:
     return t_f * (1.0 - jnp.exp(-(2.0 * eta - 3.0) / ((eta - 1.0) * (eta - 2.0))))
 
 
-def sliding_envelope(parts: Parts, t: ArrayLike) -> np.ndarray:
-    """Bound on |s|_2 before the hand-over for the continuous loop with the smooth sign and no noise; t (time,) [s].
+def shortest_time(
+    inertia: Float[Array, "3 3"],
+    q: Float[Array, "4"],
+    eta: Scalar,
+    limit: Scalar,
+    q_f: Float[Array, "4"] | None = None,
+) -> Scalar:
+    """Shortest t_f [s] that keeps the torque below limit [N m], from rest to a fixed reference, disturbance small.
 
-    |s|^2 <= |s(0)|^2 r^(2 eta) + beta tau^2 / (eta - 1), beta = sup(|T J^-1| K2)/2 * 3 * 0.2785 width, r = tau/t_f:
-    0.2785 = max of x (1 - tanh x), the most that the smooth sign gives away per component.
+    eta sqrt(2 max_i |(J n)_i| tan(theta/2) / limit) sqrt(max(1, R(eta))), with R of `later_peak_ratio`.
     """
-    controller = parts.controller
+    first = jnp.max(jnp.abs(first_torque(inertia, q, eta, jnp.ones_like(eta), q_f)))
+    return jnp.sqrt(first / limit * jnp.maximum(1.0, later_peak_ratio(eta)))
+
+
+def residual_error(acceleration: Scalar, eta: Scalar, delta: Scalar) -> tuple[Scalar, Scalar]:
+    """Error at the hand-over and, about, at t_f that a constant residual acceleration of eps leaves [-].
+
+    a tau^2 / (eta-2)^2 before the hand-over, so a delta^2 / (eta-2)^2 at it and a delta^2 (1/2 - 1/(eta-2)^2) at t_f:
+    the latter is zero near eta = 3.41 by accident, which is why runs are judged on a window. acceleration [1/s^2].
+    """
+    share = 1.0 / (eta - 2.0) ** 2
+    return acceleration * delta**2 * share, acceleration * delta**2 * (0.5 - share)
+
+
+def hold_floor(disturbance_rate: Scalar, gain: Scalar, k1: Scalar, switching: Scalar, width: Scalar) -> Scalar:
+    """What an axis holds after the hand-over [-], about: |d'| / (l (K1 + |T J^-1| K2 / width)).
+
+    disturbance_rate: |d'| [N m/s]; gain: l [N m s]; switching: |T J^-1| K2 [1/s^2]; width: of the smooth sign.
+    """
+    return disturbance_rate / (gain * (k1 + switching / width))
+
+
+def _start(parts: Parts) -> tuple[Array, Array]:
+    """The errors and their derivatives at t = 0, (m,) each."""
     target = parts.reference(jnp.zeros_like(parts.t_end))
-    x0 = controller.align(parts.initial, target)
-    error, error_rate = controller.errors(x0, target)
-    t_f, eta = float(controller.t_f), float(controller.eta)
-    s0 = np.linalg.norm(t_f * np.asarray(error_rate) + eta * np.asarray(error))
+    return parts.controller.errors(parts.controller.align(parts.initial, target), target)
+
+
+def sliding_envelope(parts: Parts) -> tuple[float, float]:
+    """s0 and floor of |s|_2^2 <= s0^2 r^(2 (eta+n-2)) + floor tau^n before the hand-over, continuous and noise-free.
+
+    floor = 2 beta / (2 eta + n - 4), beta = (factor of tau^(n-1) sign(s) in s') * components * 0.2785 width; it is 0
+    for the exact sign, which gives the paper's (15), (32) and (43).
+    """
+    law, n = parts.controller, parts.controller.order
+    if isinstance(parts.plant, Chain):
+        s0 = float(jnp.abs(_surface(law.t_f, law.eta, parts.initial)))
+    else:
+        error, error_rate = _start(parts)
+        s0 = float(jnp.linalg.norm(law.t_f * error_rate + law.eta * error))
     bound = parts.observer.error_bound()
-    # |T J^-1|_F <= |T|_2 |J^-1|_F = |J^-1|_F for a unit quaternion
-    switching = float(numerics.norm(controller.model.inertia_inverse) * jnp.maximum(bound.start, bound.floor))
-    beta = switching / 2 * 3 * 0.2785 * float(controller.sign_width)
-    tau = np.maximum(t_f - np.asarray(t), 0.0)
-    return np.sqrt(s0**2 * (tau / t_f) ** (2 * eta) + beta * tau**2 / (eta - 1.0))
+    switching = float(law.switching_rate(jnp.maximum(bound.start, bound.floor)))
+    beta = switching * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
+    return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
 
-def predicted_path(parts: Parts, points: int = 2000) -> tuple[Array, Array]:
-    """Times before the hand-over [s] and q4^2 along the exact error motion at them, (points,) each.
+def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
+    """Bound on |s|_2 at times t (time,) [s] before the hand-over by `sliding_envelope`."""
+    law, n = parts.controller, parts.controller.order
+    s0, floor = sliding_envelope(parts)
+    tau = np.maximum(float(law.t_f) - np.asarray(t), 0.0)
+    return np.sqrt(s0**2 * (tau / float(law.t_f)) ** (2.0 * (float(law.eta) + n - 2.0)) + floor * tau**n)
+
+
+def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
+    """Bound on |error|_2, the attitude error vector's or |x_1|, at times t (time,) [s] before the hand-over."""
+    s0, floor = (jnp.asarray(v) for v in sliding_envelope(parts))
+    return np.asarray(_error_bound(parts, jnp.asarray(t), s0, floor))
+
+
+@jax.jit
+def _error_bound(parts: Parts, t: Array, s0: Scalar, floor: Scalar) -> Array:
+    law = parts.controller
+    starts = parts.initial[None] if isinstance(parts.plant, Chain) else jnp.stack(_start(parts), axis=1)
+
+    def component(time: Scalar, x0: Vector) -> Scalar:
+        centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, floor)
+        return jnp.abs(centre[0]) + half[0]
+
+    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(starts))(t)
+    return jnp.sqrt(jnp.sum(sizes**2, axis=1))
+
+
+def exact_sizes(parts: Parts, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
+    error, s = _exact_sizes(parts, jnp.asarray(t))
+    return np.asarray(error), np.asarray(s)
+
+
+@jax.jit
+def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
+    law = parts.controller
+
+    def sizes(time: Scalar) -> tuple[Scalar, Scalar]:
+        if isinstance(parts.plant, Chain):
+            chain = exact_chain(time, law.t_f, law.eta, parts.initial)
+            return jnp.abs(chain.x[0]), jnp.abs(chain.s)
+        motion = exact_error(time, law.t_f, law.eta, *_start(parts))
+        return numerics.norm(motion.error), numerics.norm(motion.s)
+
+    return jax.vmap(sizes)(t)
+
+
+def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
+    """Input (m,) [N m] along the exact motion at t [s] before the hand-over, and the law's clearance then [-].
+
+    For the spacecraft q4^2 = 1 - |v|^2 stands for the clearance; at or below 0 the path leaves the unit ball.
+    """
+    law, plant = parts.controller, parts.plant
+    if isinstance(plant, Chain):
+        motion = exact_chain(t, law.t_f, law.eta, parts.initial)
+        drive = motion.acceleration - parts.disturbance(t)
+        return (drive - plant.drift(motion.x)) / plant.input_gain(motion.x), jnp.ones_like(t)
+    target = parts.reference(t)
+    motion = exact_error(t, law.t_f, law.eta, *_start(parts))
+    rate_f, acceleration_f = target.vector_rates()
+    v = target.q[:3] + motion.error
+    square = 1.0 - jnp.sum(v * v)
+    scalar = jnp.where(target.q[3] < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(square, 1e-12))
+    q = jnp.append(v, scalar)
+    w = 2.0 * attitude.t_inverse_times(q, rate_f + motion.error_rate)
+    w_dot = attitude.t_inverse_times(q, 2.0 * (acceleration_f + motion.acceleration) + 0.5 * jnp.dot(w, w) * v)
+    return plant.inertia @ w_dot + jnp.cross(w, plant.inertia @ w) - parts.disturbance(t), square
+
+
+def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
+    """Times before the hand-over [s], (points,), inputs (points, m) and q4^2 (points,) along the exact motion at them.
 
     The additive error law works in v alone; q4^2 = 1 - |v|^2 at or below 0 means that its path leaves the unit ball.
     """
-    controller = parts.controller
-    target = parts.reference(jnp.zeros_like(parts.t_end))
-    x0 = controller.align(parts.initial, target)
-    error, error_rate = controller.errors(x0, target)
-    tau = controller.t_f * (controller.delta / controller.t_f) ** jnp.linspace(0.0, 1.0, points)
-    t = controller.t_f - tau
+    law = parts.controller
+    t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
+    u, clearance = jax.vmap(lambda time: exact_input(parts, time))(t)
+    return t, u, clearance
 
-    def square(time: Scalar) -> Scalar:
-        motion = exact_error(time, controller.t_f, controller.eta, error, error_rate)
-        return 1.0 - jnp.sum((parts.reference(time).q[:3] + motion.error) ** 2)
 
-    return t, jax.vmap(square)(t)
+def exact_peak(parts: Parts, points: int = 400) -> Scalar:
+    """Largest input along the exact motion before the hand-over [N m]: rule 3.5 for any start, reference and order."""
+    _, u, _ = exact_path(parts, points)
+    return jnp.max(jnp.abs(u))

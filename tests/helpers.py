@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def parts(
     body = plants.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
-        timing: Any = clock.graded(t_f, delta, t_end, 1.0, k1, 0.1, 0.2, saves)
+        timing: Any = clock.graded(t_f, delta, t_end, 1.0, k1 / 2, 0.1, (0.2 * t_f, 0.2), saves)
     elif flight:
         timing = clock.flight(period, t_end)
     else:
@@ -66,6 +67,52 @@ def parts(
         sensors=None if noise is None else hardware.Sensors(*(vector(v) for v in noise)),
         clock=timing,
         initial=plants.AttitudeState(vector(q), vector(rate)),
+        t_end=vector(t_end),
+        window=vector(1.0),
+        settling_angle=vector(1e-3),
+    )
+
+
+def chain_parts(
+    x0: Any,
+    t_f=5.0,
+    eta: float | None = None,
+    delta=0.05,
+    *,
+    k1=1.0,
+    a: Any = None,
+    bound=0.0,
+    sign_width=1e-3,
+    disturbance: Any = None,
+    observer: Any = None,
+    steps: tuple[int, int] | None = None,
+    period: float | None = None,
+    noise: Any = None,
+    f: Any = None,
+    g: Any = None,
+) -> Parts:
+    """An integrator chain as long as x0, without disturbance; steps: of a grid of its own, before and after t_s."""
+    n, t_end = len(x0), t_f + 2.0
+    model = plants.chain(n, f, g)
+    eta = n + 1.0 if eta is None else eta
+    a = [float(math.comb(n - 1, i)) for i in range(n - 1)] if a is None else a
+    law = controllers.PrescribedTimeChain(model, *(vector(v) for v in (t_f, eta, delta, k1, sign_width)), vector(a))
+    if period is not None:
+        timing: Any = clock.anchored(period, t_end, t_f, 2.0 + delta)
+    elif steps is not None:
+        largest = vector(1.5 * t_f / steps[0])
+        timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
+    else:
+        timing = clock.graded(t_f, delta, t_end, 1.0, law.hold_rate(), 0.0, (0.0, 0.0), (), n)
+    return Parts(
+        plant=model,
+        disturbance=disturbance or signals.Constant(jnp.zeros(1)),
+        reference=signals.Origin(),
+        controller=law,
+        observer=observer or observers.NoObserver(model, vector(bound)),
+        sensors=None if noise is None else hardware.StateSensor(vector(noise)),
+        clock=timing,
+        initial=vector(x0),
         t_end=vector(t_end),
         window=vector(1.0),
         settling_angle=vector(1e-3),

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from ptsmc_jax import metrics, scenario, store
+from ptsmc_jax import metrics, runs, scenario, store
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT
 from tests.test_scenario import BAD as BAD_SCENARIOS
 from tests.test_scenario import check_sentence
@@ -99,7 +99,7 @@ def test_a_requirement_that_is_not_met_is_exit_status_one(command, tmp_path):
 
 BAD = [
     (("simulate", "nothere.toml"), "nothere.toml is not there"),
-    (("simulate", "folder"), "folder cannot be read"),
+    (("simulate", "folder"), "folder is a folder, but must be a TOML file"),
     (("simulate", "broken.toml"), "broken.toml is no valid TOML"),
     (("simulate", "eta.toml"), "controller.eta is 1.0, but must be a number greater than 2"),
     (("tune", "eta.toml"), "controller.eta is 1.0, but must be a number greater than 2"),
@@ -337,7 +337,7 @@ def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
-    monkeypatch.setattr(single, "fly", broken)
+    monkeypatch.setattr(runs, "fly", broken)
     monkeypatch.setattr(sys, "argv", ["ptsmc", "simulate"])
     with pytest.raises(ValueError, match="ours"):
         cli.main()
@@ -368,7 +368,7 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
     (tmp_path / "s.toml").write_text("controller.eta = 2")
     bad = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "other")
     assert (bad.returncode, bad.stdout) == (2, "")
-    assert bad.stderr == "ptsmc: controller.eta is 2, but must be a number greater than 2 (Theorem 1)\n"
+    assert bad.stderr == "ptsmc: controller.eta is 2, but must be a number greater than 2 (Theorem 2)\n"
     assert not (tmp_path / "other").exists()
 
 

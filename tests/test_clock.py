@@ -63,7 +63,7 @@ def test_flight_clock_counts_from_zero_and_hands_over_at_the_first_sample_not_be
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
 def test_graded_grid_has_its_nodes_and_steps_as_promised(t_f, delta):
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
-    grid = clock.graded(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, 1e-3, saves)
+    grid = clock.graded(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
     ticks = grid.ticks(vector(t_f), vector(delta))
     t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
     assert np.all(t_next >= t)
@@ -86,7 +86,7 @@ def test_graded_grid_has_its_nodes_and_steps_as_promised(t_f, delta):
 
 
 def test_graded_nodes_move_with_t_f_and_delta_by_their_exact_derivative():
-    grid = clock.graded(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, 0.1)
+    grid = clock.graded(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, (3.0, 0.1))
 
     def nodes(t_f, delta):
         return grid.ticks(t_f, delta).t

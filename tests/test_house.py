@@ -29,17 +29,21 @@ FLOORS = {
         theory
         requirements
         dispersions
+        tables
         schema
+        checks
         scenario
-        montecarlo
+        montecarlo runs
         store
         plotting
+        paper
+        slips
     """,
     "tuning": """
-        bounds
+        bounds design
         objective
         optimise
-        report single
+        report single reproduction
         cli table
     """,
 }

@@ -81,7 +81,7 @@ def span(t, t_next, angles, torque=0.0, delivered=None):
 
 def judge(spans, t_end=4.0):
     judged = metrics.Judged(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
-    running = metrics.begin(spans[0].start, judged)
+    running = metrics.begin(spans[0].start, judged, 3)
     for one in spans:
         running = metrics.update(running, one, judged)
     return metrics.finish(running, spans[1].start, judged)
@@ -111,7 +111,7 @@ def test_an_interval_of_length_zero_changes_nothing():
     judged = metrics.Judged(vector(1.0), vector(4.0), vector(1.0), vector(0.1))
     results = []
     for spans in (plain, with_empty):
-        running = metrics.begin(spans[0].start, judged)
+        running = metrics.begin(spans[0].start, judged, 3)
         for one in spans:
             running = metrics.update(running, one, judged)
         results.append(metrics.finish(running, plain[1].start, judged))

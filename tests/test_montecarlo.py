@@ -28,9 +28,9 @@ def test_256_trials_equal_the_loop_over_them(flown):
     run, trials = flown
     alone = jax.jit(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial))
     for k in range(256):
-        metrics, status, _, q = alone(np.uint32(k))
+        metrics, status, _, x = alone(np.uint32(k))
         assert int(status) == trials.status[k]
-        np.testing.assert_allclose(q, trials.initial_q[k], atol=1e-15)
+        np.testing.assert_allclose(x.q, trials.initial.q[k], atol=1e-15)
         for name in metrics._fields:
             a, b = float(getattr(metrics, name)), float(getattr(trials.metrics, name)[k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
@@ -50,7 +50,7 @@ def test_a_trial_does_not_depend_on_the_others(flown):
     some = np.array([200, 3, 3, 77])
     again = montecarlo.run(run, SPREAD, 5, some)
     np.testing.assert_allclose(again.metrics.window_error, trials.metrics.window_error[some], rtol=1e-12)
-    np.testing.assert_allclose(again.initial_q, trials.initial_q[some], atol=1e-15)
+    np.testing.assert_allclose(again.initial.q, trials.initial.q[some], atol=1e-15)
     other = montecarlo.run(run, SPREAD, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 

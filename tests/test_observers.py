@@ -20,6 +20,10 @@ def test_update_matrix_is_one_minus_the_exponential_over_dt(dt):
     np.testing.assert_allclose(found.update_matrix(vector(dt)), expected, rtol=1e-12, atol=rounding)
 
 
+def body(w):
+    return plants.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
+
+
 def held_motion(inertia, torque, seconds, steps=2000):
     """Rates at both ends of a period of held torque, by numpy RK4 in many steps."""
     inverse = np.linalg.inv(inertia)
@@ -43,7 +47,7 @@ def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
     d, u, h = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.3, -0.2]), 0.05
     w, w_next = held_motion(np.asarray(FULL_INERTIA), u + d, h)
     matrix = found.update_matrix(vector(h))
-    d_hat = found.update(matrix, vector(d), vector(w), vector(w_next), vector(u), vector(h))
+    d_hat = found.update(matrix, vector(d), body(w), body(w_next), vector(u), vector(h))
     # what is right stays; the mean of both gyroscopic torques is the trapezium rule: h^2/12 (d^2/dt^2 of 0.01 N m)
     np.testing.assert_allclose(d_hat, d, atol=1e-6)
 
@@ -60,12 +64,12 @@ def test_digital_update_contracts_for_any_gain_and_period(inertia, dt):
 
 def test_continuous_error_obeys_its_equation():
     """(54) with the true motion: d_hat' = forcing - A d_hat must be -A (d_hat - d)."""
-    found, body = observer(), plants.spacecraft(FULL_INERTIA)
+    found = observer()
     w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
-    w_dot = body.rate(plants.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), w), u, d).w
+    x_dot = plants.spacecraft(FULL_INERTIA).rate(body(w), u, d)
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     np.testing.assert_allclose(found.decay_matrix(), a, rtol=1e-12)
-    found_rate = found.forcing(w, w_dot, u) - found.decay_matrix() @ d_hat
+    found_rate = found.forcing(body(w), x_dot, u) - found.decay_matrix() @ d_hat
     np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)
 
 

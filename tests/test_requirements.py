@@ -60,4 +60,9 @@ def test_a_verdict_carries_the_unit_of_its_metric(metric):
 def test_a_verdict_in_words():
     assert str(verdict([0.1, 0.25])) == "peak_torque at most 0.5 N m: worst 0.25: met"
     said = str(verdict([0.1, 0.75, 0.9]))
-    assert said == "peak_torque at most 0.5 N m: worst 0.9: NOT met, 2 of 3 trials beyond it"
+    assert said == "peak_torque at most 0.5 N m: worst 0.9: NOT met in 2 of 3 trials"
+    assert str(verdict([0.75])) == "peak_torque at most 0.5 N m: 0.75: NOT met"
+    assert str(verdict([0.1], [False])) == "peak_torque at most 0.5 N m: no value: NOT met"
+    lost = str(verdict([0.1, 0.2], [False, True]))
+    assert lost == "peak_torque at most 0.5 N m: no worst value: NOT met in 1 of 2 trials"
+    assert str(verdict([0.1], metric="saturated")) == "saturated at most 0.5: 0.1: met"

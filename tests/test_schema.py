@@ -5,9 +5,10 @@ import re
 import pytest
 
 from ptsmc_jax import schema
-from ptsmc_jax.metrics import CATALOGUE
+from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, CHAIN_CATALOGUE
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.tables import Actuators, Attitude, ChainPlant, Scenario, Table
 
 # design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
 DEFAULTS = {
@@ -46,6 +47,25 @@ DEFAULTS = {
         "window": 1.0,
         "settling_angle": 1e-3,
     },
+}
+# the paper's Fig. 2
+CHAIN_DEFAULTS = {
+    "plant": {"kind": "chain", "order": 3, "x0": [5.0, 3.0, 2.0]},
+    "disturbance": {"kind": "sinusoid", "amplitude": [0.01], "frequency": [1.0], "phase": [0.0], "bias": [0.0]},
+    "controller": {
+        "kind": "prescribed_time",
+        "t_f": 5.0,
+        "eta": 4.0,
+        "delta": 0.05,
+        "k1": 1.0,
+        "a": [1.0, 2.0],
+        "sign_width": 1e-3,
+        "disturbance_rate_bound": 0.01,
+        "disturbance_bound": 0.01,
+        "initial_estimate_error": 0.0,
+    },
+    "observer": {"kind": "none"},
+    "loop": {**DEFAULTS["loop"], "t_end": 15.0},
 }
 TUNE_DEFAULTS = {
     "free": ["eta", "delta", "observer_gain"],
@@ -94,6 +114,21 @@ COMPLETE = [
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
     {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
+    {"observer": {"kind": "none"}},
+    *(
+        {"plant": {"kind": "chain", "order": 3, "x0": [5.0, 3.0, 2.0]}, **tables}
+        for tables in (
+            CHAIN_DEFAULTS,
+            {"disturbance": {"kind": "constant", "amplitude": [0.01]}},
+            {"observer": {"kind": "nonlinear", "gain": [10.0]}},
+            {"hardware": {"state_noise": [1e-5, 1e-5, 0.0], "delay": 1, "torque_limit": 0.5, "torque_lag": 0.1}},
+            {"hardware": {"torque_rate_limit": 5.0, "torque_step": 1e-4}},
+            {"dispersion": {"x0": {"kind": "uniform", "half_width": [1.0, 0.5, 0.0]}}},
+            {"dispersion": {"x0": {"kind": "normal", "std": [1.0, 0.5, 0.0]}}},
+            {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
+            {"requirements": dict.fromkeys(CHAIN_CATALOGUE, 0.5)},
+        )
+    ),
 ]
 
 
@@ -153,25 +188,36 @@ def test_defaults_are_the_papers_case_one():
     assert schema.dump(from_tables({"tune": {}}))["tune"] == TUNE_DEFAULTS
 
 
+def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
+    assert schema.dump(from_tables({"plant": {"kind": "chain", "order": 3}})) == CHAIN_DEFAULTS
+    second = from_tables({"plant": {"kind": "chain"}})
+    assert (second.plant, second.controller.eta) == (ChainPlant(order=2, x0=(5.0, 3.0)), 3.0)
+    fourth = schema.dump(from_tables({"plant": {"kind": "chain", "x0": [1, 0, 0, 0]}, "tune": {}}))
+    assert (fourth["plant"]["order"], fourth["controller"]["eta"], fourth["controller"]["a"]) == (4, 5.0, [1, 3, 3])
+    assert fourth["tune"]["free"] == ["eta", "delta"]  # no observer, no gain
+    assert fourth["tune"]["bounds"] == {"eta": [4.05, 10.0], "delta": [0.05, 2.525]}
+
+
 def test_off_when_absent():
-    scenario = schema.parse({}, CATALOGUE)
+    scenario = schema.parse({}, CATALOGUES)
     assert scenario.hardware is scenario.dispersion is scenario.tune is None
     assert scenario.requirements == {}
 
 
 def test_tables_of_these_tests_name_every_key_there_is():
-    named = {struct: set() for struct in every_struct(schema.Table)}
+    named = {struct: set() for struct in every_struct(Table)}
 
     def visit(parsed, raw):
         if isinstance(raw, dict):
-            if isinstance(parsed, schema.Table):
+            if isinstance(parsed, Table):
                 named[type(parsed)] |= set(raw)
             for key, value in raw.items():
-                visit(getattr(parsed, key) if isinstance(parsed, schema.Table) else parsed[key], value)
+                visit(getattr(parsed, key) if isinstance(parsed, Table) else parsed[key], value)
 
     for tables in COMPLETE:
-        visit(schema.parse(tables, CATALOGUE), tables)
-    named.pop(schema.Attitude)  # the base of others
+        visit(schema.parse(tables, CATALOGUES), tables)
+    named.pop(Attitude)  # bases of others
+    named.pop(Actuators)
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
 
 
@@ -205,10 +251,10 @@ def test_lists_of_wrong_length(tables, path):
         said = refusal(changed(tables, path[:-1], wrong))
         assert said.startswith(f"{key_of(path)} is ")
         assert schema.show(wrong) in said
-        assert re.search("must be .*(two|three|four) ", said)
+        assert re.search("must be .*((one|two|three|four) |a list of )", said)
 
 
-@pytest.mark.parametrize("name", schema.Scenario.__struct_fields__)
+@pytest.mark.parametrize("name", Scenario.__struct_fields__)
 def test_misspelt_table_names_the_nearest(name):
     misspelt = name.replace(name[2], "", 1)
     assert refusal({misspelt: {}}) == f"[{misspelt}] is not a known table; the nearest known one is [{name}]"
@@ -224,7 +270,7 @@ def test_misspelt_key_names_the_nearest(tables, path):
     )
 
 
-@pytest.mark.parametrize("name", schema.Scenario.__struct_fields__)
+@pytest.mark.parametrize("name", Scenario.__struct_fields__)
 def test_a_table_is_a_table(name):
     assert refusal({name: 3}) == f"{name} is 3, but must be a table"
 
@@ -257,9 +303,9 @@ def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
         (b"[controller\neta = 3.0", "is no valid TOML"),
         (b"[controller]\neta = 3.0\neta = 4.0", "is no valid TOML"),
         (b"\x00", "is no valid TOML"),
-        (b"\xff\xfe", "cannot be read as text"),
+        (b"\xff\xfe", "is no text in UTF-8"),
         (b"x = " + 5000 * b"9", ""),  # more digits than Python turns into a number
-        (None, "cannot be read"),
+        (None, "is a folder"),
     ],
     ids=["unclosed", "twice", "null", "binary", "digits", "directory"],
 )

@@ -89,7 +89,7 @@ def test_verdicts_count_failures_and_missing_values():
     assert np.isnan(never.worst)
     failed = limit.verdict(np.array([29.0, 1.0, 31.0]), np.array([True, False, True]))
     assert (failed.met, failed.failures, failed.trials) == (False, 2, 3)
-    assert "NOT met, 2 of 3 trials" in str(failed)
+    assert "NOT met in 2 of 3 trials" in str(failed)
 
 
 def tree(folder):

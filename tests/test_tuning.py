@@ -172,7 +172,7 @@ def test_statistics_count_failures_and_average_the_rest():
     run = parts(20.0, 3.0, 0.5, period=0.2, t_end=21.0)
     wide = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
     trials = montecarlo.run(run, wide, 5, np.arange(64))
-    told = report.statistics(trials)
+    told = report.statistics(trials, "spacecraft")
     assert told["trials"] == 64
     assert 0 < told["counts"]["singular"] < 64
     errors = trials.metrics.window_error[trials.ok]

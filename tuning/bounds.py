@@ -10,8 +10,11 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.rollout import Parts
 
-# gain: unit
-UNITS = {"eta": "-", "delta": "s", "observer_gain": "N m s", "k1": "1/s", "sign_width": "-"}
+# gain: unit, for a spacecraft and for a chain
+UNITS = {
+    "spacecraft": {"eta": "-", "delta": "s", "observer_gain": "N m s", "k1": "1/s", "sign_width": "-"},
+    "chain": {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "s"},
+}
 
 
 @dataclass(frozen=True)
@@ -59,18 +62,15 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     controller = {k: jnp.asarray(v, float) for k, v in gains.items() if k != "observer_gain"}
     parts = replace(parts, controller=replace(parts.controller, **controller))
     if "observer_gain" in gains:
-        gain = jnp.full(3, jnp.asarray(gains["observer_gain"], float))
+        gain = jnp.full(parts.plant.inputs, jnp.asarray(gains["observer_gain"], float))
         parts = replace(parts, observer=replace(parts.observer, gain=gain))
     return parts
 
 
 def gains_of(parts: Parts) -> dict[str, float]:
-    """Every tunable gain of the parts by name (the observer's: the mean over the axes)."""
+    """Every tunable gain of the parts by name (the observer's, if there is one: the mean over the axes)."""
     controller = parts.controller
-    return {
-        "eta": float(controller.eta),
-        "delta": float(controller.delta),
-        "observer_gain": float(jnp.mean(parts.observer.gain)),
-        "k1": float(controller.k1),
-        "sign_width": float(controller.sign_width),
-    }
+    gains = {"eta": float(controller.eta), "delta": float(controller.delta)}
+    if hasattr(parts.observer, "gain"):
+        gains["observer_gain"] = float(jnp.mean(parts.observer.gain))
+    return {**gains, "k1": float(controller.k1), "sign_width": float(controller.sign_width)}

@@ -10,12 +10,12 @@ from cyclopts import App, CycloptsError, Parameter
 import ptsmc_jax
 
 if TYPE_CHECKING:
-    from ptsmc_jax.schema import Scenario
+    from ptsmc_jax.tables import Scenario
     from tuning.report import Tuning
 
 app = App(
     name="ptsmc",
-    help="Prescribed-time sliding mode control for spacecraft attitude: simulate it, tune its gains.",
+    help="Prescribed-time sliding mode control: reproduce the paper, simulate, tune the gains.",
     version=ptsmc_jax.__version__,
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
@@ -59,14 +59,37 @@ def simulate(
     from ptsmc_jax import store
 
     store.check(folder, force)
+    from ptsmc_jax import runs
     from ptsmc_jax.scenario import study
     from tuning import single
 
-    run = single.fly(study(loaded), key, number)
+    run = runs.fly(study(loaded, drawn=number is not None), key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
         _show_run(run, folder)
     return 0 if run.met else 1
+
+
+@app.command
+def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, figures: Figures = True) -> int:
+    """Fly every figure of the paper, and set its claims and its slips beside what is measured.
+
+    Exit status: 0 done, 1 a run failed, 2 bad input.
+    """
+    from ptsmc_jax import store
+
+    folder = out if out is not None else Path("out") / "reproduce"
+    store.check(folder, force)
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from tuning import reproduction
+
+    made = reproduction.reproduce()
+    store.write(folder, lambda making: reproduction.write(making, made, figures))
+    if not quiet:
+        _show_reproduction(made, folder)
+    return 0 if reproduction.summary(made)["status"] == "ok" else 1
 
 
 @app.command
@@ -189,17 +212,36 @@ class _Progress:
         self._bar.update(self._task, completed=done, total=total, description=f"RMS error {rms:.3e}, {met}")
 
 
+def _show_reproduction(made: Any, folder: Path) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    style: Any = {"title_justify": "left", "box": SIMPLE, "pad_edge": False}
+    table = Table("verdict", "the paper", "measured", title="Claims", **style)
+    for claim in made.claims:
+        table.add_row(claim.verdict, f"{claim.where}: {claim.claim}", claim.measured)
+    console.print(table)
+    table = Table(
+        "where", "what it must be", "shown by", title="Slips", title_justify="left", box=SIMPLE, pad_edge=False
+    )
+    for slip in made.slips:
+        table.add_row(slip.where, slip.correct, slip.shown)
+    console.print(table)
+    console.print("why, and the slips as printed: claims.md", soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)
+
+
 def _show_run(run: Any, folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from ptsmc_jax.metrics import CATALOGUE
-
     console = Console(highlight=False)
     table = Table("metric", "value", "unit", "meaning", box=None, pad_edge=False)
-    for name, (unit, meaning) in CATALOGUE.items():
-        value = run.metrics[name]
-        table.add_row(name, "never" if value != value else f"{value:.5g}", unit, meaning)
+    for name, (unit, meaning) in run.catalogue.items():
+        value, none = run.metrics[name], "never" if run.status == "ok" else "-"
+        table.add_row(name, none if value != value else f"{value:.5g}", unit, meaning)
     what = f", {run.reason}, at {run.bad_time:.4g} s" if run.reason else ""
     console.print(f"status: {run.status}{what}", soft_wrap=True)
     console.print(table)
@@ -212,26 +254,31 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.requirements import verdict_text
+    from tuning import design
     from tuning.bounds import UNITS
 
     console = Console(highlight=False)
     groups = {"paper": summary["paper"], "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     table = Table("", *groups, "unit", box=None, pad_edge=False)
-    for gain, unit in UNITS.items():
-        if any(group["gains"][gain] != groups["paper"]["gains"][gain] for group in groups.values()):
-            table.add_row(gain, *(f"{group['gains'][gain]:.6g}" for group in groups.values()), unit)
+    kind = summary["plant"]
+    for gain, unit in UNITS[kind].items():
+        cells = [group["gains"].get(gain) for group in groups.values()]
+        if len(set(cells)) > 1:
+            table.add_row(gain, *(f"{cell:.6g}" for cell in cells), unit)
     trials = summary["fresh"]["trials"]
     rows = (
-        ("RMS window error", "window_error", "rms", "-"),
-        ("largest window error", "window_error", "max", "-"),
-        ("mean peak torque", "peak_torque", "mean", "N m"),
-        ("largest peak torque", "peak_torque", "max", "N m"),
-        ("mean effort", "effort", "mean", "N m s"),
+        ("RMS window error", "window_error", "rms"),
+        ("largest window error", "window_error", "max"),
+        ("mean peak torque", "peak_torque", "mean"),
+        ("largest peak torque", "peak_torque", "max"),
+        ("mean effort", "effort", "mean"),
     )
-    for label, metric, statistic, unit in rows:
+    for label, metric, statistic in rows:
         cells = (group[metric][statistic] if group[metric] else None for group in groups.values())
-        table.add_row(label, *("-" if cell is None else f"{cell:.4g}" for cell in cells), unit)
+        table.add_row(label, *("-" if cell is None else f"{cell:.4g}" for cell in cells), CATALOGUES[kind][metric][0])
     table.add_row("failed trials", *(str(trials - group["counts"]["ok"]) for group in groups.values()), "")
     console.print(f"tuning {how}; judged on {trials} fresh trials, flight clock, exact sign:", soft_wrap=True)
     console.print(table)
@@ -240,9 +287,9 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     for gain, side in summary["at_bound"].items():
         console.print(f"{gain} ended on its {side} bound", soft_wrap=True)
     for verdict in summary["verdicts"]:
-        met = "met" if verdict["met"] else f"NOT met, {verdict['failures']} of {verdict['trials']} trials beyond it"
-        worst = "-" if verdict["worst"] is None else f"{verdict['worst']:.4g}"
-        console.print(
-            f"{verdict['metric']} at most {verdict['limit']:g} {verdict['unit']}: worst {worst}: {met}", soft_wrap=True
-        )
+        fields = ("metric", "limit", "unit", "worst", "failures", "trials")
+        console.print(verdict_text(*(verdict[field] for field in fields)), soft_wrap=True)
+    if summary["shortest_t_f"] is not None:
+        shortest = summary["shortest_t_f"]
+        console.print(design.text(shortest["limit"], shortest["theory"], shortest["simulated"]), soft_wrap=True)
     console.print(f"results in {folder}", soft_wrap=True)

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import Mesh, PartitionSpec
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
@@ -125,7 +124,7 @@ def _screen(problem: Problem, requirements, gains: np.ndarray) -> tuple[np.ndarr
 
 
 def _add_hardest(problem: Problem, requirements, gains: np.ndarray) -> Problem:
-    if not requirements or problem.dispersion.attitude is None:
+    if not requirements or not problem.dispersion.varies:
         return problem
     trials, ratio = _screen(problem, requirements, gains)
     known = set(np.asarray(problem.trials).tolist())
@@ -134,7 +133,7 @@ def _add_hardest(problem: Problem, requirements, gains: np.ndarray) -> Problem:
 
 
 def _holds(problem: Problem, requirements, gains: np.ndarray) -> bool:
-    if problem.dispersion.attitude is None:
+    if not problem.dispersion.varies:
         return True
     return bool(np.all(_screen(problem, requirements, gains)[1] <= 1.0))
 
@@ -227,13 +226,11 @@ def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:
 @partial(jax.jit, static_argnames=("bounds", "devices"))
 def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
     """Measures f and c of (batches, points, gains) free reals, without derivatives, batch after batch."""
-    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
-    whole, spread = PartitionSpec(), PartitionSpec("device")
 
-    def share(problem: Problem, z: jax.Array) -> tuple:
+    def share(z: jax.Array) -> tuple:
         return jax.lax.map(jax.vmap(lambda z: measure(problem, bounds.gains(z))), z)
 
-    return jax.shard_map(share, mesh=mesh, in_specs=(whole, spread), out_specs=spread, check_vma=False)(problem, z)
+    return montecarlo.spread(share, z, devices)
 
 
 def _divisor(count: int) -> int:
@@ -253,7 +250,7 @@ def _evaluate(problem: Problem, bounds: Bounds, z: np.ndarray) -> tuple[np.ndarr
 def _compiled(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
     """Tangents forward, as one more batch axis."""
 
-    def one(problem: Problem, z: jax.Array) -> tuple:
+    def one(z: jax.Array) -> tuple:
         def twice(z: jax.Array) -> tuple:
             measured = measure(problem, bounds.gains(z))
             return measured, measured
@@ -261,8 +258,4 @@ def _compiled(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> t
         (f_slope, c_slope), (f, c) = jax.jacfwd(twice, has_aux=True)(z)
         return bounds.gains(z), f, c, f_slope, c_slope
 
-    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
-    whole, spread = PartitionSpec(), PartitionSpec("device")
-    return jax.shard_map(
-        jax.vmap(one, (None, 0)), mesh=mesh, in_specs=(whole, spread), out_specs=spread, check_vma=False
-    )(problem, z)
+    return montecarlo.spread(jax.vmap(one), z, devices)

@@ -9,19 +9,18 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
-from ptsmc_jax import draws, montecarlo, plotting, schema, store
-from ptsmc_jax.metrics import Metrics
+from ptsmc_jax import draws, metrics, montecarlo, plotting, schema, store, tables
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.scenario import Reach, Study, reach_of, replace, study
-from ptsmc_jax.schema import Scenario
+from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
 from tuning.bounds import Bounds
+from tuning.design import ShortestTime, shortest_time
 from tuning.objective import Problem
 from tuning.optimise import Search, search
 
 FRESH = 1000  # trials on which gains are judged
-PAPER = {"eta": 3.0, "delta": 0.05, "observer_gain": 10.0, "k1": 1.0}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
 
 
@@ -38,6 +37,7 @@ class Tuning:
     fresh_seed: int
     judged_gains: dict[str, dict[str, float]]  # the gains of each of them
     verdicts: list[Verdict]  # of the tuned gains on the fresh trials
+    shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
 
     @property
     def met(self) -> bool:
@@ -49,6 +49,7 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
     """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw."""
     table = scenario.tune
     assert table is not None
+    assert table.free is not None  # a checked scenario names them
     limits = Bounds(table.free, *(tuple(table.bounds[name][k] for name in table.free) for k in (0, 1)))
     ready = study(scenario, reach=_reach(scenario, table))
     own = gain_bounds.gains_of(ready.parts)
@@ -71,8 +72,7 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
     )
 
     fresh_seed = draws.derive(seed, "fresh trials")
-    period = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
-    paper = {**PAPER, "delta": max(PAPER["delta"], period)}
+    paper = paper_gains(scenario)
     candidates = {"tuned": tuned, "paper": with_gains(scenario, paper)}
     if any(own[name] != paper.get(name, own[name]) for name in own):
         candidates["before"] = scenario
@@ -84,7 +84,18 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
         judged_gains[name] = gain_bounds.gains_of(study(candidate).parts)
     verdicts = [r.verdict(getattr(fresh["tuned"].metrics, r.metric), fresh["tuned"].ok) for r in ready.requirements]
     at_bound = limits.at_bound(found.gains)
-    return Tuning(tuned, gains, found, at_bound, training, fresh, fresh_seed, judged_gains, verdicts)
+    limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
+    shortest = None if limit is None else shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
+    return Tuning(tuned, gains, found, at_bound, training, fresh, fresh_seed, judged_gains, verdicts, shortest)
+
+
+def paper_gains(scenario: Scenario) -> dict[str, float]:
+    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; delta at least a period."""
+    shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+    gains = {"eta": 3.0, "delta": max(0.05, shortest), "k1": 1.0}
+    if isinstance(scenario.plant, tables.ChainPlant):
+        gains["eta"] = scenario.plant.order + 1.0
+    return gains if isinstance(scenario.observer, tables.NoObserver) else {**gains, "observer_gain": 10.0}
 
 
 def as_flown(scenario: Scenario) -> Scenario:
@@ -92,7 +103,7 @@ def as_flown(scenario: Scenario) -> Scenario:
     if scenario.loop.mode != "sampled":
         return scenario
     flown = replace(scenario, loop__clock="flight")
-    if scenario.tune is not None and "sign_width" in scenario.tune.free:
+    if scenario.tune is not None and "sign_width" in _free(scenario):
         return flown
     return replace(flown, controller__sign_width=0.0)
 
@@ -101,14 +112,15 @@ def with_gains(scenario: Scenario, gains: dict[str, float]) -> Scenario:
     """The scenario with other gains."""
     changes: dict[str, Any] = {f"controller__{k}": v for k, v in gains.items() if k != "observer_gain"}
     if "observer_gain" in gains:
-        changes["observer__gain"] = [gains["observer_gain"]] * 3
+        axes = len(getattr(scenario.observer, "gain", ()))
+        changes["observer__gain"] = [gains["observer_gain"]] * axes
     return replace(scenario, **changes)
 
 
-def statistics(trials: Trials) -> dict[str, Any]:
-    """Counts by status and statistics of each metric over the trials that ended well."""
+def statistics(trials: Trials, kind: str) -> dict[str, Any]:
+    """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
     summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
-    for name in Metrics._fields:
+    for name in metrics.CATALOGUES[kind]:
         values = getattr(trials.metrics, name)[trials.ok]
         known = values[np.isfinite(values)]
         if known.size == 0:
@@ -128,17 +140,22 @@ def statistics(trials: Trials) -> dict[str, Any]:
 
 def summary(tuning: Tuning, seed: int) -> dict[str, Any]:
     """What `summary.json` says."""
-    groups = {name: {"gains": tuning.judged_gains[name], **statistics(trials)} for name, trials in tuning.fresh.items()}
+    kind = tuning.tuned.plant.kind
+    groups = {
+        name: {"gains": tuning.judged_gains[name], **statistics(trials, kind)} for name, trials in tuning.fresh.items()
+    }
     tuned, paper = (groups[name]["window_error"] for name in ("tuned", "paper"))
     return {
         "status": "met" if tuning.met else "not met",
+        "plant": tuning.tuned.plant.kind,
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
         "accuracy_gain_over_paper": paper["rms"] / tuned["rms"] if tuned and paper else None,
-        "training": {"seed": seed, **statistics(tuning.training)},
+        "training": {"seed": seed, **statistics(tuning.training, kind)},
         "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
         "paper": {"seed": tuning.fresh_seed, **groups["paper"]},
         **({"before": {"seed": tuning.fresh_seed, **groups["before"]}} if "before" in groups else {}),
+        "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
         "search": {
             "starts": int(tuning.search.history[0].rms.size),
@@ -152,32 +169,30 @@ def summary(tuning: Tuning, seed: int) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, seed: int, figures: bool) -> None:
     """Fill a result folder."""
-    assert scenario.tune is not None
-    names = scenario.tune.free
+    names = _free(scenario)
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
     store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
     store.write_json(folder / "versions.json", store.versions("tune", seed))
     store.write_json(folder / "summary.json", summary(tuning, seed))
-    metrics = [f"{m}_over_limit" for m in scenario.requirements]
+    over = [f"{m}_over_limit" for m in scenario.requirements]
     rows = [
         [step, start, row.rms[start], *row.gains[start], *row.worst[start]]
         for step, row in enumerate(tuning.search.history)
         for start in range(row.rms.size)
     ]
-    store.write_csv(folder / "history.csv", ["step", "start", "rms_window_error", *names, *metrics], rows)
+    store.write_csv(folder / "history.csv", ["step", "start", "rms_window_error", *names, *over], rows)
     if figures:
         plotting.save(_figures(scenario, tuning), folder / "figures")
 
 
 def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
-    assert scenario.tune is not None
-    names, first = scenario.tune.free, tuning.search.history[0].rms.size
+    names, first = _free(scenario), tuning.search.history[0].rms.size
     history = [step for step in tuning.search.history if step.rms.size == first]
     limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
     return {
         "history": plotting.tuning_history(
             names,
-            [gain_bounds.UNITS[name] for name in names],
+            [gain_bounds.UNITS[scenario.plant.kind][name] for name in names],
             np.stack([step.gains for step in history]),
             np.stack([step.rms for step in history]),
             np.stack([np.all(step.worst <= 1.0, axis=1) for step in history]),
@@ -192,16 +207,33 @@ def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _reach(scenario: Scenario, table: schema.Tune) -> Reach:
+def _free(scenario: Scenario) -> tuple[str, ...]:
+    assert scenario.tune is not None
+    assert scenario.tune.free is not None  # a checked scenario names them
+    return scenario.tune.free
+
+
+def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
     own = reach_of(scenario)
-    delta = table.bounds.get("delta", (own.delta, own.delta)) if "delta" in table.free else (own.delta, own.delta)
-    gain = table.bounds["observer_gain"][0] if "observer_gain" in table.free else own.gain
-    return Reach(own.t_f, max(delta[1], own.delta), min(delta[0], own.smallest_delta), min(gain, own.gain))
+
+    def interval(name: str, value: float) -> tuple[float, float]:
+        lower, upper = table.bounds.get(name, (value, value))
+        return min(lower, value), max(upper, value)
+
+    smallest_delta, delta = interval("delta", own.delta)
+    return Reach(
+        t_f=own.t_f,
+        delta=delta,
+        smallest_delta=smallest_delta,
+        gain=interval("observer_gain", own.gain)[0],
+        k1=interval("k1", own.k1)[1],
+        sign_width=interval("sign_width", own.sign_width)[0],
+    )
 
 
 def _trials(ready: Study, wanted: int) -> int:
     """How many trials differ at all: one where nothing is drawn."""
-    return wanted if ready.dispersion.attitude is not None or ready.parts.sensors is not None else 1
+    return wanted if ready.dispersion.varies or ready.parts.sensors is not None else 1
 
 
 def _rounded(value: float) -> float:

@@ -1,0 +1,242 @@
+"""What single keys of a scenario cannot tell: defaults that depend on other keys, keys against each other."""
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import plants, schema, tables
+from ptsmc_jax.controllers import hurwitz
+from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
+from ptsmc_jax.tables import Scenario
+
+MOST_STEPS = 200_000
+
+
+def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
+    """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
+    key, value = attitude_key(table)
+    full = f"{name}.{key}"
+    if table.sequence is not None and key != "euler_deg":
+        raise ScenarioError(f"{name}.sequence is {schema.show(table.sequence)}, but goes with euler_deg only")
+    array = np.array(value, dtype=float)
+    if key in ("quat_xyzw", "quat_wxyz"):
+        length = np.linalg.norm(array)
+        if abs(length - 1.0) > 1e-6:
+            raise wrong(full, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
+        array = array / length
+        return array if key == "quat_xyzw" else np.roll(array, -1)
+    if key == "rotvec_deg":
+        return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
+    if key == "mrp":
+        return Rotation.from_mrp(array).as_quat(canonical=True)
+    if key == "dcm_body_to_inertial":
+        off = np.abs(array @ array.T - np.eye(3)).max()
+        if off > 1e-6 or np.linalg.det(array) < 0:
+            raise wrong(full, value, "a rotation matrix (orthonormal within 1e-6, determinant +1)")
+        return Rotation.from_matrix(array).as_quat(canonical=True)
+    if table.sequence is None:
+        raise ScenarioError(f'{full} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"')
+    try:
+        return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
+    except ValueError:
+        raise wrong(
+            f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
+        ) from None
+
+
+def attitude_key(table: tables.Attitude) -> tuple[str, Any]:
+    """The attitude key that a table uses, and its value."""
+    key = next(key for key in tables.ATTITUDE_KEYS if getattr(table, key) is not None)
+    return key, getattr(table, key)
+
+
+def resolve(scenario: Scenario) -> Scenario:
+    """The scenario with the defaults that depend on other keys: t_end, and what is tuned within which bounds."""
+    loop, t_f = scenario.loop, scenario.controller.t_f
+    if loop.t_end is None:
+        loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
+    tune = scenario.tune
+    if tune is not None:
+        shortest = loop.period if loop.mode == "sampled" else 0.0
+        lower = max(shortest, min(0.05, t_f / 4))
+        least = _least_eta(scenario)
+        default = {
+            "eta": (least + 0.05, least + 6.0),
+            "delta": (lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)),
+            "observer_gain": (0.5, 300.0),
+            "k1": (0.1, 10.0),
+            "sign_width": (1e-5, 1e-1),
+        }
+        free = tune.free
+        if free is None:
+            free = ("eta", "delta", "observer_gain") if _has_gain(scenario) else ("eta", "delta")
+        bounds = {**{key: default[key] for key in free if key in default}, **tune.bounds}
+        tune = msgspec.structs.replace(tune, free=free, bounds=bounds)
+    dispersion = scenario.dispersion
+    if isinstance(dispersion, tables.ChainDispersion) and dispersion.x0 is not None:
+        assert isinstance(scenario.plant, tables.ChainPlant)
+        key = _spread(dispersion.x0)
+        width = getattr(dispersion.x0, key) or (1.0,) * scenario.plant.order
+        dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
+    return msgspec.structs.replace(scenario, loop=loop, tune=tune, dispersion=dispersion)
+
+
+def check(scenario: Scenario) -> None:
+    """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
+    _check_plant(scenario)
+    _check_available(scenario)
+    _check_loop(scenario)
+    _check_dispersion(scenario)
+    if scenario.tune is not None:
+        _check_tune(scenario, scenario.tune)
+
+
+def _spread(x0: tables.UniformState | tables.NormalState) -> str:
+    """The key that says how wide the initial states are drawn."""
+    return "half_width" if isinstance(x0, tables.UniformState) else "std"
+
+
+def _least_eta(scenario: Scenario) -> float:
+    """What eta must exceed: 2 by Theorems 1 and 2, the order of a chain by Theorem 3."""
+    return float(scenario.plant.order) if isinstance(scenario.plant, tables.ChainPlant) else 2.0
+
+
+def _has_gain(scenario: Scenario) -> bool:
+    return not isinstance(scenario.observer, tables.NoObserver)
+
+
+def _check_available(scenario: Scenario) -> None:
+    """Refuse what files may say but the project cannot do yet."""
+
+    def refuse(key: str, value: Any, allowed: str) -> None:
+        raise ScenarioError(f"{key} = {schema.show(value)} {NOT_YET}; allowed is {allowed}")
+
+    error = getattr(scenario.controller, "error", "additive")
+    if error != "additive":
+        refuse("controller.error", error, '"additive"')
+    if scenario.hardware is not None:
+        built = [k for k in ("attitude_noise", "rate_noise", "state_noise") if hasattr(scenario.hardware, k)]
+        for key in scenario.hardware.__struct_fields__:
+            value = getattr(scenario.hardware, key)
+            if value is not None and key not in built:
+                refuse(f"hardware.{key}", value, " and ".join(built))
+    if scenario.dispersion is not None:
+        for key in scenario.dispersion.__struct_fields__:
+            value = getattr(scenario.dispersion, key)
+            if value is not None and key not in ("attitude", "x0"):
+                other = "x0" if isinstance(scenario.dispersion, tables.ChainDispersion) else "attitude"
+                refuse(f"dispersion.{key}", msgspec.to_builtins(value), other)
+    for key, value in scenario.requirements.items():
+        if isinstance(value, tables.Limit) and (value.quantile is not None or value.confidence is not None):
+            given = {k: v for k, v in msgspec.to_builtins(value).items() if v is not None}
+            refuse(f"requirements.{key}", given, "a number, which holds for every trial")
+    tune = scenario.tune
+    if tune is not None:
+        if tune.objective != "rms":
+            refuse("tune.objective", tune.objective, '"rms"')
+        if tune.level is not None:
+            raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
+        if any(gain not in tables.TUNED for gain in tune.free or ()):
+            refuse("tune.free", tune.free, ", ".join(tables.TUNED))
+
+
+def _check_plant(scenario: Scenario) -> None:
+    plant = scenario.plant
+    if isinstance(plant, tables.SpacecraftPlant):
+        assert scenario.spacecraft is not None
+        assert scenario.initial is not None
+        assert scenario.reference is not None
+        try:
+            plants.check_inertia(scenario.spacecraft.inertia)
+        except ValueError as error:
+            raise ScenarioError(f"spacecraft.inertia is {schema.show(scenario.spacecraft.inertia)}: {error}") from None
+        quaternion(scenario.initial, "initial")
+        quaternion(scenario.reference, "reference")
+        return
+    controller, n = scenario.controller, plant.order
+    assert isinstance(controller, tables.ChainController)
+    if len(plant.x0) != n:
+        raise wrong("plant.x0", plant.x0, f"a list of plant.order = {n} numbers")
+    if not controller.eta > n:
+        theorem = "Theorem 1" if n == 2 else "Theorem 3"
+        raise wrong("controller.eta", controller.eta, f"greater than plant.order, {n} ({theorem})")
+    if len(controller.a) != n - 1:
+        raise wrong("controller.a", controller.a, f"a list of plant.order - 1 = {n - 1} numbers")
+    if not hurwitz(controller.a):
+        raise wrong(
+            "controller.a", controller.a, "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
+        )
+    noise = getattr(scenario.hardware, "state_noise", None)
+    if noise is not None and len(noise) != n:
+        raise wrong("hardware.state_noise", noise, f"a list of plant.order = {n} numbers")
+
+
+def _check_loop(scenario: Scenario) -> None:
+    controller, loop = scenario.controller, scenario.loop
+    t_f, delta, sampled = controller.t_f, controller.delta, loop.mode == "sampled"
+    if delta >= t_f:
+        raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
+    assert loop.t_end is not None  # `resolve` filled it in
+    if loop.t_end < t_f:
+        raise wrong("loop.t_end", loop.t_end, f"at least controller.t_f + loop.window, {t_f + loop.window}")
+    if loop.t_end < t_f + loop.window - 1e-9:
+        raise wrong("loop.window", loop.window, f"at most loop.t_end - controller.t_f, {loop.t_end - t_f}")
+    if sampled and delta < loop.period * (1 - 1e-9):
+        raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
+    if sampled and loop.t_end / loop.period > MOST_STEPS:
+        raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {loop.t_end / MOST_STEPS}")
+    if not sampled and scenario.hardware is not None:
+        for key in scenario.hardware.__struct_fields__:
+            if getattr(scenario.hardware, key) is not None:
+                raise ScenarioError(f'hardware.{key} needs the sampled loop, but loop.mode is "{loop.mode}"')
+
+
+def _check_dispersion(scenario: Scenario) -> None:
+    dispersion = scenario.dispersion
+    if isinstance(dispersion, tables.Dispersion) and isinstance(dispersion.attitude, tables.AxisAngle):
+        angles = dispersion.attitude
+        if angles.min_deg > angles.max_deg:
+            raise wrong("dispersion.attitude.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
+    if isinstance(dispersion, tables.ChainDispersion) and dispersion.x0 is not None:
+        assert isinstance(scenario.plant, tables.ChainPlant)
+        key = _spread(dispersion.x0)
+        value = getattr(dispersion.x0, key)
+        if len(value) != scenario.plant.order:
+            raise wrong(f"dispersion.x0.{key}", value, f"a list of plant.order = {scenario.plant.order} numbers")
+
+
+def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
+    t_f, period = scenario.controller.t_f, scenario.loop.period
+    shortest = period if scenario.loop.mode == "sampled" else 0.0
+    # gain: lowest and highest that a bound may be, and whether the lowest itself may be
+    ranges = {
+        "eta": (_least_eta(scenario), math.inf, False),
+        "delta": (shortest, t_f, shortest > 0.0),
+        "observer_gain": (0.0, math.inf, False),
+        "k1": (0.0, math.inf, False),
+        "sign_width": (0.0, math.inf, False),
+    }
+    assert tune.free is not None  # `resolve` filled it in
+    if len(set(tune.free)) < len(tune.free):
+        raise wrong("tune.free", tune.free, "a list that names each gain once")
+    if "observer_gain" in tune.free and not _has_gain(scenario):
+        raise ScenarioError(
+            f'tune.free is {schema.show(tune.free)}, but observer.kind = "none" has no gain; '
+            'allowed is observer_gain with observer.kind = "nonlinear"'
+        )
+    for name, (lower, upper) in tune.bounds.items():
+        key = f"tune.bounds.{name}"
+        if name not in tables.FREE:
+            closest = schema.nearest(name, tables.FREE)
+            raise ScenarioError(f"{key} is not a known gain; the nearest known one is {closest}")
+        if name not in tune.free:
+            raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.show(tune.free)}")
+        least, most, closed = ranges[name]
+        if not (least <= lower if closed else least < lower) or not upper < most:
+            allowed = f"two numbers {'from' if closed else 'above'} {least}"
+            raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
+        if lower >= upper:
+            raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")

@@ -1,0 +1,45 @@
+"""One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import rollout
+from ptsmc_jax.requirements import Verdict
+from ptsmc_jax.rollout import Log, Parts
+from ptsmc_jax.scenario import Study
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    parts: Parts  # as flown
+    log: Log  # numpy arrays (time, component), intervals of length zero left out
+    metrics: dict[str, float]
+    catalogue: dict[str, tuple[str, str]]  # what those are: name -> (unit, meaning)
+    status: str
+    reason: str
+    bad_time: float  # [s], NaN if none
+    verdicts: list[Verdict]
+
+    @property
+    def met(self) -> bool:
+        """The run ended well and met every requirement."""
+        return self.status == "ok" and all(v.met for v in self.verdicts)
+
+
+def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
+    """Fly one run: nominal with the noise of trial 0, or a trial with its dispersions and its noise."""
+    key, number = jnp.uint32(seed), jnp.uint32(trial or 0)
+    parts = ready.parts if trial is None else ready.dispersion.apply(ready.parts, key, number)
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
+    assert result.log is not None
+    lasts = result.log.lasts
+    log = jax.tree.map(lambda rows: rows[lasts], result.log)
+    status, reason = rollout.STATUS[int(result.status)]
+    metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
+    verdicts = [r.verdict(np.asarray(metrics[r.metric]), np.asarray(status == "ok")) for r in ready.requirements]
+    return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)

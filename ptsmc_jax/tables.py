@@ -1,0 +1,329 @@
+"""The tables of a scenario file: every key, its type, range, default and description, for each kind of plant."""
+
+import math
+import typing
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+Number = Annotated[float, Meta(description="a number")]
+Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
+NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
+Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
+Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
+ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
+One = Annotated[tuple[float], Meta(description="a list of one number")]
+OnePositive = Annotated[tuple[Positive], Meta(description="a list of one number greater than 0")]
+Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
+NotNegatives = Annotated[
+    tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
+]
+Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
+Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
+Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
+Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
+Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
+
+
+class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
+    """A table of a scenario file."""
+
+
+class SpacecraftPlant(Table, frozen=True):
+    kind: Literal["spacecraft"] = "spacecraft"
+
+
+class ChainPlant(Table, frozen=True):
+    """Integrator chain (35); x0 is as long as order says, and says it where order is absent."""
+
+    kind: Literal["chain"] = "chain"
+    order: Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")] = 2
+    x0: Numbers = (5.0, 3.0)
+
+
+class Spacecraft(Table, frozen=True):
+    inertia: Inertia = (10.0, 12.0, 14.0)
+
+
+class Attitude(Table, frozen=True):
+    """Exactly one of the attitude keys; `euler_deg` goes with `sequence`."""
+
+    quat_xyzw: Four | None = None
+    quat_wxyz: Four | None = None
+    rotvec_deg: Three | None = None
+    mrp: Three | None = None
+    dcm_body_to_inertial: Matrix | None = None
+    euler_deg: Three | None = None
+    sequence: Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None = None
+
+
+ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
+
+
+class Initial(Attitude, frozen=True):
+    rate: Three = (0.0, 0.0, 0.0)
+
+
+class FixedReference(Attitude, frozen=True):
+    kind: Literal["fixed"] = "fixed"
+
+
+class SpinReference(Attitude, frozen=True):
+    kind: Literal["spin"] = "spin"
+    rate: Three = (0.0, 0.0, 0.0)
+
+
+class NoDisturbance(Table, frozen=True):
+    kind: Literal["none"] = "none"
+
+
+class ConstantDisturbance(Table, frozen=True):
+    kind: Literal["constant"] = "constant"
+    amplitude: Three = (0.01, 0.01, 0.01)
+
+
+class SinusoidDisturbance(Table, frozen=True):
+    kind: Literal["sinusoid"] = "sinusoid"
+    amplitude: Three = (0.01, 0.01, 0.01)
+    frequency: Three = (0.1, 0.1, 0.1)
+    phase: Three = (0.0, 0.0, 0.0)
+    bias: Three = (0.0, 0.0, 0.0)
+
+
+class ChainConstantDisturbance(Table, frozen=True):
+    kind: Literal["constant"] = "constant"
+    amplitude: One = (0.01,)
+
+
+class ChainSinusoidDisturbance(Table, frozen=True):
+    kind: Literal["sinusoid"] = "sinusoid"
+    amplitude: One = (0.01,)
+    frequency: One = (1.0,)
+    phase: One = (0.0,)
+    bias: One = (0.0,)
+
+
+class Controller(Table, frozen=True):
+    kind: Literal["prescribed_time"] = "prescribed_time"
+    error: Literal["additive", "multiplicative"] = "additive"
+    t_f: Positive = 30.0
+    eta: Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")] = 3.0
+    delta: Positive = 0.05
+    k1: Positive = 1.0
+    sign_width: NotNegative = 1e-3
+    disturbance_rate_bound: NotNegative = 1e-3
+    disturbance_bound: NotNegative = 0.01
+    initial_estimate_error: NotNegative = 0.0
+
+
+class ChainController(Table, frozen=True):
+    kind: Literal["prescribed_time"] = "prescribed_time"
+    t_f: Positive = 5.0
+    eta: Positive = 3.0
+    delta: Positive = 0.05
+    k1: Positive = 1.0
+    a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
+        1.0,
+    )
+    sign_width: NotNegative = 1e-3
+    disturbance_rate_bound: NotNegative = 0.01
+    disturbance_bound: NotNegative = 0.01
+    initial_estimate_error: NotNegative = 0.0
+
+
+class NoObserver(Table, frozen=True):
+    kind: Literal["none"] = "none"
+
+
+class NonlinearObserver(Table, frozen=True):
+    kind: Literal["nonlinear"] = "nonlinear"
+    gain: ThreePositive = (10.0, 10.0, 10.0)
+
+
+class ChainNonlinearObserver(Table, frozen=True):
+    kind: Literal["nonlinear"] = "nonlinear"
+    gain: OnePositive = (10.0,)
+
+
+class Loop(Table, frozen=True):
+    mode: Literal["continuous", "sampled"] = "continuous"
+    period: Positive = 0.05
+    clock: Literal["anchored", "flight"] = "anchored"
+    t_end: Positive | None = None
+    window: Positive = 1.0
+    settling_angle: Positive = 1e-3
+
+
+class Actuators(Table, frozen=True):
+    torque_limit: Positive | None = None
+    torque_rate_limit: Positive | None = None
+    torque_lag: Positive | None = None
+    torque_step: Positive | None = None
+    delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
+
+
+class Hardware(Actuators, frozen=True):
+    attitude_noise: NotNegative | None = None
+    rate_noise: NotNegative | None = None
+    rate_bias: NotNegative | None = None
+
+
+class ChainHardware(Actuators, frozen=True):
+    state_noise: NotNegatives | None = None
+
+
+class UniformAttitude(Table, frozen=True):
+    kind: Literal["uniform"] = "uniform"
+
+
+class AxisAngle(Table, frozen=True):
+    kind: Literal["axis_angle"] = "axis_angle"
+    min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
+    max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
+
+
+class NormalAttitude(Table, frozen=True):
+    kind: Literal["normal"] = "normal"
+    std_deg: NotNegative = 1.0
+
+
+class NormalRate(Table, frozen=True):
+    kind: Literal["normal"] = "normal"
+    std: NotNegative = 0.01
+
+
+class RelativeInertia(Table, frozen=True):
+    kind: Literal["relative_normal"] = "relative_normal"
+    std: NotNegative = 0.05
+
+
+class UniformPhase(Table, frozen=True):
+    kind: Literal["uniform"] = "uniform"
+
+
+class UniformState(Table, frozen=True):
+    """Every state uniform within half_width of x0."""
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: NotNegatives = ()  # 1 for each state
+
+
+class NormalState(Table, frozen=True):
+    """Every state normal about x0."""
+
+    kind: Literal["normal"] = "normal"
+    std: NotNegatives = ()  # 1 for each state
+
+
+class Limit(Table, frozen=True):
+    """A requirement in full: metric <= limit in this share of the trials, with this one-sided confidence."""
+
+    limit: Positive
+    quantile: Quantile | None = None
+    confidence: Quantile | None = None
+
+
+Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f"]
+FREE: tuple[str, ...] = typing.get_args(Free)
+TUNED = tuple(gain for gain in FREE if gain != "t_f")  # what tuning can free today
+FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(TUNED)}")]
+
+
+class Tune(Table, frozen=True):
+    free: FreeGains | None = None  # eta, delta, observer_gain
+    bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}
+    objective: Literal["rms", "worst", "cvar"] = "rms"
+    level: Quantile | None = None
+    trials: Count = 256
+    starts: Count = 8
+    steps: Count = 150
+
+
+class Dispersion(Table, frozen=True):
+    attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
+    rate: NormalRate | None = None
+    inertia: RelativeInertia | None = None
+    disturbance_phase: UniformPhase | None = None
+
+
+class ChainDispersion(Table, frozen=True):
+    x0: UniformState | NormalState | None = None
+    disturbance_phase: UniformPhase | None = None
+
+
+class Scenario(Table, frozen=True, kw_only=True):
+    """A scenario as its file says it, every key resolved; tables that are None are off, or not of this plant's."""
+
+    plant: SpacecraftPlant | ChainPlant
+    spacecraft: Spacecraft | None = None
+    initial: Initial | None = None
+    reference: FixedReference | SpinReference | None = None
+    disturbance: (
+        NoDisturbance | ConstantDisturbance | SinusoidDisturbance | ChainConstantDisturbance | ChainSinusoidDisturbance
+    )
+    controller: Controller | ChainController
+    observer: NonlinearObserver | ChainNonlinearObserver | NoObserver
+    loop: Loop
+    hardware: Hardware | ChainHardware | None = None
+    dispersion: Dispersion | ChainDispersion | None = None
+    requirements: dict[str, float | Limit] = {}
+    tune: Tune | None = None
+
+
+# A table is a struct, or one for each kind, the default first; a kind without a struct is not available yet.
+Kinds = dict[str, type[Table] | None]
+_LAWS: Kinds = {"pd": None, "terminal": None, "fixed_time": None}
+_OBSERVERS: Kinds = {"finite_time": None, "prescribed_time": None}
+TABLES: dict[str, dict[str, type[Table] | Kinds]] = {  # by the kind of the plant
+    "spacecraft": {
+        "plant": SpacecraftPlant,
+        "spacecraft": Spacecraft,
+        "initial": Initial,
+        "reference": {"fixed": FixedReference, "spin": SpinReference, "sinusoid": None, "slew": None},
+        "disturbance": {"sinusoid": SinusoidDisturbance, "none": NoDisturbance, "constant": ConstantDisturbance},
+        "controller": {"prescribed_time": Controller, **_LAWS},
+        "observer": {"nonlinear": NonlinearObserver, "none": NoObserver, **_OBSERVERS},
+        "loop": Loop,
+        "hardware": Hardware,
+        "dispersion": Dispersion,
+        "tune": Tune,
+    },
+    "chain": {
+        "plant": ChainPlant,
+        "disturbance": {
+            "sinusoid": ChainSinusoidDisturbance,
+            "none": NoDisturbance,
+            "constant": ChainConstantDisturbance,
+        },
+        "controller": {"prescribed_time": ChainController, **_LAWS},
+        "observer": {"none": NoObserver, "nonlinear": ChainNonlinearObserver, **_OBSERVERS},
+        "loop": Loop,
+        "hardware": ChainHardware,
+        "dispersion": ChainDispersion,
+        "tune": Tune,
+    },
+}
+OPTIONAL = ("hardware", "dispersion", "requirements", "tune")  # off where absent
+DISPERSIONS: dict[str, Kinds] = {
+    "attitude": {"axis_angle": AxisAngle, "uniform": UniformAttitude, "normal": NormalAttitude},
+    "rate": {"normal": NormalRate},
+    "inertia": {"relative_normal": RelativeInertia},
+    "disturbance_phase": {"uniform": UniformPhase},
+    "x0": {"uniform": UniformState, "normal": NormalState},
+}
+
+_CASE_I: dict[str, Mapping[str, Any]] = {
+    "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
+    "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
+}
+
+
+def defaults(kind: str, order: int) -> dict[str, Mapping[str, Any]]:
+    """Defaults that no single key tells: the paper's Case I; a chain's, Figs. 1 and 2 for order 2 and 3."""
+    if kind == "spacecraft":
+        return _CASE_I
+    x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
+    poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
+    return {"plant": {"x0": x0}, "controller": {"eta": order + 1.0, "a": poles_at_minus_one}}

@@ -1,0 +1,93 @@
+"""What `ptsmc reproduce` leaves: Figs. 1 to 10 of the paper, and its claims and slips beside what was measured."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from ptsmc_jax import paper, plotting, schema, slips, store
+from ptsmc_jax.plants import Chain
+from ptsmc_jax.runs import Run
+from ptsmc_jax.scenario import from_tables
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The paper's cases as flown, and what was measured."""
+
+    cases: dict[str, Run]
+    claims: list[paper.Claim]
+    slips: list[slips.Slip]
+
+
+def reproduce() -> Reproduction:
+    """Fly every case of the paper and measure what it claims."""
+    cases = paper.fly_cases()
+    return Reproduction(cases, paper.claims(cases), slips.shown(cases))
+
+
+def summary(made: Reproduction) -> dict[str, Any]:
+    """What `summary.json` says."""
+    verdicts = [claim.verdict for claim in made.claims]
+    return {
+        "status": "ok" if all(run.status == "ok" for run in made.cases.values()) else "failed",
+        "verdicts": {word: verdicts.count(word) for word in paper.VERDICTS},
+        "claims": [asdict(claim) for claim in made.claims],
+        "slips": [asdict(slip) for slip in made.slips],
+        "cases": {
+            name: {"figures": paper.CASES[name][0], "status": run.status, **run.metrics}
+            for name, run in made.cases.items()
+        },
+    }
+
+
+def write(folder: Path, made: Reproduction, figures: bool) -> None:
+    """Fill a result folder."""
+    store.write_json(folder / "versions.json", store.versions("reproduce", 0))
+    store.write_json(folder / "summary.json", summary(made))
+    (folder / "claims.md").write_text(_markdown(made), encoding="utf-8")
+    (folder / "scenarios").mkdir()
+    for name, (_, _, tables) in paper.CASES.items():
+        store.write_toml(folder / "scenarios" / f"{name}.toml", schema.dump(from_tables(tables)))
+    if figures:
+        plotting.save(_figures(made), folder / "figures")
+
+
+def _figures(made: Reproduction) -> dict[str, Figure]:
+    found = {}
+    for name, run in made.cases.items():
+        numbers, title, _ = paper.CASES[name]
+        first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
+        chain = isinstance(run.parts.plant, Chain)
+        parts = ("a", "b") if chain else ("", "")
+        motion, label = (plotting.states, "states") if chain else (plotting.attitude, "attitude")
+        heading = f"Fig. {first}{f' ({parts[0]})' if chain else ''}: {title}"
+        found[f"fig_{int(first):02}{parts[0]}_{label}"] = motion(run.parts, run.log, heading)
+        heading = f"Fig. {last}{f' ({parts[1]})' if chain else ''}: {title}"
+        label = "control" if chain else "torque"
+        found[f"fig_{int(last):02}{parts[1]}_{label}"] = plotting.torque(run.parts, run.log, title=heading)
+        found[f"convergence_{name}"] = plotting.convergence(run.parts, run.log, f"Convergence: {title}")
+    return found
+
+
+def _markdown(made: Reproduction) -> str:
+    claims = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in made.claims]
+    shown = [(s.where, s.paper, s.correct, s.shown) for s in made.slips]
+    return "\n".join(
+        [
+            "# The paper's claims beside what was measured",
+            "",
+            *_rows(("where", "the paper", "measured", "verdict", "why"), claims),
+            "",
+            "# Its slips, and what shows them",
+            "",
+            *_rows(("where", "the paper", "what it must be", "shown by"), shown),
+            "",
+        ]
+    )
+
+
+def _rows(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    cells = [header, tuple("---" for _ in header), *rows]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]
