@@ -160,7 +160,7 @@ class Chain(Plant):
         """|x_2| = |x_1'|."""
         return jnp.abs(x[1])
 
-    def columns(self, x: Float[Array, "time n"]) -> dict[str, Any]:
+    def columns(self, x: Any) -> dict[str, Any]:
         """The states x1..xn."""
         return {"x": x}
 

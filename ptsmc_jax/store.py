@@ -81,8 +81,10 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
 
 
 def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
-    """A TOML file, arrays of numbers on one line."""
-    text = re.sub(r"\[\n((?:    [^\[\]\n]+,\n)+)\]", _one_line, tomli_w.dumps(dict(tables)))
+    """A TOML file, arrays on one line."""
+    text, before = tomli_w.dumps(dict(tables)), ""
+    while text != before:  # innermost arrays first
+        text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
     path.write_text(text, encoding="utf-8")
 
 
@@ -100,7 +102,7 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 
 
 def _one_line(array: re.Match[str]) -> str:
-    return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].splitlines()) + "]"
+    return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].rstrip("\n").split("\n")) + "]"
 
 
 def _plain(value: Any) -> Any:

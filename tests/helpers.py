@@ -96,7 +96,8 @@ def chain_parts(
     model = plants.chain(n, f, g)
     eta = n + 1.0 if eta is None else eta
     a = [float(math.comb(n - 1, i)) for i in range(n - 1)] if a is None else a
-    law = controllers.PrescribedTimeChain(model, *(vector(v) for v in (t_f, eta, delta, k1, sign_width)), vector(a))
+    gains = (vector(t_f), vector(eta), vector(delta), vector(k1), vector(sign_width))
+    law = controllers.PrescribedTimeChain(model, *gains, vector(a))
     if period is not None:
         timing: Any = clock.anchored(period, t_end, t_f, 2.0 + delta)
     elif steps is not None:

@@ -63,7 +63,8 @@ def test_simulate_leaves_what_the_contract_says(command, tmp_path):
     assert (status, err) == (0, "")
     assert "window_error" in out
     folder = tmp_path / "out" / "simulate-s"
-    figures = {f"figures/{name}.png" for name in ("attitude", "error", "rate", "torque", "sliding", "disturbance")}
+    names = ("attitude", "error", "rate", "torque", "sliding", "disturbance", "convergence")
+    figures = {f"figures/{name}.png" for name in names}
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json", *figures}
     header, *rows = (folder / "trajectory.csv").read_text().splitlines()
     assert header == "t,q1,q2,q3,q4,w1,w2,w3,d_hat1,d_hat2,d_hat3,u1,u2,u3,s1,s2,s3"
@@ -218,8 +219,8 @@ WHOLE = "a whole number from 0 to 4294967295"
         (("tune", "--trial", "1"), ("--trial",)),
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("t.toml",)),
-        (("simulat",), ("simulat", "simulate, tune")),
-        (("montecarlo", "s.toml"), ("montecarlo", "simulate, tune")),
+        (("simulat",), ("simulat", "simulate, reproduce, tune")),
+        (("montecarlo", "s.toml"), ("montecarlo", "simulate, reproduce, tune")),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),
@@ -377,3 +378,81 @@ def in_a_process(*args, then=""):
     code = f"import sys\nfrom tuning.cli import main\ntry: main()\nfinally:\n    {then or 'pass'}"
     command = [sys.executable, "-c", code, *map(str, args)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+
+
+CHAIN = """
+[plant]
+kind = "chain"
+order = 3
+[loop]
+mode = "sampled"
+t_end = 6.0
+[hardware]
+state_noise = [1e-4, 1e-4, 1e-3]
+[dispersion]
+x0 = { kind = "uniform", half_width = [1.0, 1.0, 0.5] }
+[requirements]
+peak_torque = 20.0
+[tune]
+trials = 8
+starts = 2
+steps = 4
+"""
+
+
+def test_a_chain_is_simulated(command, tmp_path):
+    (tmp_path / "c.toml").write_text(CHAIN)
+    status, out, err = command("simulate", "c.toml", "--trial", 2)
+    assert (status, err) == (1, "")  # the paper's delta of one period is far beyond the limit
+    assert "peak_torque at most 20 u" in out
+    assert "NOT met" in out
+    assert "terminal_angle" not in out
+    folder = tmp_path / "out" / "simulate-c"
+    header = (folder / "trajectory.csv").read_text().splitlines()[0]
+    assert header == "t,x1,x2,x3,d_hat1,u1,s1"
+    names = {path.name for path in (folder / "figures").iterdir()}
+    assert names == {"states.png", "error.png", "torque.png", "sliding.png", "convergence.png"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(metrics.CHAIN_CATALOGUE) <= set(summary)
+    assert "peak_momentum" not in summary
+    rows = rows_of(folder)
+    assert np.all(np.abs(rows[0, 1:4] - [5.0, 3.0, 2.0]) <= [1.0, 1.0, 0.5])
+    assert np.any(rows[0, 1:4] != [5.0, 3.0, 2.0])
+    assert summary["peak_torque"] == pytest.approx(np.abs(rows[:, 5]).max(), rel=1e-12)
+    assert command("simulate", "c.toml", "--out", "n", "--quiet", "--no-figures")[0] == 1
+    np.testing.assert_array_equal(rows_of(tmp_path / "n")[0, 1:4], [5.0, 3.0, 2.0])
+
+
+def test_a_chain_is_tuned(command, tmp_path):
+    (tmp_path / "c.toml").write_text(CHAIN)
+    status, out, _ = command("tune", "c.toml", "--seed", 2)
+    assert status in (0, 1)
+    assert "shortest t_f for a limit of 20" in out
+    assert "observer_gain" not in out
+    folder = tmp_path / "out" / "tune-c"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(summary["gains"]) == {"eta", "delta"}
+    assert summary["gains"]["eta"] > 3.0
+    assert "peak_momentum" not in summary["fresh"]
+    assert summary["shortest_t_f"]["theory"] > 0.0
+    tuned = scenario.read(folder / "tuned.toml")
+    assert tuned.controller.eta == summary["gains"]["eta"]
+    assert command("tune", "c.toml", "--seed", 2)[1].startswith("tuning already done")
+
+
+def test_reproduce_leaves_what_the_contract_says(command, tmp_path):
+    status, out, err = command("reproduce", "--no-figures")
+    assert (status, err) == (0, "")
+    assert "holds in part" in out
+    folder = tmp_path / "out" / "reproduce"
+    assert {"summary.json", "versions.json", "claims.md"} <= set(tree(folder))
+    assert command("reproduce")[0] == 2  # it is there already
+    assert command("reproduce", "some.toml")[0] == 2
+
+
+def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_leave(command, tmp_path):
+    (tmp_path / "s.toml").write_text("initial.quat_xyzw = [1, 0, 0, 0]\n" + SHORT)
+    status, _, err = command("simulate", "s.toml", "--no-figures")
+    assert status == 2
+    assert "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]" in err
+    assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # drawn instead

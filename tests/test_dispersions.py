@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import dispersions, lanes, signals
 from tests import helpers
-from tests.helpers import vector
+from tests.helpers import chain_parts, vector
 
 ALARM = 1e-6  # with other seeds a check would fail once in a million; they are fixed
 EPS = np.finfo(float).eps
@@ -134,3 +134,25 @@ def test_the_draw_belongs_to_its_own_stream(kind):
     )
     got = dispersions.Dispersion(KINDS[kind]).apply(other, 3, 4).initial.q
     np.testing.assert_array_equal(got, one(KINDS[kind], 3, 4))
+
+
+def test_initial_states_of_a_chain_are_drawn_about_the_nominal_one():
+    run = chain_parts([5.0, 3.0, 2.0])
+    width = vector([1.0, 0.5, 0.0])
+    trials = jnp.arange(TRIALS, dtype=jnp.uint32)
+    drawn_states = {}
+    for spread in (dispersions.UniformState(width), dispersions.NormalState(width)):
+        whole = dispersions.Dispersion(state=spread)
+        assert whole.varies
+        x0 = np.asarray(jax.jit(jax.vmap(lambda k, whole=whole: whole.apply(run, 3, k).initial))(trials))
+        np.testing.assert_array_equal(x0[:, 2], 2.0)
+        drawn_states[type(spread)] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
+        np.testing.assert_array_equal(whole.apply(run, 3, 7).initial, x0[7])
+    uniform, normal = drawn_states[dispersions.UniformState], drawn_states[dispersions.NormalState]
+    assert np.abs(uniform).max() <= 1.0
+    for k in range(2):
+        assert stats.kstest(uniform[:, k], "uniform", (-1.0, 2.0)).pvalue > ALARM
+        assert stats.kstest(normal[:, k], "norm").pvalue > ALARM
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert abs(np.corrcoef(uniform.T)[0, 1]) < limit
+    assert not dispersions.Dispersion().varies

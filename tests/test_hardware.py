@@ -80,3 +80,19 @@ def test_sensors_are_a_frozen_pytree():
     assert jax.tree.leaves(SENSORS) == list(SIZES)
     with pytest.raises(dataclasses.FrozenInstanceError):
         SENSORS.rate_noise = vector(1.0)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_state_sensor_adds_independent_noise_of_the_stated_size_to_every_state():
+    sensor = hardware.StateSensor(vector([1e-3, 0.0, 2.0]))
+    x = vector([1.0, 2.0, 3.0])
+    one = jax.jit(jax.vmap(lambda k: sensor.measure(x, sensor.noise(sensor.keys(5, 6), k))))
+    error = np.asarray(one(jnp.arange(1 << 15))) - np.asarray(x)
+    np.testing.assert_array_equal(error[:, 1], 0.0)
+    for k, size in ((0, 1e-3), (2, 2.0)):
+        assert stats.kstest(error[:, k] / size, "norm").pvalue > 1e-6
+    limit = -stats.norm.ppf(0.5e-6) / math.sqrt(len(error))
+    assert abs(np.corrcoef(error[:, 0], error[:, 2])[0, 1]) < limit
+    np.testing.assert_array_equal(
+        sensor.noise(sensor.keys(7, 8), jnp.asarray(-5)),
+        sensor.sigma * draws.normals(draws.stream(7, 8, "state_noise"), 3, -5),
+    )

@@ -247,3 +247,12 @@ def test_versions_name_what_made_a_result():
     )
     assert made["platform"]
     assert made["machine"]
+
+
+def test_arrays_stand_on_one_line_however_deep(tmp_path):
+    tables = {"a": {"flat": [1.0, 2.0], "deep": [[1.0, 0.0], [0.0, 1.0]], "words": ["x, [y]", "]"], "none": []}}
+    store.write_toml(tmp_path / "t.toml", tables)
+    text = (tmp_path / "t.toml").read_text()
+    assert "deep = [[1.0, 0.0], [0.0, 1.0]]" in text
+    assert len(text.splitlines()) == 5
+    assert tomllib.loads(text) == tables

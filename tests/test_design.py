@@ -1,0 +1,94 @@
+"""The shortest t_f for a limit on the input, by theory and as flown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import montecarlo, scenario
+from tests.helpers import vector
+from tuning import design
+
+SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 120.0}}
+FLOWN = {
+    "controller": {"t_f": 20.0, "eta": 3.2, "delta": 1.0},
+    "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 22.0},
+    "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6},
+    "disturbance": {"amplitude": [1e-3, 1e-3, 1e-3]},
+    "dispersion": SPREAD,
+}
+
+
+def largest(tables, t_f, trials):
+    tables = {
+        **tables,
+        "controller": {**tables["controller"], "t_f": t_f},
+        "loop": {**tables["loop"], "t_end": t_f + 2},
+    }
+    ready = scenario.study(scenario.from_tables(tables))
+    return montecarlo.run(ready.parts, ready.dispersion, 4, np.arange(trials)).metrics.peak_torque.max()
+
+
+def test_shortest_time_is_where_flown_trials_cross_the_limit():
+    limit, trials = 0.6, 32
+    found = design.shortest_time(scenario.from_tables(FLOWN), limit, 4, np.arange(trials))
+    assert found.theory is not None
+    assert found.simulated is not None
+    assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance and noise: 1e-3 and 1 % of 0.6 N m
+    assert largest(FLOWN, found.simulated, trials) <= limit
+    assert largest(FLOWN, 0.995 * found.simulated, trials) > limit
+    assert str(found).startswith("shortest t_f for a limit of 0.6 with these gains: ")
+    assert str(found).endswith(" s as flown")
+
+
+def test_shortest_time_from_rest_is_the_rule():
+    """3.5 in closed form: without a disturbance the search finds it."""
+    tables = {
+        "controller": {"eta": 4.0, "disturbance_rate_bound": 0.0},
+        "disturbance": {"kind": "none"},
+        "initial": {"rotvec_deg": [0, 0, 90]},
+    }
+    found = design.shortest_time(scenario.from_tables(tables), 0.25, 0, np.arange(1))
+    rule = 4.0 * np.sqrt(2 * 14.0 * np.tan(np.pi / 4) / 0.25)
+    assert found.theory == pytest.approx(rule, rel=2e-3)
+    assert found.simulated == pytest.approx(rule, rel=2e-3)
+
+
+def test_a_limit_below_the_disturbance_cannot_be_kept():
+    found = design.shortest_time(scenario.from_tables({}), 0.009, 0, np.arange(1))
+    assert (found.theory, found.simulated) == (None, None)
+    assert str(found) == "no t_f keeps these gains below the limit of 0.009"
+
+
+def test_shortest_time_of_a_chain():
+    chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
+    found = design.shortest_time(chain, 5.0, 0, np.arange(1))
+    assert found.theory is not None
+    assert found.simulated == pytest.approx(found.theory, rel=5e-3)  # the disturbance is 0.01 of 5
+    ready = scenario.study(scenario.replace(chain, controller__t_f=found.simulated))
+    run = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(1))
+    assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
+def test_search_finds_the_last_crossing(power):
+    found = design._smallest(lambda t: t**-power + 0.02 * np.sin(t), 0.1, 3.0, 1e-3, 1e3, 1e-4, 60)
+    assert found is not None
+    assert found**-power + 0.02 * np.sin(found) <= 0.1
+    before = found * (1 - 2e-4)
+    assert before**-power + 0.02 * np.sin(before) > 0.1
+    assert design._smallest(lambda t: 1.0 + 1 / t, 0.5, 1.0, 1e-3, 10.0, 1e-4, 60) is None
+    assert design._smallest(lambda t: np.inf if t < 2.0 else 0.0, 0.5, 1.0, 0.1, 10.0, 1e-3, 60) == pytest.approx(
+        2.0, rel=2e-3
+    )
+
+
+def test_only_t_f_and_what_follows_it_is_changed():
+    parts = scenario.study(scenario.from_tables(FLOWN)).parts
+    moved = design._at(parts, 15.0)
+    assert (float(moved.controller.t_f), float(moved.t_end), float(moved.clock.t_end)) == (15.0, 17.0, 17.0)
+    back = replace(design._at(moved, 20.0), initial=parts.initial)
+    assert float(back.t_end) == float(parts.t_end)
+    np.testing.assert_array_equal(
+        back.clock.ticks(vector(20.0), vector(1.0)).t, parts.clock.ticks(vector(20.0), vector(1.0)).t
+    )

@@ -1,0 +1,108 @@
+"""The paper reproduced: its claims and slips as measured, and what `ptsmc reproduce` leaves of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import paper, slips
+from ptsmc_jax.scenario import read
+from tests.helpers import REFERENCE
+from tuning import reproduction
+
+
+@pytest.fixture(scope="module")
+def made():
+    return reproduction.reproduce()
+
+
+def test_every_figure_of_the_paper_is_a_case():
+    numbers = [int(n) for figures, _, _ in paper.CASES.values() for n in figures.split(", ")]
+    assert numbers == list(range(1, 11))
+
+
+def test_cases_are_those_of_the_reference_data(made):
+    """The independent integration was made with c instead of sqrt(3) c in (55): a larger K2 holds a tenth less."""
+    by_name = {(c["t_f"], c["eta"]): c["summary"] for c in REFERENCE["cases"]}
+    for name in paper.SPACECRAFT:
+        law = made.cases[name].parts.controller
+        truth = by_name[float(law.t_f), float(law.eta)]
+        np.testing.assert_allclose(made.cases[name].metrics["terminal_error"], truth["terminal_error_2"], rtol=0.3)
+        np.testing.assert_allclose(
+            np.abs(made.cases[name].log.error[made.cases[name].log.t >= float(law.t_f)]).max(),
+            truth["hold_error_inf"],
+            rtol=0.15,
+        )
+
+
+def test_verdicts_are_those_that_the_theory_notes_expect(made):
+    """Accuracy is better than claimed at t_f, not kept after it, and no better for a larger eta."""
+    told = {claim.claim.split(" (")[0]: claim for claim in made.claims}
+    assert [claim.verdict for claim in made.claims].count("differs") == 3
+    assert told["error of 10E-5 at t_f for eta = 5"].verdict == "holds in part"
+    assert told["a larger eta gives a smaller error"].verdict == "differs"
+    assert told["the system stays at the origin after t_f"].verdict == "differs"
+    assert told["so does a larger eta"].values["ratio"] == pytest.approx((5 / 3) ** 2, rel=1e-12)
+    shorter = told["a shorter t_f asks for a larger initial torque"]
+    assert shorter.values["ratio"] == pytest.approx((4 / 3) ** 2, rel=1e-12)
+    assert shorter.values["larger"] == pytest.approx(0.28, rel=1e-12)  # theory notes, 3.3
+    at_t_f = told["errors of 10E-4 at t_f = 30 and 40 s"].values["at_t_f"]
+    assert 1e-8 < at_t_f < 1e-7
+    settled = told["the settling time does not depend on the initial state"].values
+    assert settled["spread_quiet"] < 0.1  # a step of the grid
+    assert settled["spread_disturbed"] > 0.3
+
+
+def test_a_verdict_follows_its_measurement(made):
+    """The same words with other runs: nothing is decided beforehand."""
+    swapped = {**made.cases, "case_2_eta_3": made.cases["case_2_eta_5"], "case_2_eta_5": made.cases["case_2_eta_3"]}
+    told = {claim.claim: claim.verdict for claim in paper.claims(swapped)}
+    assert told["a larger eta converges faster"] == "differs"
+    assert told["so does a larger eta"] == "differs"
+
+
+def test_slips_show_what_they_say(made):
+    values = {slip.where + slip.correct[:4]: slip.values for slip in made.slips}
+    assert len(values) == len(made.slips)
+    (expansion,) = [v for k, v in values.items() if k.startswith("(37)")]
+    assert expansion["largest_relative_difference"] < 1e-12
+    (growth,) = [v for k, v in values.items() if k.startswith("Theorem 3")]
+    assert growth["growth"] == pytest.approx(100.0, rel=0.02)  # 5 s over 0.05 s, read off between nodes
+    (term,) = [v for k, v in values.items() if k.startswith("(29)")]
+    # x'' + x' + x = 0 from (1, -1): s = x + x' = 2/sqrt(3) e^(-t/2) sin(sqrt(3) t/2) in size, largest at t = 1.209
+    assert term["without"] == pytest.approx(2 / 3**0.5 * np.exp(-1.2092 / 2) * np.sin(3**0.5 * 1.2092 / 2), rel=1e-2)
+    assert term["with"] < 1e-9
+    (factor,) = [v for k, v in values.items() if k.startswith("(55)sqrt")]
+    assert factor["over_corrected"] < 1.0 < factor["over_printed"]
+    (decay,) = [v for k, v in values.items() if k.startswith("(55)the")]
+    assert decay["corrected"] < decay["printed"]
+    (gain,) = [v for k, v in values.items() if k.startswith("(60)")]
+    assert gain["rate"] == pytest.approx(gain["k1"] / 2, rel=1e-3)
+    (start,) = [v for k, v in values.items() if k.startswith("(57)")]
+    assert start["with_true_bound"] <= 1.0 < start["with_0"]
+    (sign,) = [v for k, v in values.items() if k.startswith("4")]
+    assert sign["error"] < 1e-6
+    assert sign["angle_deg"] == pytest.approx(120.0, abs=0.01)
+    assert sign["aligned_angle_deg"] < 1e-3
+    (singular,) = [v for k, v in values.items() if k.startswith("Theorem 2")]
+    assert singular["179"] / singular["90"] == pytest.approx(np.tan(np.deg2rad(89.5)), rel=1e-9)
+
+
+def test_folder_holds_figures_claims_and_scenarios(made, tmp_path):
+    reproduction.write(tmp_path, made, figures=True)
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    for number in range(1, 11):
+        assert any(name.startswith(f"fig_{number:02}") for name in names), number
+    assert {f"convergence_{name}.png" for name in paper.CASES} <= names
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "ok"
+    assert sum(summary["verdicts"].values()) == len(summary["claims"]) == len(made.claims)
+    assert all(claim["verdict"] in paper.VERDICTS for claim in summary["claims"])
+    text = (tmp_path / "claims.md").read_text()
+    for line in (*made.claims, *made.slips):
+        assert line.where in text
+    for name, run in made.cases.items():
+        scenario = read(tmp_path / "scenarios" / f"{name}.toml")
+        assert scenario.controller.eta == float(run.parts.controller.eta)
+        assert summary["cases"][name]["terminal_error"] == run.metrics["terminal_error"]
+    assert slips.__doc__
