@@ -32,7 +32,11 @@ class SurfaceGains(NamedTuple):
 
 @dataclass(frozen=True)
 class Law:
-    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1)."""
+    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
+
+    The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
+    enough, and with delta > 0 V(t_f) is only small.
+    """
 
     model: Any  # the nominal plant
     t_f: Leaf  # prescribed time [s]
@@ -96,8 +100,9 @@ class Law:
 class PrescribedTime(Law):
     """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
 
-    Differences from the paper: sign(s) is tanh(s / sign_width) (0: exact); `T` of (1) is both torque and matrix, here
-    the torque is u; ||T J^-1||, whose norm the paper leaves open, is the Frobenius norm, which is smooth and not below
+    Differences from the paper: sign(s) is tanh(s / sign_width) (0: exact); `T` of (1) is both torque and matrix and
+    q both quaternion and its scalar, here the torque is u and the scalar q4; (29), which this law is a case of, lacks
+    the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference, (60) and (57) have them; ||T J^-1||, whose norm the paper leaves open, is the Frobenius norm, which is smooth and not below
     the spectral norm that the proof needs; K1 acts with an effective gain of K1/2 in (60). The law is singular at
     q4 = 0, 180 degrees from the inertial frame's identity wherever the reference is, and cannot cross it: `align`
     chooses the sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the
