@@ -102,11 +102,12 @@ class PrescribedTime(Law):
 
     Differences from the paper: sign(s) is tanh(s / sign_width) (0: exact); `T` of (1) is both torque and matrix and
     q both quaternion and its scalar, here the torque is u and the scalar q4; (29), which this law is a case of, lacks
-    the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference, (60) and (57) have them; ||T J^-1||, whose norm the paper leaves open, is the Frobenius norm, which is smooth and not below
-    the spectral norm that the proof needs; K1 acts with an effective gain of K1/2 in (60). The law is singular at
-    q4 = 0, 180 degrees from the inertial frame's identity wherever the reference is, and cannot cross it: `align`
-    chooses the sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the
-    bound grows like 1/q4. After the hand-over nothing stays "at the origin": the rates are 1 and K1/2.
+    the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference, (60) and (57) have them; ||T J^-1||, whose
+    norm the paper leaves open, is the Frobenius norm, which is smooth and not below the spectral norm that the proof
+    needs; K1 acts with an effective gain of K1/2 in (60). The law is singular at q4 = 0, 180 degrees from the inertial
+    frame's identity wherever the reference is, and cannot cross it: `align` chooses the sign of q, `clearance` says
+    how far away the singularity is. So "bounded control" is not global: the bound grows like 1/q4. After the
+    hand-over nothing stays "at the origin": the rates are 1 and K1/2.
     """
 
     model: Spacecraft  # the nominal plant
