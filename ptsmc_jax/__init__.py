@@ -24,7 +24,7 @@ _EXPORTS = {
     "PrescribedTimeChain": "controllers",
     "NoObserver": "observers",
     "NonlinearObserver": "observers",
-    "Sensors": "hardware",
+    "Sensors": "sensors",
     "Parts": "rollout",
     "Result": "rollout",
     "STATUS": "rollout",
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from ptsmc_jax.controllers import PrescribedTime as PrescribedTime
     from ptsmc_jax.controllers import PrescribedTimeChain as PrescribedTimeChain
     from ptsmc_jax.dispersions import Dispersion as Dispersion
-    from ptsmc_jax.hardware import Sensors as Sensors
     from ptsmc_jax.metrics import Metrics as Metrics
     from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
     from ptsmc_jax.observers import NoObserver as NoObserver
@@ -61,6 +60,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario import Study as Study
     from ptsmc_jax.scenario import study as study
     from ptsmc_jax.schema import ScenarioError as ScenarioError
+    from ptsmc_jax.sensors import Sensors as Sensors
     from ptsmc_jax.signals import Constant as Constant
     from ptsmc_jax.signals import Fixed as Fixed
     from ptsmc_jax.signals import Sinusoid as Sinusoid

@@ -29,6 +29,12 @@ def normalise(q: Quaternion) -> Quaternion:
     return q / jnp.sqrt(jnp.dot(q, q))
 
 
+def rotate(q: Quaternion, y: Vector) -> Vector:
+    """The vector y, given in the axes that q turns to, in the axes that it turns from: R(q) y, in the units of y."""
+    u = 2.0 * jnp.cross(q[:3], y)
+    return y + q[3] * u + jnp.cross(q[:3], u)
+
+
 def t_matrix(q: Quaternion) -> Float[Array, "3 3"]:
     """T(q) of (3) [-]."""
     x, y, z, s = q

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import plants, schema, tables
+from ptsmc_jax import hardware, plants, schema, tables
 from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
@@ -45,6 +45,11 @@ def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
         raise wrong(
             f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
         ) from None
+
+
+def has_attitude(table: tables.Attitude) -> bool:
+    """Whether a table gives an attitude at all."""
+    return any(getattr(table, key) is not None for key in tables.ATTITUDE_KEYS)
 
 
 def attitude_key(table: tables.Attitude) -> tuple[str, Any]:
@@ -117,12 +122,6 @@ def _check_available(scenario: Scenario) -> None:
     error = getattr(scenario.controller, "error", "additive")
     if error != "additive":
         refuse("controller.error", error, '"additive"')
-    if scenario.hardware is not None:
-        built = [k for k in ("attitude_noise", "rate_noise", "state_noise") if hasattr(scenario.hardware, k)]
-        for key in scenario.hardware.__struct_fields__:
-            value = getattr(scenario.hardware, key)
-            if value is not None and key not in built:
-                refuse(f"hardware.{key}", value, " and ".join(built))
     if scenario.dispersion is not None:
         for key in scenario.dispersion.__struct_fields__:
             value = getattr(scenario.dispersion, key)
@@ -153,8 +152,15 @@ def _check_plant(scenario: Scenario) -> None:
             plants.check_inertia(scenario.spacecraft.inertia)
         except ValueError as error:
             raise ScenarioError(f"spacecraft.inertia is {schema.show(scenario.spacecraft.inertia)}: {error}") from None
+        if scenario.spacecraft.true_inertia is not None:
+            try:
+                plants.check_inertia(scenario.spacecraft.true_inertia)
+            except ValueError as error:
+                value = schema.show(scenario.spacecraft.true_inertia)
+                raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
         quaternion(scenario.initial, "initial")
         quaternion(scenario.reference, "reference")
+        _check_devices(scenario)
         return
     controller, n = scenario.controller, plant.order
     assert isinstance(controller, tables.ChainController)
@@ -174,6 +180,45 @@ def _check_plant(scenario: Scenario) -> None:
         raise wrong("hardware.state_noise", noise, f"a list of plant.order = {n} numbers")
 
 
+def terms(scenario: Scenario) -> tuple[Any, ...]:
+    """The disturbances that act together."""
+    table = scenario.disturbance
+    return table.terms if isinstance(table, tables.SumDisturbance) else (table,)
+
+
+def _check_devices(scenario: Scenario) -> None:
+    """Disturbances, sensors, filter and wheels of a spacecraft."""
+    table, device, estimator = scenario.hardware, scenario.wheels, scenario.filter
+    assert table is None or isinstance(table, tables.Hardware)
+    for term in terms(scenario):
+        if isinstance(term, tables.GravityGradient) and has_attitude(term):
+            quaternion(term, "disturbance")
+    if table is not None:
+        if table.rate_noise is not None and table.rate_noise_density is not None:
+            raise wrong("hardware.rate_noise_density", table.rate_noise_density, "absent where rate_noise is given")
+        every = table.star_tracker_every
+        if every not in (None, 1) and not isinstance(estimator, tables.SteadyStateFilter):
+            raise ScenarioError(
+                f"hardware.star_tracker_every is {every}, but without a filter the law needs a sample every period; "
+                'allowed is 1, or [filter] with kind = "steady_state"'
+            )
+    noisy = table is not None and table.attitude_noise and (table.rate_noise or table.rate_noise_density)
+    if isinstance(estimator, tables.SteadyStateFilter) and estimator.bandwidth is None and not noisy:
+        raise ScenarioError(
+            "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
+        )
+    if device is not None:
+        axes = hardware.pyramid() if isinstance(device, tables.PyramidWheels) else np.asarray(device.axes)
+        try:
+            hardware.wheels(axes)
+        except ValueError as error:
+            raise ScenarioError(f"wheels.axes is {schema.show(axes.tolist())}: {error}") from None
+        if device.momentum is not None and len(device.momentum) != len(axes):
+            raise wrong("wheels.momentum", device.momentum, f"a list of {len(axes)} numbers, one for each wheel")
+    if device is None and "peak_wheel_momentum" in scenario.requirements:
+        raise ScenarioError("requirements.peak_wheel_momentum needs reaction wheels, but there is no [wheels] table")
+
+
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, sampled = controller.t_f, controller.delta, loop.mode == "sampled"
@@ -188,10 +233,17 @@ def _check_loop(scenario: Scenario) -> None:
         raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
     if sampled and loop.t_end / loop.period > MOST_STEPS:
         raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {loop.t_end / MOST_STEPS}")
-    if not sampled and scenario.hardware is not None:
-        for key in scenario.hardware.__struct_fields__:
+    if not sampled:
+        for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
             if getattr(scenario.hardware, key) is not None:
                 raise ScenarioError(f'hardware.{key} needs the sampled loop, but loop.mode is "{loop.mode}"')
+        for name in ("wheels", "filter"):
+            if getattr(scenario, name) is not None and not isinstance(scenario.filter, tables.NoFilter):
+                raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
+        if any(isinstance(term, tables.RandomWalk | tables.ChainRandomWalk) for term in terms(scenario)):
+            raise ScenarioError(
+                f'disturbance.kind = "random_walk" needs the sampled loop, but loop.mode is "{loop.mode}"'
+            )
 
 
 def _check_dispersion(scenario: Scenario) -> None:

@@ -1,78 +1,195 @@
-"""What stands between the law and the plant: here the sensors."""
+"""What stands between the commanded torque and the body: delay, quantisation, limits, lag, reaction wheels.
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+Each device is off where it is None. All are exact; quantisation has the derivative of the command it is given.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Float
 
-from ptsmc_jax import attitude, draws
-from ptsmc_jax.draws import Whole
+from ptsmc_jax import numerics
 from ptsmc_jax.numerics import Leaf
-from ptsmc_jax.plants import AttitudeState
 
-ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
 
 
-class Sensor(Protocol):
-    """What the rollout asks of a sensor; its noise belongs to (seed, trial, sample)."""
-
-    def keys(self, seed: Whole, trial: Whole) -> Any:
-        """Streams of a trial's noise."""
-        ...
-
-    def noise(self, keys: Any, sample: Int[Array, ""]) -> Any:
-        """Noise of one sample."""
-        ...
-
-    def measure(self, x: Any, noise: Any) -> Any:
-        """The state as measured."""
-        ...
+def quantise(u: Array, step: Scalar) -> Array:
+    """The nearest multiple of step. Its derivative is that of the command: a staircase has none to learn from."""
+    return u + jax.lax.stop_gradient(step * jnp.round(u / step) - u)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Sensors:
-    """Star tracker and gyro sampled once a period, white noise, independent per axis and sample."""
+class Wheels:
+    """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A."""
 
-    attitude_noise: Leaf  # 1 sigma of the small rotation about each body axis [rad]
-    rate_noise: Leaf  # 1 sigma [rad/s]
+    axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
+    allocation: Leaf  # (n, 3) pseudo-inverse of A
+    initial: Leaf  # (n,) momentum at t = 0 [N m s]
+    torque_limit: Leaf | None = None  # per wheel [N m]
+    momentum_limit: Leaf | None = None  # per wheel [N m s]
 
-    def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key]:
-        """Streams of a trial's noise, one for each sensor."""
-        return draws.stream(seed, trial, ATTITUDE_NOISE), draws.stream(seed, trial, RATE_NOISE)
 
-    def noise(
-        self, keys: tuple[draws.Key, draws.Key], sample: Int[Array, ""]
-    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""
-        return (
-            self.attitude_noise * draws.normals(keys[0], 3, sample),
-            self.rate_noise * draws.normals(keys[1], 3, sample),
-        )
+def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_limit: Any = None) -> Wheels:
+    """Wheels from their spin axes (n, 3) in body axes, of any length; initial: momenta (n,) [N m s], default 0.
 
-    def measure(self, x: AttitudeState, noise: tuple[Float[Array, "3"], Float[Array, "3"]]) -> AttitudeState:
-        """The state as measured: attitude turned by a small rotation in body axes, rate with noise added."""
-        turned = attitude.multiply(x.q, attitude.from_rotation_vector(noise[0]))
-        return AttitudeState(turned, jnp.add(x.w, noise[1]))
+    Raises ValueError where the axes do not span all directions.
+    """
+    unit = np.asarray(axes, dtype=float)
+    if (
+        unit.ndim != 2
+        or unit.shape[1] != 3
+        or not np.all(np.isfinite(unit))
+        or np.any(np.linalg.norm(unit, axis=1) == 0)
+    ):
+        raise ValueError("allowed are rows of three numbers, a direction for each wheel")
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    if np.linalg.svd(unit, compute_uv=False)[-1] < 1e-6 or len(unit) < 3:
+        raise ValueError("the wheels' axes must span all three directions")
+    start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
+    limits = (None if v is None else jnp.asarray(float(v)) for v in (torque_limit, momentum_limit))
+    return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)
+
+
+def pyramid(cant: float = np.arctan(1.0 / np.sqrt(2.0))) -> np.ndarray:
+    """Spin axes (4, 3) of four wheels, `cant` [rad] above the x-y plane; by default all axes are equally strong."""
+    around = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+    return np.stack([np.cos(cant) * np.cos(around), np.cos(cant) * np.sin(around), np.full(4, np.sin(cant))], axis=1)
+
+
+class ActuatorState(NamedTuple):
+    """What actuators carry from period to period."""
+
+    queue: Array | None  # (delay, m) commands on their way, the oldest first [N m]
+    v: Array  # (channels,) torque at the end of the last period [N m]
+    h: Array | None  # (wheels,) stored momentum [N m s]
+
+
+class Drive(NamedTuple):
+    """One period: channels move from v toward the target c."""
+
+    v: Array  # (channels,) [N m]
+    c: Array
+    h: Array | None  # (wheels,) at the start of the period [N m s]
+    limited: Array  # bool: a limit cuts the command
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class StateSensor:
-    """All states of a chain sampled once a period, white noise, independent per state and sample."""
+class Actuators:
+    """Delay, then per axis or per wheel: quantisation, limits, and the slower of rate limit and first-order lag."""
 
-    sigma: Leaf  # (n,) 1 sigma of each state
+    torque_limit: Leaf | None = None  # per body axis [N m]
+    rate_limit: Leaf | None = None  # [N m/s]
+    lag: Leaf | None = None  # time constant [s]
+    step: Leaf | None = None  # quantisation [N m]
+    wheels: Wheels | None = None
+    delay: int = field(default=0, metadata={"static": True})  # whole control periods
 
-    def keys(self, seed: Whole, trial: Whole) -> draws.Key:
-        """Stream of a trial's noise."""
-        return draws.stream(seed, trial, STATE_NOISE)
+    @property
+    def moves(self) -> bool:
+        """Whether the torque changes within a period."""
+        return self.rate_limit is not None or self.lag is not None
 
-    def noise(self, keys: draws.Key, sample: Int[Array, ""]) -> Float[Array, " n"]:
-        """Noise of one sample, (n,)."""
-        return self.sigma * draws.normals(keys, self.sigma.shape[-1], sample)
+    def begin(self, inputs: int) -> ActuatorState:
+        """At rest: no torque, no command on its way."""
+        queue = jnp.zeros((self.delay, inputs)) if self.delay else None
+        if self.wheels is None:
+            return ActuatorState(queue, jnp.zeros(inputs), None)
+        return ActuatorState(queue, jnp.zeros_like(self.wheels.initial), self.wheels.initial)
 
-    def measure(self, x: Float[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The states as measured."""
-        return x + noise
+    def command(self, state: ActuatorState, u: Vector, w: Vector, dt: Scalar, weight: Scalar) -> tuple[Drive, Any]:
+        """The period's drive and the queue after it, for the law's command u [N m] at the rate seen w [rad/s].
+
+        The flight software knows the wheels' momentum and adds w x A h. weight: share of a partial first period; its
+        command counts that much of the way, so that nothing jumps where the period vanishes.
+        """
+        queue, now = state.queue, u
+        if queue is not None:
+            now = queue[0]
+            pushed = jnp.concatenate([queue[1:], numerics.lerp(weight, u, queue[-1])[None]])
+            queue = jnp.where(dt > 0.0, pushed, queue)
+        wanted = now if self.torque_limit is None else jnp.clip(now, -self.torque_limit, self.torque_limit)
+        limited = jnp.any(wanted != now)
+        if self.wheels is not None:
+            assert state.h is not None
+            wanted = self.wheels.allocation @ (wanted + jnp.cross(w, self.wheels.axes @ state.h))
+        if self.step is not None:
+            wanted = quantise(wanted, self.step)
+        cut = wanted
+        if self.wheels is not None:
+            cut = _within_wheels(self.wheels, wanted, state.h, dt)
+        limited = limited | jnp.any(cut != wanted)
+        if self.rate_limit is not None:
+            limited = limited | jnp.any(
+                jnp.abs(cut - state.v) > self.rate_limit * (dt if self.lag is None else dt + self.lag)
+            )
+        return Drive(state.v, cut, state.h, limited), queue
+
+    def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
+        """Torque of each channel s [s] into the period and its integral from the start [N m, N m s].
+
+        v' = (c - v) / lag, |v'| at most the rate limit: a ramp until |c - v| is rate limit times lag, then the lag.
+        """
+        v, c = drive.v, drive.c
+        if not self.moves:
+            return c, c * s
+        gap = c - v
+        near, ramp, slope = (
+            gap,
+            jnp.zeros_like(gap),
+            jnp.zeros_like(gap),
+        )  # what the lag closes; how long it ramps before
+        if self.rate_limit is not None:
+            reach = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
+            near = jnp.clip(gap, -reach, reach)
+            ramp = jnp.abs(gap - near) / self.rate_limit
+            slope = self.rate_limit * jnp.sign(gap)
+        ramping = s < ramp
+        still = jnp.maximum(s - ramp, 0.0)
+        left, area = jnp.zeros_like(gap), jnp.zeros_like(gap)  # of the lag: what is not yet closed, and its integral
+        if self.lag is not None:
+            left = near * jnp.exp(-still / self.lag)
+            area = near * self.lag * -jnp.expm1(-still / self.lag)
+        torque = jnp.where(ramping, v + slope * s, c - left)
+        after = ramp * (v + slope * ramp / 2) + c * still - area
+        return torque, jnp.where(ramping, s * (v + slope * s / 2), after)
+
+    def torque(self, drive: Drive, s: Scalar) -> Vector:
+        """Torque on the body s [s] into the period [N m]."""
+        v, _ = self.channels(drive, s)
+        return v if self.wheels is None else self.wheels.axes @ v
+
+    def over(self, drive: Drive, start: Scalar, dt: Scalar) -> tuple[Vector, Array | None]:
+        """Mean torque on the body over dt [s] from `start` in the period [N m], and the momentum A h of the wheels.
+
+        The momentum [N m s] is that of the middle, None without wheels. So the body's momentum comes out exact.
+        """
+        lasts = dt > 0.0
+        before, after = (self.channels(drive, s)[1] for s in (start, start + dt))
+        v = jnp.where(lasts, (after - before) / jnp.where(lasts, dt, 1.0), drive.v)
+        if self.wheels is None or drive.h is None:
+            return v, None
+        return self.wheels.axes @ v, self.wheels.axes @ (drive.h - (before + after) / 2)
+
+    def end(self, drive: Drive, queue: Any, dt: Scalar) -> ActuatorState:
+        """State after a period of dt [s]; one of length zero changes nothing."""
+        v, impulse = self.channels(drive, dt)
+        v = jnp.where(dt > 0.0, v, drive.v)
+        return ActuatorState(queue, v, None if drive.h is None else drive.h - impulse)
+
+
+def _within_wheels(device: Wheels, v: Array, h: Array | None, dt: Scalar) -> Array:
+    """Wheel torques that keep the torque limit and, to the end of the period, the momentum limit."""
+    if device.torque_limit is not None:
+        v = jnp.clip(v, -device.torque_limit, device.torque_limit)
+    if device.momentum_limit is not None:
+        assert h is not None
+        safe = jnp.where(dt > 0.0, dt, 1.0)
+        v = jnp.clip(v, (h - device.momentum_limit) / safe, (h + device.momentum_limit) / safe)
+    return v

@@ -18,12 +18,13 @@ CATALOGUE = {
     "hold_error": ("-", "largest of that 2-norm from t_f to t_end"),
     "peak_torque": ("N m", "largest commanded torque about one axis, before the actuator"),
     "peak_torque_delivered": ("N m", "largest delivered torque about one axis"),
-    "saturated": ("-", "fraction of the time in which the delivered torque is not the commanded one"),
+    "saturated": ("-", "fraction of the time in which a limit of the actuators cuts the command"),
     "effort": ("N m s", "integral of the 1-norm of the delivered torque"),
     "settling_time": ("s", "time from which the angle stays below settling_angle"),
     "chattering": ("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
     "peak_rate": ("rad/s", "largest 2-norm of the body rate"),
-    "peak_momentum": ("N m s", "largest 2-norm of the angular momentum"),
+    "peak_momentum": ("N m s", "largest 2-norm of the body's angular momentum"),
+    "peak_wheel_momentum": ("N m s", "largest momentum stored in one reaction wheel"),
 }
 # The same for an integrator chain, whose x_1 is the error, in the states' own units; what it lacks is left out.
 CHAIN_CATALOGUE = {
@@ -32,7 +33,7 @@ CHAIN_CATALOGUE = {
     "hold_error": ("x1", "largest |x_1| from t_f to t_end"),
     "peak_torque": ("u", "largest commanded input, before the actuator"),
     "peak_torque_delivered": ("u", "largest delivered input"),
-    "saturated": ("-", "fraction of the time in which the delivered input is not the commanded one"),
+    "saturated": ("-", "fraction of the time in which a limit of the actuators cuts the command"),
     "effort": ("u s", "integral of the magnitude of the delivered input"),
     "settling_time": ("s", "time from which |x_1| stays below settling_angle"),
     "chattering": ("u/s", "total variation of the delivered input per second after t_f"),
@@ -56,6 +57,7 @@ class Metrics(NamedTuple):
     chattering: Array
     peak_rate: Array
     peak_momentum: Array
+    peak_wheel_momentum: Array
 
 
 class Sight(NamedTuple):
@@ -78,6 +80,8 @@ class Span(NamedTuple):
     commanded: tuple[Array, ...]  # (m,) each [N m]
     delivered: tuple[Array, ...]
     weights: tuple[float, ...]  # sum to 1
+    limited: Array  # bool: a limit of the actuators cuts the command
+    wheel_momentum: Array | None  # (wheels,) at the end [N m s]
 
 
 class Judged(NamedTuple):
@@ -103,6 +107,7 @@ class Running(NamedTuple):
     variation: Array  # (m,) of the delivered torque after t_f [N m]
     peak_rate: Array
     peak_momentum: Array
+    peak_wheel_momentum: Array  # NaN without wheels
 
 
 def begin(first: Sight, judged: Judged, inputs: int) -> Running:
@@ -120,6 +125,7 @@ def begin(first: Sight, judged: Judged, inputs: int) -> Running:
         variation=jnp.zeros(inputs),
         peak_rate=first.rate,
         peak_momentum=first.momentum,
+        peak_wheel_momentum=jnp.full_like(zero, jnp.nan),
     )
 
 
@@ -135,7 +141,6 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
         jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques])) for torques in (span.commanded, delivered)
     )
     nodes = list(zip(span.weights, span.commanded, delivered, strict=True))
-    saturated = sum(w * jnp.any(u != v) for w, u, v in nodes)
     effort = sum(w * jnp.sum(jnp.abs(v)) for w, _, v in nodes)
     # total variation after t_f: the jump at the start of the interval, then what happens inside
     jump = jnp.where(span.t > judged.t_f, jnp.abs(delivered[0] - running.last_torque), 0.0)
@@ -153,13 +158,16 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
         hold_error=jnp.where(after, jnp.maximum(running.hold_error, numerics.norm(span.end.error)), 0.0),
         peak_torque=jnp.maximum(running.peak_torque, largest),
         peak_torque_delivered=jnp.maximum(running.peak_torque_delivered, largest_delivered),
-        saturated_for=running.saturated_for + dt * saturated,
+        saturated_for=running.saturated_for + dt * span.limited,
         effort=running.effort + dt * effort,
         settled_at=settled_at,
         last_torque=delivered[-1],
         variation=running.variation + variation,
         peak_rate=jnp.maximum(running.peak_rate, span.end.rate),
         peak_momentum=jnp.maximum(running.peak_momentum, span.end.momentum),
+        peak_wheel_momentum=running.peak_wheel_momentum
+        if span.wheel_momentum is None
+        else jnp.fmax(running.peak_wheel_momentum, jnp.max(jnp.abs(span.wheel_momentum))),
     )
     return numerics.select(lasts, new, running)
 
@@ -184,6 +192,7 @@ def finish(running: Running, at_t_f: Sight, judged: Judged) -> Metrics:
         chattering=chattering,
         peak_rate=running.peak_rate,
         peak_momentum=running.peak_momentum,
+        peak_wheel_momentum=running.peak_wheel_momentum,
     )
 
 

@@ -33,6 +33,11 @@ class Trials:
         """Which trials ended well."""
         return self.status == rollout.OK
 
+    @property
+    def finished(self) -> np.ndarray:
+        """Which trials were flown to the end, whether or not t_f was met: their metrics are averaged."""
+        return np.isin(self.status, rollout.FINISHED)
+
     def counts(self) -> dict[str, int]:
         """How many trials ended with each status."""
         names = dict.fromkeys(status for status, _ in rollout.STATUS.values())

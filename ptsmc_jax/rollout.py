@@ -11,26 +11,32 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax import metrics, numerics
+from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.controllers import Law
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.hardware import Sensor
+from ptsmc_jax.hardware import Actuators
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
+from ptsmc_jax.sensors import Sensor
 
 Scalar = Float[Array, ""]
 
-OK, DIVERGED, TOO_FAST, SINGULAR = range(4)
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED = range(5)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
     DIVERGED: ("diverged", "the state is not finite"),
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
     SINGULAR: ("singular", "the law's singularity (q4 = 0 for the additive error) came nearer than 1e-3"),
+    MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
 }
+FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
 SINGULAR_CLEARANCE = 1e-3
+LEFT = 0.05  # share of the initial angle, and SETTLED settling angles, beyond which a run has missed t_f
+SETTLED = 10.0
+DISTURBANCE_WALK = "disturbance_walk"
 
 
 @jax.tree_util.register_dataclass
@@ -39,16 +45,18 @@ class Parts:
     """Everything a run is made of. `plant` is the truth; controller and observer hold their own, nominal model."""
 
     plant: Plant
-    disturbance: Any  # callable: t [s] -> (m,) [N m]
+    disturbance: Any  # callable: t [s], true state -> (m,) [N m]
     reference: Any  # callable: t [s] -> what the law is to reach, a Target for spacecraft
     controller: Law
     observer: Any  # observers.Observer
-    sensors: Any  # hardware.Sensor, or None: the law sees the true state
+    sensors: Any  # sensors.Sensor, or None: the law sees the true state
     clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # after t_f, for window_error [s]
     settling_angle: Leaf  # [rad]
+    actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
+    walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
 
 
@@ -79,13 +87,22 @@ class Result(NamedTuple):
 class _State(NamedTuple):
     x: Any
     d_hat: Array
-    u: Array  # delivered last
-    measured: Any  # state at the last sample, what the digital observer starts from
+    u: Array  # delivered at the end of the last interval
     sight: metrics.Sight
     running: metrics.Running
     at_t_f: tuple  # what the state at t_f is computed from
     status: Array
     bad_time: Array
+
+
+class _Flight(NamedTuple):
+    """What the sampled loop carries besides."""
+
+    sensing: Any  # memory of the sensors
+    seen: Any  # state as the law saw it at the last sample
+    applied: Array  # mean torque of the last period, what the observer is told
+    acting: Any  # state of the actuators
+    pushed: Array | None  # random walk of the disturbance [N m]
 
 
 def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False) -> Result:
@@ -105,10 +122,11 @@ simulate_jit = jax.jit(simulate, static_argnames="record")
 
 
 def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, trial, record) -> Result:
-    """Measured, computed and held over each control period; digital observer; plant by RK4 under the held torque."""
+    """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
     controller = parts.controller
     observer: Observer = parts.observer
     sensors: Sensor | None = parts.sensors
+    actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = observer.error_bound()
     lengths = ticks.t_next - ticks.t
     length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
@@ -117,40 +135,66 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
     matrix = observer.update_matrix(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
     first_length = jnp.sum(jnp.where(ticks.noise_weight < 1.0, lengths, 0.0))
     first_matrix = observer.update_matrix(first_length)
-    keys = None if sensors is None else sensors.keys(seed, trial)
+    walk = draws.stream(seed, trial, DISTURBANCE_WALK)
 
-    def fly(x: Any, t: Scalar, u: Array, dt: Scalar) -> Any:
+    def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
         step = dt / parts.substeps
         for k in range(parts.substeps):
-            x = numerics.rk4(lambda time, y: parts.plant.rate(y, u, parts.disturbance(time)), t + k * step, x, step)
+            u, stored = actuators.over(drive, k * step, step)
+
+            def rate(time: Scalar, y: Any, u: Array = u, stored: Array | None = stored) -> Any:
+                d = parts.disturbance(time, y)
+                u = _with_wheels(u, stored, parts.plant.velocity(y))
+                return parts.plant.rate(y, u, d if pushed is None else d + pushed)
+
+            x = numerics.rk4(rate, t + k * step, x, step)
         return parts.plant.normalise(x)
 
-    def period(carry: tuple[_State, Any], tick: tuple) -> tuple[tuple[_State, Any], Any]:
-        (now, dt_before, partial), (state, noise) = tick, carry
+    def period(carry: tuple[_State, _Flight], tick: tuple) -> tuple[tuple[_State, _Flight], Any]:
+        (now, dt_before, partial), (state, flight) = tick, carry
         dt = now.t_next - now.t
-        if sensors is None:
-            measured, noise_next = state.x, noise
-        else:
-            noise_next = sensors.noise(keys, now.sample + 1)
-            measured = sensors.measure(state.x, numerics.lerp(now.noise_weight, noise, noise_next))
+        seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
         d_hat = observer.update(
-            jnp.where(partial, first_matrix, matrix), state.d_hat, state.measured, measured, state.u, dt_before
+            jnp.where(partial, first_matrix, matrix), state.d_hat, flight.seen, seen, flight.applied, dt_before
         )
         d_hat = jnp.where(dt_before > 0.0, d_hat, state.d_hat)
-        u, s = controller.torque(now.t, now.hold, measured, parts.reference(now.t), d_hat, k2(now.t))
-        row = _row(parts, now.t, state.x, d_hat, u, u, s, dt > 0.0) if record else None
-        x = fly(state.x, now.t, u, dt)
-        from_here = (now.t, state.x, u)
-        state = _advance(parts, judged, state, now, x, d_hat, measured, (u,), (1.0,), from_here, dt / parts.substeps)
-        return (state, noise_next), row
+        u, s = controller.torque(now.t, now.hold, seen, parts.reference(now.t), d_hat, k2(now.t))
+        w = parts.plant.velocity(seen)
+        drive, queue = actuators.command(flight.acting, u, w, dt, now.noise_weight)
+        pushed = flight.pushed
+        if parts.walk_rate is not None:
+            pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
+        delivered = actuators.torque(drive, jnp.zeros_like(dt))
+        row = _row(parts, now.t, state.x, d_hat, delivered, u, s, dt > 0.0) if record else None
+        x = fly(state.x, now.t, drive, pushed, dt)
+        if actuators.moves:
+            weights = (1 / 6, 4 / 6, 1 / 6)
+            torques = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
+        else:
+            weights, torques = (1.0,), (delivered,)
+        acting = actuators.end(drive, queue, dt)
+        span = _Torques((u,) * len(torques), torques, weights, drive.limited, acting.h)
+        from_here = (now.t, state.x, drive, pushed)
+        state = _advance(parts, judged, state, now, x, d_hat, span, from_here, dt / parts.substeps)
+        applied = _with_wheels(*actuators.over(drive, jnp.zeros_like(dt), dt), w)
+        return (state, _Flight(sensing, seen, applied, acting, pushed)), row
 
-    noise = None if sensors is None else sensors.noise(keys, ticks.sample[0])
-    state = _begin(parts, judged, x0)
-    state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, jnp.zeros(parts.plant.inputs)))
-    (state, _), rows = jax.lax.scan(period, (state, noise), (ticks, length_before, partial_before))
-    t, x, u = state.at_t_f
-    at_t_f = _sight(parts, judged.t_f, fly(x, t, u, judged.t_f - t))
-    return _finish(parts, judged, state, at_t_f, k2, rows, held=True)
+    state, none = _begin(parts, judged, x0), jnp.zeros(parts.plant.inputs)
+    first = state.sight
+    acting = actuators.begin(parts.plant.inputs)
+    sensing = None if sensors is None else sensors.begin(seed, trial, x0, ticks.sample[0])
+    flight = _Flight(sensing, x0, none, acting, None if parts.walk_rate is None else none)
+    drive, _ = actuators.command(acting, none, parts.plant.velocity(x0), jnp.zeros_like(judged.t_f), judged.t_f)
+    state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, drive, flight.pushed))
+    (state, _), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
+    t, x, drive, pushed = state.at_t_f
+    at_t_f = _sight(parts, judged.t_f, fly(x, t, drive, pushed, judged.t_f - t))
+    return _finish(parts, judged, first, state, at_t_f, k2, rows, held=True)
+
+
+def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
+    """What acts on a body that turns at w and stores this momentum in wheels: u - w x A h."""
+    return u if stored is None else u - jnp.cross(w, stored)
 
 
 def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, trial, record) -> Result:
@@ -167,7 +211,7 @@ def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, see
 
         def rate(t: Scalar, x: Any, d_hat: Array) -> tuple[Any, Array, tuple[Array, Array]]:
             u, s = controller.torque(t, now.hold, x, parts.reference(t), d_hat, k2(t))
-            x_dot = parts.plant.rate(x, u, parts.disturbance(t))
+            x_dot = parts.plant.rate(x, u, parts.disturbance(t, x))
             return x_dot, observer.forcing(x, x_dot, u), (u, s)
 
         x, d_hat, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, state.d_hat, dt)
@@ -175,12 +219,14 @@ def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, see
         x = parts.plant.normalise(x)
         _, _, (u_end, _) = rate(now.t_next, x, d_hat)
         torques = (u, u_middle, u_end)
-        return _advance(parts, judged, state, now, x, d_hat, x, torques, (1 / 6, 4 / 6, 1 / 6), None, dt), row
+        span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
+        return _advance(parts, judged, state, now, x, d_hat, span, None, dt), row
 
     state = _begin(parts, judged, x0)
-    state = state._replace(at_t_f=(state.sight,))
+    first = state.sight
+    state = state._replace(at_t_f=(first,))
     state, rows = jax.lax.scan(step, state, (ticks, decays))
-    return _finish(parts, judged, state, state.at_t_f[0], k2, rows, held=False)
+    return _finish(parts, judged, first, state, state.at_t_f[0], k2, rows, held=False)
 
 
 def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
@@ -190,7 +236,6 @@ def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
         x=x0,
         d_hat=none,
         u=none,
-        measured=x0,
         sight=sight,
         running=metrics.begin(sight, judged, parts.plant.inputs),
         at_t_f=(),
@@ -201,21 +246,29 @@ def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
     return state._replace(status=status, bad_time=bad_time)
 
 
-def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, measured, torques, weights, at_t_f, step) -> _State:
+class _Torques(NamedTuple):
+    """Torques of an interval at the quadrature nodes of `weights`, the last one at its end."""
+
+    commanded: tuple[Array, ...]
+    delivered: tuple[Array, ...]
+    weights: tuple[float, ...]
+    limited: Array
+    wheel_momentum: Array | None
+
+
+def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torques, at_t_f, step) -> _State:
     """The state after an interval: metrics, status and what the state at t_f is computed from (None: this sight).
 
-    torques: at the quadrature nodes of `weights` in the interval, the last one at its end; step: longest integration
-    step taken in it [s].
+    step: longest integration step taken in it [s].
     """
     sight = _sight(parts, now.t_next, x)
-    span = metrics.Span(now.t, now.t_next, state.sight, sight, torques, torques, weights)
+    span = metrics.Span(now.t, now.t_next, state.sight, sight, *torques)
     crosses = (now.t < judged.t_f) & (judged.t_f <= now.t_next)
-    status, bad_time = _watch(parts, state, now.t_next, step, x, torques[-1])
+    status, bad_time = _watch(parts, state, now.t_next, step, x, torques.delivered[-1])
     return _State(
         x=x,
         d_hat=d_hat,
-        u=torques[-1],
-        measured=measured,
+        u=torques.delivered[-1],
         sight=sight,
         running=metrics.update(state.running, span, judged),
         at_t_f=numerics.select(crosses, (sight,) if at_t_f is None else at_t_f, state.at_t_f),
@@ -224,7 +277,7 @@ def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, measured, torqu
     )
 
 
-def _finish(parts: Parts, judged, state: _State, at_t_f, k2, rows, *, held: bool) -> Result:
+def _finish(parts: Parts, judged, first, state: _State, at_t_f, k2, rows, *, held: bool) -> Result:
     log = None
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
@@ -233,7 +286,10 @@ def _finish(parts: Parts, judged, state: _State, at_t_f, k2, rows, *, held: bool
         u = state.u if held else u
         last = _row(parts, judged.t_end, state.x, state.d_hat, u, u, s, jnp.asarray(True))
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
-    return Result(metrics.finish(state.running, at_t_f, judged), state.status, state.bad_time, log)
+    missed = (state.status == OK) & (at_t_f.angle > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
+    status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
+    bad_time = jnp.where(missed, judged.t_f, state.bad_time)
+    return Result(metrics.finish(state.running, at_t_f, judged), status, bad_time, log)
 
 
 def _sight(parts: Parts, t: Scalar, x: Any) -> metrics.Sight:
@@ -263,4 +319,4 @@ def _watch(parts: Parts, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array)
 def _row(parts: Parts, t, x, d_hat, u, commanded, s, lasts) -> Log:
     target = parts.reference(t)
     error, _ = parts.controller.errors(x, target)
-    return Log(t, x, d_hat, u, commanded, s, parts.disturbance(t), target, error, lasts)
+    return Log(t, x, d_hat, u, commanded, s, parts.disturbance(t, x), target, error, lasts)

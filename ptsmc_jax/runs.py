@@ -41,5 +41,6 @@ def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
     log = jax.tree.map(lambda rows: rows[lasts], result.log)
     status, reason = rollout.STATUS[int(result.status)]
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
-    verdicts = [r.verdict(np.asarray(metrics[r.metric]), np.asarray(status == "ok")) for r in ready.requirements]
+    finished = np.asarray(int(result.status) in rollout.FINISHED)
+    verdicts = [r.verdict(np.asarray(metrics[r.metric]), finished) for r in ready.requirements]
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)

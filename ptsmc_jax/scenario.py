@@ -10,19 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import (
-    checks,
-    clock,
-    controllers,
-    dispersions,
-    hardware,
-    metrics,
-    observers,
-    plants,
-    schema,
-    signals,
-    theory,
-)
+from ptsmc_jax import build, checks, clock, dispersions, metrics, observers, schema, theory
 from ptsmc_jax import tables as t
 from ptsmc_jax.checks import MOST_STEPS
 from ptsmc_jax.requirements import Requirement
@@ -31,6 +19,7 @@ from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
 MOST_SUBSTEPS = 50
+MOVING = 4  # steps a period at least where the torque changes within it
 
 
 @dataclass(frozen=True)
@@ -45,7 +34,8 @@ class Study:
     @property
     def catalogue(self) -> dict[str, tuple[str, str]]:
         """The metrics that this plant has: name -> (unit, what it is)."""
-        return metrics.CATALOGUES[self.scenario.plant.kind]
+        names = metrics.CATALOGUES[self.scenario.plant.kind]
+        return names if self.scenario.wheels is not None else {k: v for k, v in names.items() if "wheel" not in k}
 
 
 @dataclass(frozen=True)
@@ -99,7 +89,7 @@ def study(scenario: Scenario, saves: object = (), reach: Reach | None = None, *,
     Raises ScenarioError where the additive law cannot reach the reference from the initial attitude.
     """
     parts = _parts(scenario, saves, reach)
-    dispersion = _dispersion(scenario)
+    dispersion = build.dispersion(scenario)
     if scenario.initial is not None:
         _check_reference(scenario, parts)
         if not drawn or dispersion.attitude is None:  # a drawn trial that meets the singularity is marked and counted
@@ -157,14 +147,11 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
 _path = jax.jit(theory.exact_path)
 
 
-def _vector(values: Any) -> Any:
-    return jnp.asarray(np.asarray(values, dtype=float))
-
-
 def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
     reach = reach or reach_of(scenario)
-    model, controller, initial, reference = _chain(scenario) if scenario.initial is None else _spacecraft(scenario)
-    observer = _observer(scenario, model)
+    made = build.chain(scenario) if scenario.initial is None else build.spacecraft(scenario)
+    model, controller, initial, reference = made
+    observer = build.observer(scenario, model)
     loop = scenario.loop
     assert loop.t_end is not None
     substeps = 1
@@ -179,68 +166,29 @@ def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
             else clock.flight(loop.period, loop.t_end)
         )
         substeps = _substeps(scenario)
+    disturbance, walk = build.disturbance(scenario, model.inputs)
     return Parts(
-        plant=model,
-        disturbance=_disturbance(scenario, model.inputs),
+        plant=model if scenario.spacecraft is None else build.true_body(scenario),
+        disturbance=disturbance,
         reference=reference,
         controller=controller,
         observer=observer,
-        sensors=_sensors(scenario),
+        sensors=build.sensors(scenario),
         clock=timing,
         initial=initial,
-        t_end=_vector(loop.t_end),
-        window=_vector(loop.window),
-        settling_angle=_vector(loop.settling_angle),
+        t_end=build.vector(loop.t_end),
+        window=build.vector(loop.window),
+        settling_angle=build.vector(loop.settling_angle),
+        actuators=build.actuators(scenario),
+        walk_rate=walk,
         substeps=substeps,
     )
 
 
-def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
-    table = scenario.controller
-    return (
-        _vector(table.t_f),
-        _vector(table.eta),
-        _vector(table.delta),
-        _vector(table.k1),
-        _vector(table.sign_width),
-    )
-
-
-def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
-    """Nominal plant, law, initial state and reference of a spacecraft."""
-    assert scenario.spacecraft is not None
-    assert scenario.initial is not None
-    assert scenario.reference is not None
-    model = plants.spacecraft(scenario.spacecraft.inertia)
-    q = jnp.asarray(checks.quaternion(scenario.initial, "initial"))
-    initial = plants.AttitudeState(q, _vector(scenario.initial.rate))
-    q_f = jnp.asarray(checks.quaternion(scenario.reference, "reference"))
-    reference: Any = signals.Fixed(q_f)
-    if isinstance(scenario.reference, t.SpinReference):
-        reference = signals.Spin(q_f, _vector(scenario.reference.rate))
-    return model, controllers.PrescribedTime(model, *_gains(scenario)), initial, reference
-
-
-def _chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
-    """Nominal plant, law, initial state and reference of an integrator chain."""
-    assert isinstance(scenario.plant, t.ChainPlant)
-    assert isinstance(scenario.controller, t.ChainController)
-    model = plants.chain(scenario.plant.order)
-    controller = controllers.PrescribedTimeChain(model, *_gains(scenario), _vector(scenario.controller.a))
-    return model, controller, _vector(scenario.plant.x0), signals.Origin()
-
-
-def _observer(scenario: Scenario, model: plants.Plant) -> Any:
-    table = scenario.controller
-    if isinstance(scenario.observer, t.NoObserver):
-        return observers.NoObserver(model, _vector(table.disturbance_bound))
-    bounds = (_vector(table.disturbance_rate_bound), _vector(table.initial_estimate_error))
-    return observers.NonlinearObserver(model, _vector(scenario.observer.gain), *bounds)
-
-
 def _frequencies(scenario: Scenario) -> dict[str, float]:
     """How fast things happen [rad/s], by the key that says so."""
-    found = {"disturbance.frequency": float(np.max(np.abs(getattr(scenario.disturbance, "frequency", 0.0))))}
+    waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
+    found = {"disturbance.frequency": float(max(waves))}
     if scenario.initial is not None:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate))
         found["reference.rate"] = float(np.linalg.norm(getattr(scenario.reference, "rate", 0.0)))
@@ -264,14 +212,18 @@ def _substeps(scenario: Scenario) -> int:
     if needed > MOST_SUBSTEPS:
         asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
-    return max(1, math.ceil(needed))
+    moving = any(getattr(scenario.hardware, key, None) is not None for key in ("torque_rate_limit", "torque_lag"))
+    return max(MOVING if moving else 1, math.ceil(needed))
 
 
 def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     table, _, name = key.partition(".")
     if key == "controller.eta":  # over a short t_f
         asks += f" at controller.t_f = {scenario.controller.t_f}"
-    return wrong(key, getattr(getattr(scenario, table), name), f"lower: {asks}")
+    value = getattr(getattr(scenario, table), name, None)
+    if value is None:  # of a term in a sum
+        value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
+    return wrong(key, value, f"lower: {asks}")
 
 
 def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, saves: object) -> clock.Graded:
@@ -287,7 +239,9 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
             observer.initial_error,
         )
     bound = observer.error_bound()
-    widest = controller.with_gains(t_f=_vector(reach.t_f), k1=_vector(reach.k1), sign_width=_vector(reach.sign_width))
+    widest = controller.with_gains(
+        t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
+    )
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:
         before, after = widest.boundary_layer(jnp.maximum(bound.floor, bound.start))
@@ -311,40 +265,3 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
             raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
         raise _lower(scenario, worst, asks)
     return clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
-
-
-def _disturbance(scenario: Scenario, inputs: int) -> Any:
-    table = scenario.disturbance
-    if isinstance(table, t.NoDisturbance):
-        return signals.Constant(jnp.zeros(inputs))
-    if isinstance(table, t.ConstantDisturbance | t.ChainConstantDisturbance):
-        return signals.Constant(_vector(table.amplitude))
-    return signals.Sinusoid(*(_vector(v) for v in (table.amplitude, table.frequency, table.phase, table.bias)))
-
-
-def _sensors(scenario: Scenario) -> hardware.Sensors | hardware.StateSensor | None:
-    table = scenario.hardware
-    if isinstance(table, t.ChainHardware):
-        return None if table.state_noise is None else hardware.StateSensor(_vector(table.state_noise))
-    if table is None or (table.attitude_noise is None and table.rate_noise is None):
-        return None
-    return hardware.Sensors(_vector(table.attitude_noise or 0.0), _vector(table.rate_noise or 0.0))
-
-
-def _dispersion(scenario: Scenario) -> dispersions.Dispersion:
-    table = scenario.dispersion
-    if isinstance(table, t.ChainDispersion):
-        if isinstance(table.x0, t.UniformState):
-            return dispersions.Dispersion(state=dispersions.UniformState(_vector(table.x0.half_width)))
-        if isinstance(table.x0, t.NormalState):
-            return dispersions.Dispersion(state=dispersions.NormalState(_vector(table.x0.std)))
-        return dispersions.Dispersion()
-    attitude = table.attitude if table is not None else None
-    if isinstance(attitude, t.UniformAttitude):
-        return dispersions.Dispersion(dispersions.UniformAttitude())
-    if isinstance(attitude, t.NormalAttitude):
-        return dispersions.Dispersion(dispersions.NormalAttitude(_vector(np.deg2rad(attitude.std_deg))))
-    if isinstance(attitude, t.AxisAngle):
-        angles = (_vector(np.deg2rad(a)) for a in (attitude.min_deg, attitude.max_deg))
-        return dispersions.Dispersion(dispersions.AxisAngle(*angles))
-    return dispersions.Dispersion()

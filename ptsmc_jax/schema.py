@@ -15,8 +15,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from ptsmc_jax import tables
-from ptsmc_jax.tables import ATTITUDE_KEYS, TABLES, Kinds, Limit, Positive, Scenario, Table
+from ptsmc_jax import layouts, tables
+from ptsmc_jax.layouts import TABLES, Kinds
+from ptsmc_jax.tables import ATTITUDE_KEYS, Limit, Positive, Scenario, Table
 
 NOT_YET = "is not available yet"
 
@@ -91,10 +92,10 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
         if order < 2:
             raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
-    fallback = tables.defaults(kind, order)
+    fallback = layouts.defaults(kind, order)
     found: dict[str, Any] = {}
     for name in layout:
-        if name not in raw and name in tables.OPTIONAL:
+        if name not in raw and name in layouts.OPTIONAL:
             continue
         given = raw.get(name, {})
         if name == "dispersion":
@@ -175,7 +176,20 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Tab
     if struct is None:
         allowed = " or ".join(show(k) for k, s in kinds.items() if s is not None)
         raise ScenarioError(f"{name}.kind = {show(kind)} {NOT_YET}; allowed is {allowed}")
+    if struct is tables.SumDisturbance:
+        return _sum(name, raw, kinds)
     return _fields(name, raw, struct)
+
+
+def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds) -> Table:
+    """A table whose `terms` are tables of the other kinds."""
+    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, tables.SumDisturbance)
+    terms = raw.get("terms", ())
+    if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
+        raise wrong(f"{name}.terms", terms, 'a list of tables such as [{ kind = "constant" }]')
+    single = {kind: struct for kind, struct in kinds.items() if struct is not tables.SumDisturbance}
+    found = tuple(_table(f"{name}.terms[{k}]", term, single) for k, term in enumerate(terms))
+    return tables.SumDisturbance(terms=found)
 
 
 def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
@@ -187,7 +201,7 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
             raise ScenarioError(f"dispersion.{key} is not a known key; the nearest known one is dispersion.{closest}")
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        found[key] = _table(f"dispersion.{key}", table, tables.DISPERSIONS[key])
+        found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key])
     return struct(**found)
 
 

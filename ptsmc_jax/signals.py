@@ -1,8 +1,8 @@
-"""What varies with time alone: reference attitudes with their derivatives, and disturbance torques."""
+"""What the loop is given: reference attitudes with their derivatives, and disturbance torques."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude
 from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.plants import AttitudeState
 
 Time = Float[Array, ""]
 
@@ -68,7 +69,7 @@ class Constant:
 
     value: Leaf  # (m,) [N m]
 
-    def __call__(self, t: Time) -> Float[Array, " m"]:
+    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
         return self.value
 
@@ -83,9 +84,45 @@ class Sinusoid:
     phase: Leaf  # (m,) [rad]
     bias: Leaf  # (m,) [N m]
 
-    def __call__(self, t: Time) -> Float[Array, " m"]:
+    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
         return self.bias + self.amplitude * jnp.sin(self.frequency * t + self.phase)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GravityGradient:
+    """Gravity-gradient torque on a circular orbit, 3 n^2 c x J c, c the unit vector to the planet in body axes.
+
+    Wie, Space Vehicle Dynamics and Control (2008), eq. (6.128). It depends on the true attitude.
+    """
+
+    inertia: Leaf  # (3, 3) of the true body [kg m^2]
+    orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
+    rate: Leaf  # n [rad/s]
+    phase: Leaf  # of the body at t = 0 [rad]
+
+    def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
+        """Torque at t [s] in the state x, (3,) [N m]."""
+        along = self.rate * t + self.phase
+        radial = jnp.stack([jnp.cos(along), jnp.sin(along), jnp.zeros_like(along)])
+        c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
+        return 3.0 * self.rate**2 * jnp.cross(c, self.inertia @ c)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sum:
+    """The sum of several disturbances."""
+
+    terms: tuple[Any, ...]
+
+    def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
+        """Disturbance at t [s] in the state x, (m,) [N m]."""
+        total = self.terms[0](t, x)
+        for term in self.terms[1:]:
+            total = total + term(t, x)
+        return total
 
 
 def time_derivative(signal: Callable, t: Time) -> Array:

@@ -1,8 +1,6 @@
 """The tables of a scenario file: every key, its type, range, default and description, for each kind of plant."""
 
-import math
 import typing
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -15,10 +13,14 @@ Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
 Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
 ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
 One = Annotated[tuple[float], Meta(description="a list of one number")]
+OneNotNegative = Annotated[tuple[NotNegative], Meta(description="a list of one number of at least 0")]
 OnePositive = Annotated[tuple[Positive], Meta(description="a list of one number greater than 0")]
 Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
 NotNegatives = Annotated[
     tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
+]
+ThreeNotNegative = Annotated[
+    tuple[NotNegative, NotNegative, NotNegative], Meta(description="three numbers of at least 0")
 ]
 Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
 Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
@@ -45,6 +47,7 @@ class ChainPlant(Table, frozen=True):
 
 class Spacecraft(Table, frozen=True):
     inertia: Inertia = (10.0, 12.0, 14.0)
+    true_inertia: Inertia | None = None
 
 
 class Attitude(Table, frozen=True):
@@ -90,6 +93,31 @@ class SinusoidDisturbance(Table, frozen=True):
     frequency: Three = (0.1, 0.1, 0.1)
     phase: Three = (0.0, 0.0, 0.0)
     bias: Three = (0.0, 0.0, 0.0)
+
+
+class GravityGradient(Attitude, frozen=True):
+    """The attitude is that of the orbit's frame: z along its normal, x to where the phase counts from."""
+
+    kind: Literal["gravity_gradient"] = "gravity_gradient"
+    orbit_rate: Positive = 1.1e-3
+    phase: Number = 0.0
+
+
+class RandomWalk(Table, frozen=True):
+    kind: Literal["random_walk"] = "random_walk"
+    density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
+
+
+class ChainRandomWalk(Table, frozen=True):
+    kind: Literal["random_walk"] = "random_walk"
+    density: OneNotNegative = (1e-4,)
+
+
+class SumDisturbance(Table, frozen=True):
+    """Several disturbances at once, each a table with its own kind."""
+
+    kind: Literal["sum"] = "sum"
+    terms: tuple[Any, ...] = ()
 
 
 class ChainConstantDisturbance(Table, frozen=True):
@@ -167,11 +195,43 @@ class Actuators(Table, frozen=True):
 class Hardware(Actuators, frozen=True):
     attitude_noise: NotNegative | None = None
     rate_noise: NotNegative | None = None
+    rate_noise_density: NotNegative | None = None
     rate_bias: NotNegative | None = None
+    rate_bias_walk: NotNegative | None = None
+    star_tracker_every: Count | None = None
 
 
 class ChainHardware(Actuators, frozen=True):
     state_noise: NotNegatives | None = None
+
+
+class NoFilter(Table, frozen=True):
+    kind: Literal["none"] = "none"
+
+
+class SteadyStateFilter(Table, frozen=True):
+    kind: Literal["steady_state"] = "steady_state"
+    bandwidth: Positive | None = None
+
+
+class WheelLimits(Table, frozen=True):
+    torque_limit: Positive | None = None
+    momentum_limit: Positive | None = None
+    momentum: Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None = None
+
+
+class PyramidWheels(WheelLimits, frozen=True):
+    kind: Literal["pyramid"] = "pyramid"
+    cant_deg: Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")] = 35.264389682754654
+
+
+class AxesWheels(WheelLimits, frozen=True):
+    kind: Literal["axes"] = "axes"
+    axes: Annotated[tuple[Three, ...], Meta(description="a list of spin axes, three numbers each")] = (
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, 1.0),
+    )
 
 
 class UniformAttitude(Table, frozen=True):
@@ -261,69 +321,22 @@ class Scenario(Table, frozen=True, kw_only=True):
     initial: Initial | None = None
     reference: FixedReference | SpinReference | None = None
     disturbance: (
-        NoDisturbance | ConstantDisturbance | SinusoidDisturbance | ChainConstantDisturbance | ChainSinusoidDisturbance
+        NoDisturbance
+        | ConstantDisturbance
+        | SinusoidDisturbance
+        | GravityGradient
+        | RandomWalk
+        | SumDisturbance
+        | ChainConstantDisturbance
+        | ChainSinusoidDisturbance
+        | ChainRandomWalk
     )
     controller: Controller | ChainController
     observer: NonlinearObserver | ChainNonlinearObserver | NoObserver
     loop: Loop
     hardware: Hardware | ChainHardware | None = None
+    wheels: PyramidWheels | AxesWheels | None = None
+    filter: NoFilter | SteadyStateFilter | None = None
     dispersion: Dispersion | ChainDispersion | None = None
     requirements: dict[str, float | Limit] = {}
     tune: Tune | None = None
-
-
-# A table is a struct, or one for each kind, the default first; a kind without a struct is not available yet.
-Kinds = dict[str, type[Table] | None]
-_LAWS: Kinds = {"pd": None, "terminal": None, "fixed_time": None}
-_OBSERVERS: Kinds = {"finite_time": None, "prescribed_time": None}
-TABLES: dict[str, dict[str, type[Table] | Kinds]] = {  # by the kind of the plant
-    "spacecraft": {
-        "plant": SpacecraftPlant,
-        "spacecraft": Spacecraft,
-        "initial": Initial,
-        "reference": {"fixed": FixedReference, "spin": SpinReference, "sinusoid": None, "slew": None},
-        "disturbance": {"sinusoid": SinusoidDisturbance, "none": NoDisturbance, "constant": ConstantDisturbance},
-        "controller": {"prescribed_time": Controller, **_LAWS},
-        "observer": {"nonlinear": NonlinearObserver, "none": NoObserver, **_OBSERVERS},
-        "loop": Loop,
-        "hardware": Hardware,
-        "dispersion": Dispersion,
-        "tune": Tune,
-    },
-    "chain": {
-        "plant": ChainPlant,
-        "disturbance": {
-            "sinusoid": ChainSinusoidDisturbance,
-            "none": NoDisturbance,
-            "constant": ChainConstantDisturbance,
-        },
-        "controller": {"prescribed_time": ChainController, **_LAWS},
-        "observer": {"none": NoObserver, "nonlinear": ChainNonlinearObserver, **_OBSERVERS},
-        "loop": Loop,
-        "hardware": ChainHardware,
-        "dispersion": ChainDispersion,
-        "tune": Tune,
-    },
-}
-OPTIONAL = ("hardware", "dispersion", "requirements", "tune")  # off where absent
-DISPERSIONS: dict[str, Kinds] = {
-    "attitude": {"axis_angle": AxisAngle, "uniform": UniformAttitude, "normal": NormalAttitude},
-    "rate": {"normal": NormalRate},
-    "inertia": {"relative_normal": RelativeInertia},
-    "disturbance_phase": {"uniform": UniformPhase},
-    "x0": {"uniform": UniformState, "normal": NormalState},
-}
-
-_CASE_I: dict[str, Mapping[str, Any]] = {
-    "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
-    "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
-}
-
-
-def defaults(kind: str, order: int) -> dict[str, Mapping[str, Any]]:
-    """Defaults that no single key tells: the paper's Case I; a chain's, Figs. 1 and 2 for order 2 and 3."""
-    if kind == "spacecraft":
-        return _CASE_I
-    x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
-    poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
-    return {"plant": {"x0": x0}, "controller": {"eta": order + 1.0, "a": poles_at_minus_one}}

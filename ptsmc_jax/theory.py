@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import attitude, numerics
 from ptsmc_jax.controllers import expansion
-from ptsmc_jax.plants import Chain
+from ptsmc_jax.plants import AttitudeState, Chain
 from ptsmc_jax.rollout import Parts
 
 Scalar = Float[Array, ""]
@@ -270,7 +270,7 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     law, plant = parts.controller, parts.plant
     if isinstance(plant, Chain):
         motion = exact_chain(t, law.t_f, law.eta, parts.initial)
-        drive = motion.acceleration - parts.disturbance(t)
+        drive = motion.acceleration - parts.disturbance(t, motion.x)
         return (drive - plant.drift(motion.x)) / plant.input_gain(motion.x), jnp.ones_like(t)
     target = parts.reference(t)
     motion = exact_error(t, law.t_f, law.eta, *_start(parts))
@@ -281,7 +281,7 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     q = jnp.append(v, scalar)
     w = 2.0 * attitude.t_inverse_times(q, rate_f + motion.error_rate)
     w_dot = attitude.t_inverse_times(q, 2.0 * (acceleration_f + motion.acceleration) + 0.5 * jnp.dot(w, w) * v)
-    return plant.inertia @ w_dot + jnp.cross(w, plant.inertia @ w) - parts.disturbance(t), square
+    return plant.inertia @ w_dot + jnp.cross(w, plant.inertia @ w) - parts.disturbance(t, AttitudeState(q, w)), square
 
 
 def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import clock, controllers, hardware, observers, plants, signals
+from ptsmc_jax import clock, controllers, observers, plants, sensors, signals
 from ptsmc_jax.rollout import Parts
 
 ROOT = Path(__file__).parent.parent
@@ -64,7 +64,7 @@ def parts(
         reference=reference or signals.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
         controller=controllers.PrescribedTime(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width))),
         observer=observers.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
-        sensors=None if noise is None else hardware.Sensors(*(vector(v) for v in noise)),
+        sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,
         initial=plants.AttitudeState(vector(q), vector(rate)),
         t_end=vector(t_end),
@@ -111,7 +111,7 @@ def chain_parts(
         reference=signals.Origin(),
         controller=law,
         observer=observer or observers.NoObserver(model, vector(bound)),
-        sensors=None if noise is None else hardware.StateSensor(vector(noise)),
+        sensors=None if noise is None else sensors.StateSensor(vector(noise)),
         clock=timing,
         initial=vector(x0),
         t_end=vector(t_end),

@@ -1,98 +1,256 @@
+"""Delay, limits, lag, quantisation and wheels, each against an independent model of a few lines."""
+
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import draws, hardware, plants
-from tests.helpers import vector
+from ptsmc_jax import hardware, lanes, rollout, sensors, signals
+from ptsmc_jax.plants import AttitudeState
+from tests.helpers import FULL_INERTIA, parts, vector, with_controller
 
-EPS = np.finfo(float).eps
-SIGMAS = -stats.norm.ppf(0.5e-6)  # with other seeds a check would fail once in a million; they are fixed
-SIZES = (2e-5, 1e-6)
-SENSORS = hardware.Sensors(vector(SIZES[0]), vector(SIZES[1]))
-ATTITUDE = Rotation.from_rotvec([1.0, -2.0, 0.4])
-STATE = plants.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2, 0.03]))
-
-measure = jax.jit(
-    jax.vmap(lambda sensors, seed, trial, k: sensors.measure(STATE, sensors.noise(sensors.keys(seed, trial), k)),
-             (None, None, 0, 0))
-)  # fmt: skip
+fly = rollout.simulate_jit
+PYRAMID = hardware.pyramid()
 
 
-@pytest.fixture(scope="module")
-def errors():
-    """(trial and sample, axis) errors in units of their standard deviation: attitude in body axes, rate."""
-    trials, samples = (jnp.asarray(grid.ravel()) for grid in np.meshgrid(np.arange(128), np.arange(-256, 256)))
-    measured = measure(SENSORS, 3, trials, samples)
-    turns = (ATTITUDE.inv() * Rotation.from_quat(np.asarray(measured.q))).as_rotvec()
-    return turns / SIZES[0], (np.asarray(measured.w) - np.asarray(STATE.w)) / SIZES[1]
+def drive_of(device, v, c):
+    return hardware.Drive(vector(v), vector(c), None, jnp.asarray(False))
 
 
-def test_noise_has_the_stated_size_about_every_body_axis(errors):
-    for error in errors:
-        n = len(error)
-        assert np.all(np.abs(error.mean(axis=0)) < SIGMAS / math.sqrt(n))
-        assert np.all(np.abs((error**2).mean(axis=0) - 1) < SIGMAS * math.sqrt(2 / n))
-        for axis in error.T:
-            assert stats.kstest(axis, "norm").pvalue > 1e-6
-
-
-def test_noise_is_independent_of_axis_and_sensor(errors):
-    both = np.hstack(errors)
-    # 15 pairs
-    limit = -stats.norm.ppf(0.5e-6 / 15) / math.sqrt(len(both))
-    assert np.abs(np.corrcoef(both.T) - np.eye(6)).max() < limit
-
-
-def test_noise_differs_from_sample_to_sample_and_trial_to_trial(errors):
-    for error in errors:
-        assert len(np.unique(error[:, 0])) > 0.999 * len(error)  # birthdays among 2^32 pairs: one or none
-
-
-def test_noise_is_drawn_from_the_streams_named_after_the_sensors():
-    noises = SENSORS.noise(SENSORS.keys(7, 8), jnp.asarray(-5))
-    for noise, name, size in zip(noises, ("attitude_noise", "rate_noise"), SIZES, strict=True):
-        np.testing.assert_array_equal(noise, size * draws.normals(draws.stream(7, 8, name), 3, -5))
-
-
-def test_no_noise_measures_exactly():
-    sensors = hardware.Sensors(vector(0.0), vector(0.0))
-    got = measure(sensors, 3, jnp.arange(4), jnp.arange(4))
-    np.testing.assert_array_equal(got.q, np.tile(STATE.q, (4, 1)))
-    np.testing.assert_array_equal(got.w, np.tile(STATE.w, (4, 1)))
-
-
-def test_the_attitude_is_turned_about_body_axes():
-    turn, push = np.array([0.3, -0.1, 0.2]), np.array([1.0, 2.0, 3.0])
-    got = SENSORS.measure(STATE, (vector(turn), vector(push)))
-    exact = ATTITUDE * Rotation.from_rotvec(turn)
-    np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact.as_matrix(), atol=20 * EPS)
-    assert abs(np.linalg.norm(got.q) - 1) < 8 * EPS
-    np.testing.assert_allclose(got.w, STATE.w + push, rtol=EPS)
-
-
-def test_sensors_are_a_frozen_pytree():
-    assert jax.tree.leaves(SENSORS) == list(SIZES)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        SENSORS.rate_noise = vector(1.0)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_state_sensor_adds_independent_noise_of_the_stated_size_to_every_state():
-    sensor = hardware.StateSensor(vector([1e-3, 0.0, 2.0]))
-    x = vector([1.0, 2.0, 3.0])
-    one = jax.jit(jax.vmap(lambda k: sensor.measure(x, sensor.noise(sensor.keys(5, 6), k))))
-    error = np.asarray(one(jnp.arange(1 << 15))) - np.asarray(x)
-    np.testing.assert_array_equal(error[:, 1], 0.0)
-    for k, size in ((0, 1e-3), (2, 2.0)):
-        assert stats.kstest(error[:, k] / size, "norm").pvalue > 1e-6
-    limit = -stats.norm.ppf(0.5e-6) / math.sqrt(len(error))
-    assert abs(np.corrcoef(error[:, 0], error[:, 2])[0, 1]) < limit
-    np.testing.assert_array_equal(
-        sensor.noise(sensor.keys(7, 8), jnp.asarray(-5)),
-        sensor.sigma * draws.normals(draws.stream(7, 8, "state_noise"), 3, -5),
+@pytest.mark.parametrize("lag", [None, 0.03, 0.5])
+@pytest.mark.parametrize("rate_limit", [None, 0.4, 20.0])
+def test_channels_follow_their_differential_equation(lag, rate_limit):
+    """v' = clip((c - v)/lag, -R, R); without a lag v' = R sign(c - v) until c is met."""
+    device = hardware.Actuators(
+        rate_limit=None if rate_limit is None else vector(rate_limit), lag=None if lag is None else vector(lag)
     )
+    for start, target in ((0.2, -0.3), (-0.1, 0.4), (0.1, 0.1)):
+        for s in (0.0, 0.01, 0.2, 1.5):
+            found, impulse = device.channels(drive_of(device, [start], [target]), vector(s))
+            if lag is None:
+                gap = target - start
+                step = gap if rate_limit is None else np.clip(gap, -rate_limit * s, rate_limit * s)
+                expected = start + step
+            else:
+                limit = np.inf if rate_limit is None else rate_limit
+                flown = solve_ivp(
+                    lambda _, v, target=target, limit=limit: np.clip((target - v) / lag, -limit, limit),
+                    (0.0, s), [start], rtol=1e-10, atol=1e-12, max_step=0.01,
+                )  # fmt: skip
+                expected = flown.y[0, -1]
+            np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-8)
+            drive = drive_of(device, [start], [target])
+            area, _ = quad(lambda at, drive=drive: float(device.channels(drive, vector(at))[0][0]), 0.0, s, limit=200)
+            np.testing.assert_allclose(impulse[0], area, rtol=0, atol=1e-6)
+
+
+def test_quantisation_rounds_and_lets_the_slope_through():
+    u = vector([0.024, -0.036, 0.0])
+    np.testing.assert_allclose(hardware.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)
+    np.testing.assert_array_equal(jax.jacfwd(lambda u: hardware.quantise(u, vector(0.01)))(u), np.eye(3))
+
+
+def with_device(device, **changes):
+    run = parts(20.0, 3.0, 1.0, period=0.1, noise=(2e-5, 1e-6), flight=True, t_end=23.0, **changes)
+    return dataclasses.replace(run, actuators=device)
+
+
+def test_perfect_actuators_change_nothing():
+    plain = fly(with_device(None), np.uint32(1), np.uint32(2))
+    through = fly(with_device(hardware.Actuators()), np.uint32(1), np.uint32(2))
+    for a, b in zip(plain.metrics, through.metrics, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_commands_arrive_whole_periods_later(delay):
+    log = fly(with_device(hardware.Actuators(delay=delay)), np.uint32(1), np.uint32(2), record=True).log
+    assert log is not None
+    np.testing.assert_array_equal(log.u[:delay], np.zeros((delay, 3)))
+    np.testing.assert_array_equal(log.u[delay:-1], log.commanded[: -1 - delay])
+
+
+def test_limits_and_steps_as_delivered():
+    device = hardware.Actuators(torque_limit=vector(0.11), step=vector(0.01))
+    result = fly(with_device(device), np.uint32(1), np.uint32(2), record=True)
+    log = jax.tree.map(np.asarray, result.log)
+    expected = np.round(np.clip(log.commanded, -0.11, 0.11) / 0.01) * 0.01
+    np.testing.assert_allclose(log.u[:-1], expected[:-1], atol=1e-15)
+    assert float(result.metrics.peak_torque) > 0.11
+    np.testing.assert_allclose(result.metrics.peak_torque_delivered, 0.11)
+    beyond = np.any(np.abs(log.commanded[:-1]) > 0.11, axis=1)
+    np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[beyond]) / 23.0, rtol=1e-9)
+
+
+def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
+    device = hardware.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
+    log = jax.tree.map(
+        np.asarray, fly(with_device(device, inertia=FULL_INERTIA), np.uint32(1), np.uint32(2), record=True).log
+    )
+    inertia = np.asarray(FULL_INERTIA)
+
+    def rate(t, y, c):
+        q, w, v = y[:4], y[4:7], y[7:]
+        v_dot = np.clip((c - v) / 0.04, -0.5, 0.5)
+        w_dot = np.linalg.solve(inertia, v + 0.01 * np.sin(0.1 * t) - np.cross(w, inertia @ w))
+        return np.concatenate([0.5 * (q[3] * w + np.cross(q[:3], w)), [-0.5 * q[:3] @ w], w_dot, v_dot])
+
+    y = np.concatenate([log.x.q[0], log.x.w[0], np.zeros(3)])
+    for k in range(60):
+        y = solve_ivp(
+            rate, (log.t[k], log.t[k + 1]), y, args=(log.commanded[k],), rtol=1e-10, atol=1e-12, max_step=0.01
+        ).y[:, -1]
+    # momentum is exact; within a step of 0.025 s the mean torque stands for its course, h^2 / 12 of 0.03 rad/s^2 a jump
+    np.testing.assert_allclose(np.concatenate([log.x.q[60], log.x.w[60]]), y[:7], atol=1e-5)
+    np.testing.assert_allclose(log.u[60], y[7:], atol=1e-6)
+
+
+def test_wheels_exchange_momentum_with_the_body():
+    """Without a disturbance the total angular momentum stays where it is in the inertial frame."""
+    device = hardware.Actuators(wheels=hardware.wheels(PYRAMID, [0.5, -0.2, 0.1, 0.3]), lag=vector(0.2))
+    quiet = signals.Constant(vector([0.0] * 3))
+    run = with_device(device, disturbance=quiet, inertia=FULL_INERTIA, rate=(0.02, -0.01, 0.03))
+    run = dataclasses.replace(run, sensors=None, substeps=4)
+    result = fly(run, np.uint32(1), np.uint32(2), record=True)
+    log = jax.tree.map(np.asarray, result.log)
+    assert int(result.status) == rollout.OK
+    # the wheels' momentum: minus the integral of their torques, which the lag gives in closed form
+    h, v, axes = np.array([0.5, -0.2, 0.1, 0.3]), np.zeros(4), PYRAMID.T
+    totals, largest = [], np.abs(h).max()
+    for k in range(len(log.t) - 1):
+        total = Rotation.from_quat(log.x.q[k]).apply(np.asarray(FULL_INERTIA) @ log.x.w[k] + axes @ h)
+        totals.append(total)
+        c = np.linalg.pinv(axes) @ (log.commanded[k] + np.cross(log.x.w[k], axes @ h))
+        dt = log.t[k + 1] - log.t[k]
+        left = np.exp(-dt / 0.2)
+        h = h - (c * dt - (c - v) * 0.2 * (1 - left))
+        v = c - (c - v) * left
+        largest = max(largest, np.abs(h).max())
+    np.testing.assert_allclose(totals, np.tile(totals[0], (len(totals), 1)), atol=2e-6)  # h at mid-step
+    np.testing.assert_allclose(result.metrics.peak_wheel_momentum, largest, rtol=1e-4)
+
+
+def test_wheels_keep_their_limits():
+    limits = hardware.wheels(PYRAMID, None, torque_limit=0.08, momentum_limit=0.6)
+    result = fly(with_device(hardware.Actuators(wheels=limits)), np.uint32(1), np.uint32(2), record=True)
+    assert result.log is not None
+    assert np.all(np.abs(result.log.u) <= 0.08 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
+    assert float(result.metrics.peak_wheel_momentum) <= 0.6 * (1 + 1e-9)
+    assert float(result.metrics.saturated) > 0.1
+    assert int(result.status) == rollout.MISSED  # a slew that needs 1.2 N m s and gets half of it
+    assert all(np.isfinite(v) for v in (result.metrics.window_error, result.metrics.peak_torque))
+
+
+def test_allocation_gives_the_wanted_torque_for_any_geometry():
+    rng = np.random.default_rng(0)
+    for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):
+        found = hardware.wheels(axes)
+        np.testing.assert_allclose(found.axes @ found.allocation, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(found.axes, axis=0), 1.0)
+    flat = [[1, 0, 0], [0, 1, 0], [1, 1, 0]]
+    for bad, said in ((flat, "span"), (flat[:2], "span"), ([1, 2, 3], "rows"), ([[0, 0, 0]] * 3, "rows")):
+        with pytest.raises(ValueError, match=said):
+            hardware.wheels(bad)
+    strength = np.abs(PYRAMID).sum(axis=0)
+    np.testing.assert_allclose(strength, strength[0])  # the default cant
+
+
+def everything(delta=0.93, **changes):
+    """A run with every device on."""
+    run = parts(
+        15.0,
+        3.2,
+        delta,
+        30.0,
+        period=0.1,
+        t_end=18.0,
+        reach=(15.0, 2.0),
+        sign_width=0.05,
+        inertia=FULL_INERTIA,
+        **changes,
+    )
+    filtered = sensors.attitude_filter(0.5, 2e-5, 1e-6, 1e-8, 0.1, 2)
+    sensing = sensors.Sensors(vector(2e-5), vector(1e-6), vector(1e-5), vector(1e-8), filtered, 2)
+    device = hardware.Actuators(
+        torque_limit=vector(3.0), rate_limit=vector(4.0), lag=vector(0.03), step=vector(1e-13),
+        wheels=hardware.wheels(PYRAMID, [0.1, 0.0, 0.0, 0.0], 2.0, 5.0), delay=1,
+    )  # fmt: skip
+    gravity = signals.GravityGradient(run.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.4))
+    total = signals.Sum((run.disturbance, gravity))
+    return dataclasses.replace(run, sensors=sensing, actuators=device, disturbance=total, walk_rate=vector([1e-4] * 3))
+
+
+def test_gradients_with_every_device_on():
+    every = everything()
+
+    def error(eta, delta, gain):
+        run = with_controller(every, eta=eta, delta=delta)
+        run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, gain=jnp.full(3, gain)))
+        return rollout.simulate(run, 3, 5).metrics.window_error
+
+    point = (vector(3.2), vector(0.93), vector(30.0))
+    forward = jax.jit(jax.jacfwd(error, (0, 1, 2)))(*point)
+    value = jax.jit(error)
+    for k, slope in enumerate(forward):
+        # wide enough that the staircase of 1e-13 N m does not show
+        h = 2e-5 * float(point[k])
+        up, down = (float(value(*(p + s * h * (j == k) for j, p in enumerate(point)))) for s in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-4)
+    assert all(np.isfinite(slope) for slope in forward)
+
+
+def test_batches_with_every_device_on():
+    trials, run = jnp.arange(5, dtype=jnp.uint32), everything()
+
+    def one(trial):
+        return rollout.simulate(run, 3, trial).metrics
+
+    plain = jax.jit(jax.vmap(one))(trials)
+    by_lanes = jax.jit(lanes.vmap(one))(trials)
+    for name, a, b in zip(plain._fields, plain, by_lanes, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.std(plain.window_error) > 0
+
+
+def test_nothing_jumps_where_delta_is_a_multiple_of_the_period():
+    """With delay, filter and walk too: the vanishing first period weighs nothing."""
+    run = everything()
+    value = jax.jit(lambda delta: rollout.simulate(with_controller(run, delta=delta), 3, 5).metrics.window_error)
+    below, above = (float(value(vector(1.0 + shift))) for shift in (-1e-7, 1e-7))
+    np.testing.assert_allclose(below, above, rtol=1e-4)
+
+
+def test_gravity_gradient_is_the_textbook_torque():
+    inertia, rate = np.diag([10.0, 12.0, 14.0]), 1.1e-3
+    whole = signals.GravityGradient(vector(inertia), vector([0.0, 0.0, 0.0, 1.0]), vector(rate), vector(0.0))
+    for angle in (0.0, 0.3, 1.0):
+        # pitched about z by an angle from the radial direction x
+        q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
+        found = whole(vector(0.0), AttitudeState(vector(q), vector([0.0] * 3)))
+        expected = [0.0, 0.0, -1.5 * rate**2 * (12.0 - 10.0) * np.sin(2 * angle)]
+        np.testing.assert_allclose(found, expected, atol=1e-18)
+        # a quarter of the orbit later the body lies the other way
+        later = whole(vector(np.pi / 2 / rate), AttitudeState(vector(q), vector([0.0] * 3)))
+        np.testing.assert_allclose(later, [0.0, 0.0, 1.5 * rate**2 * 2.0 * np.sin(2 * angle)], atol=1e-18)
+
+
+def test_random_walk_grows_like_the_square_root_of_time():
+    run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=signals.Constant(vector([0.0] * 3)))
+    density = 1e-3
+    run = dataclasses.replace(run, walk_rate=vector([density / np.sqrt(0.1)] * 3))
+
+    def found(trial):
+        log = rollout.simulate(run, 4, trial, record=True).log
+        assert log is not None
+        return log.d_hat[-1]
+
+    # the observer, with l/J of about 1/s, follows the walk: its estimate spreads like the walk of 12 s less its lag
+    d_hat = np.asarray(jax.jit(jax.vmap(found))(jnp.arange(512, dtype=jnp.uint32)))
+    lag = np.array([10.0, 12.0, 14.0]) / 10.0
+    # of a walk w through a first-order lag T the variance is density^2 (t - 1.5 T) for t well beyond T
+    expected = density * np.sqrt(12.0 - 1.5 * lag)
+    np.testing.assert_allclose(d_hat.std(axis=0), expected, rtol=4 / np.sqrt(2 * 512))

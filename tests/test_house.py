@@ -20,9 +20,9 @@ FLOORS = {
         draws
         attitude
         plants
-        signals
-        hardware
+        signals hardware
         observers controllers clock
+        sensors
         metrics
         rollout
         lanes
@@ -30,8 +30,10 @@ FLOORS = {
         requirements
         dispersions
         tables
+        layouts
         schema
         checks
+        build
         scenario
         montecarlo runs
         store

@@ -76,7 +76,9 @@ def span(t, t_next, angles, torque=0.0, delivered=None):
     start, end = (metrics.Sight(vector([a / 2, 0, 0]), jnp.zeros(3), vector(a), vector(a), vector(a)) for a in angles)
     u = vector([torque, 0.0, 0.0])
     got = u if delivered is None else vector([delivered, 0.0, 0.0])
-    return metrics.Span(vector(t), vector(t_next), start, end, (u,), (got,), (1.0,))
+    return metrics.Span(
+        vector(t), vector(t_next), start, end, (u,), (got,), (1.0,), jnp.asarray(delivered is not None), None
+    )
 
 
 def judge(spans, t_end=4.0):

@@ -8,7 +8,18 @@ from ptsmc_jax import schema
 from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, CHAIN_CATALOGUE
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.tables import Actuators, Attitude, ChainPlant, Scenario, Table
+from ptsmc_jax.tables import (
+    Actuators,
+    Attitude,
+    AxesWheels,
+    ChainPlant,
+    GravityGradient,
+    PyramidWheels,
+    Scenario,
+    SumDisturbance,
+    Table,
+    WheelLimits,
+)
 
 # design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
 DEFAULTS = {
@@ -103,8 +114,18 @@ COMPLETE = [
             "attitude_noise": 2e-5,
             "rate_noise": 1e-6,
             "rate_bias": 1e-6,
+            "rate_bias_walk": 1e-8,
+            "star_tracker_every": 4,
         }
     },
+    {"hardware": {"rate_noise_density": 1e-7}},
+    {"spacecraft": {"true_inertia": [10.0, 12.0, 14.0]}},
+    {"wheels": {"kind": "pyramid", "cant_deg": 30.0, "torque_limit": 0.2, "momentum_limit": 4.0}},
+    {"wheels": {"kind": "axes", "momentum": [0.1, 0.2, 0.3]}},
+    {"filter": {"kind": "none"}},
+    {"filter": {"kind": "steady_state", "bandwidth": 0.1}},
+    {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-3, "phase": 0.1, "mrp": [0.0, 0.0, 0.1]}},
+    {"disturbance": {"kind": "random_walk", "density": [1e-4, 1e-4, 1e-4]}},
     {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 140.0}}},
     {"dispersion": {"attitude": {"kind": "normal", "std_deg": 3.0}}},
     {"dispersion": {"attitude": {"kind": "uniform"}}},
@@ -120,6 +141,7 @@ COMPLETE = [
         for tables in (
             CHAIN_DEFAULTS,
             {"disturbance": {"kind": "constant", "amplitude": [0.01]}},
+            {"disturbance": {"kind": "random_walk", "density": [1e-4]}},
             {"observer": {"kind": "nonlinear", "gain": [10.0]}},
             {"hardware": {"state_noise": [1e-5, 1e-5, 0.0], "delay": 1, "torque_limit": 0.5, "torque_lag": 0.1}},
             {"hardware": {"torque_rate_limit": 5.0, "torque_step": 1e-4}},
@@ -179,7 +201,7 @@ def refusal(tables):
 each_number = pytest.mark.parametrize(("tables", "path"), at_each(lambda _, value: isinstance(value, int | float)))
 each_key = pytest.mark.parametrize(("tables", "path"), at_each(lambda path, _: isinstance(path[-1], str)))
 each_list = pytest.mark.parametrize(
-    ("tables", "path"), at_each(lambda path, _: path[-1] == 0 and not {"inertia", "free"} & set(path))
+    ("tables", "path"), at_each(lambda path, _: path[-1] == 0 and not {"inertia", "true_inertia", "free"} & set(path))
 )
 
 
@@ -218,6 +240,12 @@ def test_tables_of_these_tests_name_every_key_there_is():
         visit(schema.parse(tables, CATALOGUES), tables)
     named.pop(Attitude)  # bases of others
     named.pop(Actuators)
+    named.pop(WheelLimits)
+    named.pop(SumDisturbance)  # of tables that are looked at like any other
+    named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
+    for wheels in (PyramidWheels, AxesWheels):
+        named[wheels] |= {"momentum", "torque_limit", "momentum_limit"}
+    named[GravityGradient] |= set(Attitude.__struct_fields__)  # as in [initial]
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
 
 

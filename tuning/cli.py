@@ -240,7 +240,7 @@ def _show_run(run: Any, folder: Path) -> None:
     console = Console(highlight=False)
     table = Table("metric", "value", "unit", "meaning", box=None, pad_edge=False)
     for name, (unit, meaning) in run.catalogue.items():
-        value, none = run.metrics[name], "never" if run.status == "ok" else "-"
+        value, none = run.metrics[name], "never" if run.status in ("ok", "missed") else "-"
         table.add_row(name, none if value != value else f"{value:.5g}", unit, meaning)
     what = f", {run.reason}, at {run.bad_time:.4g} s" if run.reason else ""
     console.print(f"status: {run.status}{what}", soft_wrap=True)
@@ -279,7 +279,7 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     for label, metric, statistic in rows:
         cells = (group[metric][statistic] if group[metric] else None for group in groups.values())
         table.add_row(label, *("-" if cell is None else f"{cell:.4g}" for cell in cells), CATALOGUES[kind][metric][0])
-    table.add_row("failed trials", *(str(trials - group["counts"]["ok"]) for group in groups.values()), "")
+    table.add_row("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), "")
     console.print(f"tuning {how}; judged on {trials} fresh trials, flight clock, exact sign:", soft_wrap=True)
     console.print(table)
     if summary["accuracy_gain_over_paper"] is not None:

@@ -62,7 +62,7 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
     def simulated(t_f: float) -> float:
         parts = _at(roomy.parts, t_f)
         result = montecarlo.run(parts, ready.dispersion, seed, trials)
-        peaks = np.where(result.ok, result.metrics.peak_torque, np.inf)
+        peaks = np.where(result.finished, result.metrics.peak_torque, np.inf)
         return float(peaks.max())
 
     found = _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)

@@ -39,7 +39,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 
     def fly(trial: Array) -> tuple[Array, Array]:
         metrics, status, _, _ = montecarlo.one(parts, problem.dispersion, problem.seed, trial)
-        ok = status == rollout.OK
+        ok = (status == rollout.OK) | (status == rollout.MISSED)
         error = jnp.where(ok, metrics.window_error, FAILED)
         over = [
             jnp.where(ok, getattr(metrics, name) / limit, FAILED) - 1.0

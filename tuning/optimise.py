@@ -119,7 +119,7 @@ def _screen(problem: Problem, requirements, gains: np.ndarray) -> tuple[np.ndarr
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
     flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
-    ratios = [np.where(flown.ok, getattr(flown.metrics, r.metric) / r.limit, np.inf) for r in requirements]
+    ratios = [np.where(flown.finished, getattr(flown.metrics, r.metric) / r.limit, np.inf) for r in requirements]
     return trials, np.max(ratios, axis=0)
 
 

@@ -78,11 +78,13 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
         candidates["before"] = scenario
     fresh, judged_gains = {}, {}
     for name, candidate in candidates.items():
-        judged = study(as_flown(candidate))
-        trials = np.arange(_trials(judged, FRESH))
-        fresh[name] = montecarlo.run(judged.parts, judged.dispersion, fresh_seed, trials)
+        flown = study(as_flown(candidate))
+        trials = np.arange(_trials(flown, FRESH))
+        fresh[name] = montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
         judged_gains[name] = gain_bounds.gains_of(study(candidate).parts)
-    verdicts = [r.verdict(getattr(fresh["tuned"].metrics, r.metric), fresh["tuned"].ok) for r in ready.requirements]
+    verdicts = [
+        r.verdict(getattr(fresh["tuned"].metrics, r.metric), fresh["tuned"].finished) for r in ready.requirements
+    ]
     at_bound = limits.at_bound(found.gains)
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None if limit is None else shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
@@ -121,7 +123,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
     summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
     for name in metrics.CATALOGUES[kind]:
-        values = getattr(trials.metrics, name)[trials.ok]
+        values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
         if known.size == 0:
             summary[name] = None
@@ -199,7 +201,7 @@ def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         ),
         "tradeoff": plotting.tradeoff(
             {
-                name: (trials.metrics.window_error[trials.ok], trials.metrics.peak_torque[trials.ok])
+                name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
                 for name, trials in tuning.fresh.items()
             },
             limit,

@@ -1,0 +1,152 @@
+"""The parts of a checked scenario: plant, law, observer, disturbance, sensors, actuators, dispersion."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import checks, controllers, dispersions, hardware, observers, plants, signals
+from ptsmc_jax import sensors as sensing
+from ptsmc_jax import tables as t
+from ptsmc_jax.tables import Scenario
+
+
+def vector(values: Any) -> Any:
+    """Numbers of a scenario as a leaf of the parts."""
+    return jnp.asarray(np.asarray(values, dtype=float))
+
+
+def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
+    table = scenario.controller
+    return (
+        vector(table.t_f),
+        vector(table.eta),
+        vector(table.delta),
+        vector(table.k1),
+        vector(table.sign_width),
+    )
+
+
+def spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
+    """Nominal plant, law, initial state and reference of a spacecraft."""
+    assert scenario.spacecraft is not None
+    assert scenario.initial is not None
+    assert scenario.reference is not None
+    model = plants.spacecraft(scenario.spacecraft.inertia)
+    q = jnp.asarray(checks.quaternion(scenario.initial, "initial"))
+    initial = plants.AttitudeState(q, vector(scenario.initial.rate))
+    q_f = jnp.asarray(checks.quaternion(scenario.reference, "reference"))
+    reference: Any = signals.Fixed(q_f)
+    if isinstance(scenario.reference, t.SpinReference):
+        reference = signals.Spin(q_f, vector(scenario.reference.rate))
+    return model, controllers.PrescribedTime(model, *_gains(scenario)), initial, reference
+
+
+def chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
+    """Nominal plant, law, initial state and reference of an integrator chain."""
+    assert isinstance(scenario.plant, t.ChainPlant)
+    assert isinstance(scenario.controller, t.ChainController)
+    model = plants.chain(scenario.plant.order)
+    controller = controllers.PrescribedTimeChain(model, *_gains(scenario), vector(scenario.controller.a))
+    return model, controller, vector(scenario.plant.x0), signals.Origin()
+
+
+def observer(scenario: Scenario, model: plants.Plant) -> Any:
+    """The observer; its model is the nominal plant."""
+    table = scenario.controller
+    if isinstance(scenario.observer, t.NoObserver):
+        return observers.NoObserver(model, vector(table.disturbance_bound))
+    bounds = (vector(table.disturbance_rate_bound), vector(table.initial_estimate_error))
+    return observers.NonlinearObserver(model, vector(scenario.observer.gain), *bounds)
+
+
+def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
+    """The disturbance as a function of time and state, and the rate of its random walk (None: none)."""
+    signal, walk = [], None
+    for table in checks.terms(scenario):
+        if isinstance(table, t.RandomWalk | t.ChainRandomWalk):
+            step = vector(table.density) / np.sqrt(scenario.loop.period)
+            walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # independent walks add up to one
+        elif isinstance(table, t.ConstantDisturbance | t.ChainConstantDisturbance):
+            signal.append(signals.Constant(vector(table.amplitude)))
+        elif isinstance(table, t.SinusoidDisturbance | t.ChainSinusoidDisturbance):
+            values = (table.amplitude, table.frequency, table.phase, table.bias)
+            signal.append(signals.Sinusoid(*(vector(v) for v in values)))
+        elif isinstance(table, t.GravityGradient):
+            assert scenario.spacecraft is not None
+            turned = checks.has_attitude(table)
+            orbit = checks.quaternion(table, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
+            values = (orbit, table.orbit_rate, table.phase)
+            signal.append(signals.GravityGradient(true_body(scenario).inertia, *(vector(v) for v in values)))
+    if len(signal) > 1:
+        return signals.Sum(tuple(signal)), walk
+    return (signal[0] if signal else signals.Constant(jnp.zeros(inputs))), walk
+
+
+def true_body(scenario: Scenario) -> plants.Spacecraft:
+    """The spacecraft as it is: its true inertia where the scenario gives one."""
+    assert scenario.spacecraft is not None
+    table = scenario.spacecraft
+    return plants.spacecraft(table.inertia if table.true_inertia is None else table.true_inertia)
+
+
+def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
+    """Star tracker, gyro and filter, or a chain's sensor; None where the law sees the true state."""
+    table, period = scenario.hardware, scenario.loop.period
+    if isinstance(table, t.ChainHardware):
+        return None if table.state_noise is None else sensing.StateSensor(vector(table.state_noise))
+    filtered = isinstance(scenario.filter, t.SteadyStateFilter)
+    table = table or t.Hardware()
+    noises = (table.attitude_noise, table.rate_noise, table.rate_noise_density, table.rate_bias, table.rate_bias_walk)
+    if not filtered and all(noise is None for noise in noises):
+        return None
+    star, every = table.attitude_noise or 0.0, table.star_tracker_every or 1
+    gyro = table.rate_noise or sensing.per_sample(table.rate_noise_density or 0.0, period)
+    walk = table.rate_bias_walk
+    estimator = None
+    if isinstance(scenario.filter, t.SteadyStateFilter):
+        bandwidth = scenario.filter.bandwidth or sensing.best_bandwidth(star, gyro, period, period * every)
+        estimator = sensing.attitude_filter(bandwidth, star, gyro, walk or 0.0, period, every)
+    return sensing.Sensors(
+        vector(star),
+        vector(gyro),
+        None if table.rate_bias is None else vector(table.rate_bias),
+        None if walk is None else vector(sensing.per_sample(walk, period)),
+        estimator,
+        every,
+    )
+
+
+def actuators(scenario: Scenario) -> hardware.Actuators | None:
+    """Limits, lag, delay and wheels; None where the torque is the commanded one."""
+    table, device = scenario.hardware, scenario.wheels
+    values = [getattr(table, key, None) for key in ("torque_limit", "torque_rate_limit", "torque_lag", "torque_step")]
+    delay = getattr(table, "delay", None) or 0
+    if device is None and delay == 0 and all(value is None for value in values):
+        return None
+    wheels = None
+    if device is not None:
+        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if isinstance(device, t.PyramidWheels) else device.axes
+        wheels = hardware.wheels(axes, device.momentum, device.torque_limit, device.momentum_limit)
+    limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
+    return hardware.Actuators(limit, rate_limit, lag, step, wheels, delay)
+
+
+def dispersion(scenario: Scenario) -> dispersions.Dispersion:
+    """What is drawn for each trial."""
+    table = scenario.dispersion
+    if isinstance(table, t.ChainDispersion):
+        if isinstance(table.x0, t.UniformState):
+            return dispersions.Dispersion(state=dispersions.UniformState(vector(table.x0.half_width)))
+        if isinstance(table.x0, t.NormalState):
+            return dispersions.Dispersion(state=dispersions.NormalState(vector(table.x0.std)))
+        return dispersions.Dispersion()
+    attitude = table.attitude if table is not None else None
+    if isinstance(attitude, t.UniformAttitude):
+        return dispersions.Dispersion(dispersions.UniformAttitude())
+    if isinstance(attitude, t.NormalAttitude):
+        return dispersions.Dispersion(dispersions.NormalAttitude(vector(np.deg2rad(attitude.std_deg))))
+    if isinstance(attitude, t.AxisAngle):
+        angles = (vector(np.deg2rad(a)) for a in (attitude.min_deg, attitude.max_deg))
+        return dispersions.Dispersion(dispersions.AxisAngle(*angles))
+    return dispersions.Dispersion()

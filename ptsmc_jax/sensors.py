@@ -1,0 +1,224 @@
+"""What the law sees: star tracker and gyro, raw or through a gyro-propagated attitude filter; a chain's states.
+
+A sensor has a memory (noise of the sample, bias, estimate) that the rollout carries; its noise belongs to (seed,
+trial, sample). In the partial first period of the anchored clock everything a sample does is weighted by the period's
+share, so that nothing jumps where that period vanishes.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ptsmc_jax import attitude, draws, numerics
+from ptsmc_jax.clock import Ticks
+from ptsmc_jax.draws import Whole
+from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.plants import AttitudeState
+
+Scalar = Float[Array, ""]
+ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
+RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
+
+
+def per_sample(density: float, period: float) -> float:
+    """1 sigma of samples of white noise, each an average over a period [s]: density / sqrt(period).
+
+    density: of a rate in rad/s/sqrt(Hz), which is rad/sqrt(s), a gyro's angle random walk (IEEE Std 952).
+    """
+    return density / np.sqrt(period)
+
+
+class Sensor(Protocol):
+    """What the rollout asks of a sensor."""
+
+    def begin(self, seed: Whole, trial: Whole, x0: Any, sample: Array) -> Any:
+        """Memory before the first sample."""
+        ...
+
+    def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
+        """The state as the law sees it, and the memory; dt: length of the period just ended [s]."""
+        ...
+
+
+class Estimate(NamedTuple):
+    """State of the attitude filter."""
+
+    q: Array  # (4,)
+    bias: Array  # (3,) of the gyro [rad/s]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AttitudeFilter:
+    """Steady-state multiplicative filter: propagated by the gyro, corrected by star tracker samples.
+
+    The error is a rotation (Lefferts, Markley, Shuster, JGCD 5(5), 1982) and the gains are constant, as in Farrenkopf's
+    steady state (J. Guidance and Control 1(4), 1978); build it with `attitude_filter`, which chooses them by bandwidth.
+    """
+
+    attitude_gain: Leaf  # share of a star tracker residual that corrects the attitude [-]
+    bias_gain: Leaf  # of it, per second, that corrects the bias [1/s]
+    attitude_error: Leaf  # 1 sigma per axis of the estimate at t = 0 [rad]
+    bias_error: Leaf  # [rad/s]
+
+    def begin(self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"]) -> Estimate:
+        """An estimate whose errors are those of the steady state: the filter has run before the slew."""
+        turned = attitude.multiply(q, attitude.from_rotation_vector(self.attitude_error * normals[:3]))
+        return Estimate(turned, bias + self.bias_error * normals[3:])
+
+    def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
+        """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
+        a, b = w - old.bias, w_next - old.bias
+        turn = dt / 2 * (a + b) + dt * dt / 12 * jnp.cross(a, b)
+        return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
+
+    def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:
+        """The estimate after a star tracker sample that counts with this weight (0: none)."""
+        off = attitude.multiply(attitude.conjugate(old.q), measured)
+        residual = jnp.where(off[3] < 0.0, -2.0, 2.0) * off[:3]
+        turn = self.attitude_gain * weight * residual
+        q = attitude.normalise(attitude.multiply(old.q, attitude.from_rotation_vector(turn)))
+        return Estimate(q, old.bias - self.bias_gain * weight * residual)
+
+
+def filter_gains(bandwidth: Any, interval: float) -> tuple[Any, Any]:
+    """Gains (attitude [-], bias [1/s]) that put both poles of the estimation error at e^(-bandwidth interval).
+
+    bandwidth [rad/s]; interval between star tracker samples [s]. With p that pole: 1 - p^2 and (1 - p)^2 / interval.
+    """
+    pole = jnp.exp(-bandwidth * interval)
+    return 1.0 - pole**2, (1.0 - pole) ** 2 / interval
+
+
+def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, interval: float) -> float:
+    """Bandwidth [rad/s] at which star tracker and gyro noise weigh the same: sigma_v / (sigma_n sqrt(interval)).
+
+    attitude_noise: 1 sigma a sample [rad]; rate_noise: 1 sigma a control period [rad/s]; sigma_v = rate_noise
+    sqrt(period) is the gyro's angle random walk.
+    """
+    return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))
+
+
+def attitude_filter(
+    bandwidth: float, attitude_noise: float, rate_noise: float, bias_walk: float, period: float, every: int
+) -> AttitudeFilter:
+    """Filter of this bandwidth [rad/s], its errors at t = 0 those of its steady state under these noises.
+
+    attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk [rad/s/sqrt(s)];
+    every: control periods between star tracker samples.
+    """
+    interval = period * every
+    k1, k2 = (float(v) for v in filter_gains(bandwidth, interval))
+    # errors (attitude, bias) from one correction to the next: e+ = K F e + K g + (k1, -k2) noise
+    step = np.array([[1.0, -interval], [0.0, 1.0]])
+    keep = np.array([[1.0 - k1, 0.0], [k2, 1.0]])
+    walk = interval * bias_walk**2
+    gyro = np.array([[rate_noise**2 * period * interval + walk * interval**2 / 3, -walk * interval / 2],
+                     [-walk * interval / 2, walk]])  # fmt: skip
+    star = np.outer([k1, -k2], [k1, -k2]) * attitude_noise**2
+    move, drive = keep @ step, keep @ gyro @ keep.T + star
+    spread = np.linalg.solve(np.eye(4) - np.kron(move, move), drive.reshape(4)).reshape(2, 2)
+    sizes = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    return AttitudeFilter(*(jnp.asarray(float(v)) for v in (k1, k2, *sizes)))
+
+
+class Memory(NamedTuple):
+    """What `Sensors` carries from sample to sample."""
+
+    keys: tuple
+    noise: tuple[Array, Array]  # of the sample to come
+    bias: Any  # (3,) of the gyro [rad/s]; None without one
+    estimate: Any  # Estimate; None without a filter
+    rate: Any  # (3,) as last measured [rad/s]; None without a filter
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sensors:
+    """Star tracker and gyro sampled once a period, white noise, independent per axis and sample.
+
+    Without a filter the law sees the samples themselves; with one, its attitude and the gyro's rate less its bias.
+    """
+
+    attitude_noise: Leaf  # 1 sigma of the small rotation about each body axis [rad]
+    rate_noise: Leaf  # 1 sigma [rad/s]
+    rate_bias: Leaf | None = None  # 1 sigma, constant over a run [rad/s]
+    bias_rate: Leaf | None = None  # 1 sigma of the bias's change per second of a period: walk / sqrt(period) [rad/s^2]
+    filter: AttitudeFilter | None = None
+    every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
+
+    def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key, draws.Key]:
+        """Streams of a trial's noise: attitude, rate, change of the bias."""
+        return (
+            draws.stream(seed, trial, ATTITUDE_NOISE),
+            draws.stream(seed, trial, RATE_NOISE),
+            draws.stream(seed, trial, BIAS_WALK),
+        )
+
+    def noise(self, keys: tuple, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""
+        return (
+            self.attitude_noise * draws.normals(keys[0], 3, sample),
+            self.rate_noise * draws.normals(keys[1], 3, sample),
+        )
+
+    def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, sample: Int[Array, ""]) -> Memory:
+        """Memory before the first sample."""
+        keys, bias, estimate = self.keys(seed, trial), None, None
+        if self.rate_bias is not None or self.bias_rate is not None:
+            bias = jnp.zeros(3)
+            if self.rate_bias is not None:
+                bias = self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+        if self.filter is not None:
+            normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
+            estimate = self.filter.begin(x0.q, jnp.zeros(3) if bias is None else bias, normals)
+        return Memory(keys, self.noise(keys, sample), bias, estimate, None if estimate is None else x0.w)
+
+    def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
+        noise_next = self.noise(memory.keys, now.sample + 1)
+        turn, shift = numerics.lerp(now.noise_weight, memory.noise, noise_next)
+        bias, estimate = memory.bias, memory.estimate
+        if self.bias_rate is not None:
+            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
+        w = jnp.add(x.w, shift)
+        if bias is not None:
+            w = w + bias
+        q = attitude.multiply(x.q, attitude.from_rotation_vector(turn))
+        if self.filter is None:
+            return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
+        weight = jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+        estimate = self.filter.correct(self.filter.propagate(estimate, memory.rate, w, dt), q, weight)
+        seen = AttitudeState(estimate.q, w - estimate.bias)
+        return seen, Memory(memory.keys, noise_next, bias, estimate, w)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StateSensor:
+    """All states of a chain sampled once a period, white noise, independent per state and sample."""
+
+    sigma: Leaf  # (n,) 1 sigma of each state
+
+    def key(self, seed: Whole, trial: Whole) -> draws.Key:
+        """Stream of a trial's noise."""
+        return draws.stream(seed, trial, STATE_NOISE)
+
+    def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " n"]:
+        """Noise of one sample, (n,)."""
+        return self.sigma * draws.normals(key, self.sigma.shape[-1], sample)
+
+    def begin(self, seed: Whole, trial: Whole, x0: Float[Array, " n"], sample: Int[Array, ""]) -> tuple:
+        """Memory before the first sample."""
+        key = self.key(seed, trial)
+        return key, self.noise(key, sample)
+
+    def measure(self, memory: tuple, x: Float[Array, " n"], now: Ticks, dt: Scalar) -> tuple[Float[Array, " n"], tuple]:
+        """The states as measured, and the memory."""
+        key, noise = memory
+        noise_next = self.noise(key, now.sample + 1)
+        return x + numerics.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
