@@ -5,6 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import matplotlib.colors
+import matplotlib.lines
+import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -233,6 +236,74 @@ def tradeoff(sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | Non
     axes.set_xlabel("window error [-]")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14))
     return figure
+
+
+def accuracy_map(
+    x: tuple[str, Sequence[float], bool],
+    y: tuple[str, Sequence[float], bool],
+    grids: Mapping[str, np.ndarray],
+    lost: np.ndarray,
+    borders: Mapping[str, tuple[np.ndarray, np.ndarray]],
+) -> Figure:
+    """Window error as flown and by linear theory, and peak torques, over two keys.
+
+    x, y: key, values, whether on a log scale; grids: name -> (y, x); lost: (y, x) bool, a trial failed or missed t_f.
+    """
+    titles = {
+        "window_error": "RMS window error",
+        "linear_window_error": "its share from noise, linear theory",
+        "peak_torque": "mean peak torque",
+        "largest_peak_torque": "largest peak torque",
+    }
+    drawn = [name for name in titles if np.any(np.isfinite(grids[name]))]
+    with matplotlib.rc_context(_RC):
+        rows = (len(drawn) + 1) // 2
+        figure = Figure(figsize=(10.0, 4.2 * rows), layout="constrained")
+        many = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
+        errors = np.concatenate([grids[name].ravel() for name in drawn if "error" in name])
+        torques = np.concatenate([grids[name].ravel() for name in drawn if "torque" in name])
+        for axes, name in zip(many, drawn, strict=False):
+            seen = errors if "error" in name else torques
+            seen = seen[np.isfinite(seen) & (seen > 0)]
+            low, high = seen.min(), min(seen.max(), seen.min() * 1e4)
+            norm = matplotlib.colors.LogNorm(low, max(high, 1.01 * low))
+            if x[2]:
+                axes.set_xscale("log")
+                _plain_ticks(axes.xaxis)
+            if y[2]:
+                axes.set_yscale("log")
+                _plain_ticks(axes.yaxis)
+            shown = np.ma.masked_invalid(grids[name])
+            mesh = axes.pcolormesh(x[1], y[1], shown, norm=norm, cmap="cividis", shading="nearest")
+            figure.colorbar(mesh, ax=axes, extend="max" if seen.max() > high else "neither")
+            column, row = np.meshgrid(x[1], y[1])
+            axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
+            limits = axes.get_xlim(), axes.get_ylim()
+            for (label, line), style in zip(borders.items(), ("-", "--", ":"), strict=False):
+                axes.plot(*line, color="white", lw=3.0, ls=style)
+                axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
+            axes.set(xlim=limits[0], ylim=limits[1], title=titles[name])
+            axes.grid(visible=False)
+        for axes in many[len(drawn) :]:
+            axes.remove()
+        for axes in many[: len(drawn)]:
+            axes.label_outer()
+        figure.supxlabel(x[0])
+        figure.supylabel(y[0])
+        handles, labels = many[0].get_legend_handles_labels()
+        if np.any(lost):
+            handles.append(matplotlib.lines.Line2D([], [], color="0.4", marker="x", ls=""))
+            labels.append("a trial failed or missed t_f")
+        if handles:
+            figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
+    return figure
+
+
+def _plain_ticks(line: Any) -> None:
+    """Numbers such as 0.05 on a log axis."""
+    line.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    line.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
 def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:

@@ -219,8 +219,8 @@ WHOLE = "a whole number from 0 to 4294967295"
         (("tune", "--trial", "1"), ("--trial",)),
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("t.toml",)),
-        (("simulat",), ("simulat", "simulate, reproduce, tune")),
-        (("montecarlo", "s.toml"), ("montecarlo", "simulate, reproduce, tune")),
+        (("simulat",), ("simulat", "simulate, reproduce, map, tune")),
+        (("montecarlo", "s.toml"), ("montecarlo", "simulate, reproduce, map, tune")),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),
@@ -456,3 +456,18 @@ def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_le
     assert status == 2
     assert "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]" in err
     assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # drawn instead
+
+
+def test_map_leaves_what_the_contract_says(command, tmp_path):
+    pairs = ("--x", "loop.period=0.05:0.1:2", "--y", "controller.delta=0.2:0.8:2")
+    status, out, _ = command("map", "s.toml", *pairs, "--trials", 2)
+    assert status == 0
+    assert "4 of 4 pairs flown" in out
+    assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
+    for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.delta=0.2:0.8:2"),
+                ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
+        status, out, err = command("map", "s.toml", *pairs, "--out", "bad", *bad)
+        assert (status, out) == (2, "")
+        assert err.startswith("ptsmc: ")
+        assert "Traceback" not in err
+    assert not (tmp_path / "bad").exists()

@@ -26,7 +26,7 @@ FLOORS = {
         metrics
         rollout
         lanes
-        theory
+        theory linear
         requirements
         dispersions
         tables
@@ -45,7 +45,7 @@ FLOORS = {
         bounds design
         objective
         optimise
-        report single reproduction
+        report single reproduction mapping
         cli table
     """,
 }

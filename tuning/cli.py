@@ -92,6 +92,47 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     return 0 if reproduction.summary(made)["status"] == "ok" else 1
 
 
+@app.command(name="map")
+def map_(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
+    y: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "controller.delta=0.05:5:9",
+    trials: Annotated[str, Parameter(help="Trials of each pair, a whole number from 1 to 1000000.")] = "32",
+    out: Out = None,
+    seed: Seed = "0",
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly the scenario over two of its keys: window error and peak torque, with the borders of linear theory.
+
+    Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
+    """
+    key, count = _whole("--seed", seed), _whole("--trials", trials)
+    if not 1 <= count <= 1_000_000:
+        raise UsageError(f"--trials is {trials}, but must be a whole number from 1 to 1000000")
+    loaded, folder = _prepare(scenario, "map", out)
+    from ptsmc_jax import store
+
+    store.check(folder, force)
+    from tuning import mapping
+
+    try:
+        across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
+    except mapping.AxisError as error:
+        raise UsageError(str(error)) from None
+    if across.key == up.key:
+        raise UsageError(f"--y is {y}, but must be another key than --x")
+    with _Progress(quiet) as told:
+        cells = mapping.fly(loaded, across, up, key, count, lambda done, total: told(done, total, float("nan"), True))
+    store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, key, figures))
+    if not quiet:
+        _show_map(cells, folder)
+    return 0
+
+
 @app.command
 def tune(
     scenario: ScenarioFile = None,
@@ -209,7 +250,8 @@ class _Progress:
 
     def _tell(self, done: int, total: int, rms: float, admissible: bool) -> None:
         met = "limits met" if admissible else "limits not yet met"
-        self._bar.update(self._task, completed=done, total=total, description=f"RMS error {rms:.3e}, {met}")
+        best = f"RMS error {rms:.3e}, {met}" if rms == rms else "flying"
+        self._bar.update(self._task, completed=done, total=total, description=best)
 
 
 def _show_reproduction(made: Any, folder: Path) -> None:
@@ -231,6 +273,17 @@ def _show_reproduction(made: Any, folder: Path) -> None:
     console.print(table)
     console.print("why, and the slips as printed: claims.md", soft_wrap=True)
     console.print(f"results in {folder}", soft_wrap=True)
+
+
+def _show_map(cells: list[Any], folder: Path) -> None:
+    flown = [cell for cell in cells if cell.status == "flown"]
+    print(f"{len(flown)} of {len(cells)} pairs flown, {sum(cell.failures > 0 for cell in flown)} with failed trials")
+    known = [cell for cell in flown if cell.window_error == cell.window_error]
+    if known:
+        best = min(known, key=lambda cell: cell.window_error)
+        where = f"{best.x:.4g} (across) and {best.y:.4g} (up)"
+        print(f"smallest RMS window error {best.window_error:.3g} at {where}, mean peak {best.peak_torque:.3g}")
+    print(f"results in {folder}")
 
 
 def _show_run(run: Any, folder: Path) -> None:

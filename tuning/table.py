@@ -1,4 +1,4 @@
-"""What sampling and noise do to fixed gains: `python -m tuning.table` prints it for 1 000 attitudes."""
+"""What sampling, noise and an attitude filter do to fixed gains, over 1 000 attitudes: `python -m tuning.table`."""
 
 import numpy as np
 from rich.console import Console
@@ -12,7 +12,7 @@ TRIALS = 1000
 
 
 def main() -> None:
-    """Fly every row without and with noise; attitudes, noise and loop as in scenarios/first_flight.toml."""
+    """Fly every row without noise, with noise, and with noise through the filter; else scenarios/first_flight.toml."""
     configure()
     from ptsmc_jax import montecarlo, scenario
     from tuning.report import with_gains
@@ -26,18 +26,20 @@ def main() -> None:
         }
     )
     quiet = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})
-    columns = ("eta", "delta [s]", "l [N m s]", "RMS, quiet", "RMS, noisy", "mean peak, quiet [N m]", "noisy [N m]")
+    filtered = scenario.replace(base, filter={"kind": "steady_state"})
+    gains, peaks = ("eta", "delta [s]", "l [N m s]"), ("mean peak, quiet [N m]", "noisy [N m]", "filtered [N m]")
+    columns = (*gains, "RMS, quiet", "RMS, noisy", "RMS, filtered", *peaks)
     table = Table(*columns, box=None, pad_edge=False)
     for eta, delta, gain in GAINS:
         rms, peak = [], []
-        for case in (quiet, base):
+        for case in (quiet, base, filtered):
             ready = scenario.study(with_gains(case, {"eta": eta, "delta": delta, "observer_gain": gain}))
             trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(TRIALS))
             assert np.all(trials.ok)
             rms.append(float(np.sqrt(np.mean(trials.metrics.window_error**2))))
             peak.append(float(np.mean(trials.metrics.peak_torque)))
         table.add_row(*(f"{v:g}" for v in (eta, delta, gain)), *(f"{v:.1e}" for v in rms), *(f"{v:.2f}" for v in peak))
-    console = Console(highlight=False, width=110)
+    console = Console(highlight=False, width=130)
     console.print(f"window error and peak torque over {TRIALS} trials, flight clock, t_f = 35 s, period 0.05 s")
     console.print(table)
 

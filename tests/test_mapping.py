@@ -1,0 +1,100 @@
+"""`ptsmc map`: axes, cells, borders."""
+
+import csv
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import montecarlo, scenario
+from ptsmc_jax.schema import ScenarioError
+from tuning import mapping
+
+SHORT = """
+loop = { mode = "sampled", period = 0.1, t_end = 7.0, clock = "flight" }
+controller = { t_f = 5.0, delta = 0.5 }
+hardware = { attitude_noise = 2e-5, rate_noise = 1e-6 }
+dispersion.attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 60.0 }
+"""
+
+
+def flown(x, y, text=SHORT, trials=6):
+    loaded = scenario.from_tables(tomllib.loads(text))
+    across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
+    return loaded, across, up, mapping.fly(loaded, across, up, 3, trials, lambda done, total: None)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("loop.period=0.1:0.4:3", [0.1, 0.25, 0.4]),
+        ("controller.delta=0.05:5:3", [0.05, 0.5, 5.0]),
+        ("hardware.delay=0:2:5", [0.0, 1.0, 2.0]),
+    ],
+)
+def test_axes(text, values):
+    np.testing.assert_allclose(mapping.axis(text, "--x").values, values)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "delta=1:2:3", "controller.delta", "controller.delta=1:2", "controller.delta=2:1:3", "a.b=1:2:1",
+             "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:1000", "a.b.c=1:2:3"]
+)  # fmt: skip
+def test_bad_axes_are_refused_in_a_sentence(text):
+    with pytest.raises(mapping.AxisError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
+        mapping.axis(text, "--y")
+
+
+def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives():
+    loaded, x, y, cells = flown("loop.period=0.05:0.2:3", "controller.delta=0.1:0.9:3")
+    assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
+    refused = [c for c in cells if c.status != "flown"]
+    assert [(c.x, c.y) for c in refused] == [(0.125, 0.1), (0.2, 0.1)]  # below one period
+    assert all("at least one control period" in c.status for c in refused)
+    for cell in cells:
+        if (cell.x, cell.y) in ((0.05, 0.9), (0.2, 0.5)):  # every one compiles a program of its own
+            alone = scenario.study(scenario.replace(loaded, loop__period=cell.x, controller__delta=cell.y))
+            trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
+            np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
+            np.testing.assert_allclose(cell.largest_peak_torque, trials.metrics.peak_torque.max(), rtol=1e-9)
+        if cell.status == "flown":
+            assert (cell.trials, cell.failures) == (6, 0)
+            assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
+
+
+def test_keys_of_every_kind_can_be_mapped():
+    _, _, _, cells = flown("observer.gain=5:20:2", "hardware.delay=0:1:2", trials=2)
+    assert all(c.status == "flown" for c in cells)
+    assert len({c.window_error for c in cells}) == 4
+    assert cells[2].delay_margin < cells[0].delay_margin
+    _, _, _, cells = flown("hardware.torque_lag=0.01:0.1:2", "hardware.attitude_noise=1e-6:1e-3:2", trials=2)
+    assert all(np.isfinite(c.window_error) for c in cells)
+
+
+def test_a_map_without_an_allowed_pair_is_refused():
+    with pytest.raises(ScenarioError, match=r"controller.eta is 1.0"):
+        flown("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
+
+
+def test_borders_are_drawn_over_period_and_delta_only():
+    loaded, x, y, cells = flown("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2", trials=1)
+    lines = mapping.borders(loaded, x, y)
+    delta, period = lines["$\\delta = (\\eta - 3/2) h$"]
+    np.testing.assert_allclose(delta, 1.5 * np.asarray(period))
+    assert not mapping.borders(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
+    assert cells
+
+
+def test_folder_holds_the_map(tmp_path):
+    loaded, x, y, cells = flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:2", trials=2)
+    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
+    with (tmp_path / "map.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["loop.period"]) for row in rows] == [c.x for c in cells]
+    assert rows[0]["status"] == "flown"
+    assert float(rows[0]["window_error"]) == cells[0].window_error
+    assert rows[1]["window_error"] == ""  # refused
+    assert (tmp_path / "figures" / "map.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "versions.json").read_text())["command"] == "map"
+    assert scenario.read(tmp_path / "scenario.toml") == loaded
