@@ -254,3 +254,39 @@ def test_random_walk_grows_like_the_square_root_of_time():
     # of a walk w through a first-order lag T the variance is density^2 (t - 1.5 T) for t well beyond T
     expected = density * np.sqrt(12.0 - 1.5 * lag)
     np.testing.assert_allclose(d_hat.std(axis=0), expected, rtol=4 / np.sqrt(2 * 512))
+
+
+def test_gradients_are_finite_at_the_corners():
+    """On a limit, at rest, with nothing to do: where clip, sign and the end of a ramp have no slope of their own."""
+    device = hardware.Actuators(
+        torque_limit=vector(0.3), rate_limit=vector(0.5), lag=vector(0.1), step=vector(0.1),
+        wheels=hardware.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
+    )  # fmt: skip
+
+    def outcome(u, v, h, dt):
+        state = hardware.ActuatorState(u[None], v, h)
+        drive, queue = device.command(state, u, vector([0.0] * 3), dt, vector(1.0))
+        end = device.end(drive, queue, dt)
+        return device.torque(drive, dt), device.over(drive, 0.0 * dt, dt), end.v, end.h
+
+    zero, full = vector([0.0] * 4), vector([0.5] * 4)
+    for u in (vector([0.0] * 3), vector([0.3, -0.3, 0.3]), vector([0.05, 0.0, 0.0])):
+        for v, h in ((zero, zero), (zero, full), (vector([0.2] * 4), -full)):
+            for dt in (vector(0.0), vector(0.1)):
+                slopes = jax.jacfwd(outcome, (0, 1, 2, 3))(u, v, h, dt)
+                assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
+
+
+def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
+    device = hardware.Actuators(torque_limit=vector(0.1))
+    run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, t_end=120.0)
+    result = fly(dataclasses.replace(run, actuators=device), record=True)
+    assert result.log is not None
+    assert int(result.status) == rollout.MISSED
+    assert float(result.bad_time) == 20.0
+    metrics = result.metrics
+    assert all(np.isfinite(float(v)) for name, v in zip(metrics._fields, metrics, strict=True) if "wheel" not in name)
+    assert float(metrics.terminal_angle) > 0.1
+    assert float(metrics.settling_time) > 20.0  # the hold law brings it home, and the metrics say when
+    assert float(metrics.saturated) > 0.1
+    assert np.abs(result.log.u).max() <= 0.1

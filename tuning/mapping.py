@@ -56,6 +56,8 @@ class Cell:
     radius: float = np.nan  # of the frozen loop's poles at the hand-over
     gain_margin: float = np.nan
     delay_margin: float = np.nan  # [s]
+    hold_gain_margin: float = np.nan  # after it
+    hold_delay_margin: float = np.nan  # [s]
 
 
 def axis(text: str, option: str) -> Axis:
@@ -144,8 +146,10 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
         }
     parts = ready.parts
     if ready.scenario.loop.mode == "sampled" and not isinstance(parts.plant, Chain):
-        at = linear.margins(parts)["hand_over"]
+        found = linear.margins(parts)
+        at, hold = found["hand_over"], found["hold"]
         known |= {"radius": at.radius, "gain_margin": at.gain, "delay_margin": at.delay}
+        known |= {"hold_gain_margin": hold.gain, "hold_delay_margin": hold.delay}
         if parts.sensors is not None and parts.sensors.filter is None and at.radius < 1.0:
             expected = linear.noise(parts)
             known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
