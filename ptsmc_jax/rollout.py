@@ -165,7 +165,7 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         delivered = actuators.torque(drive, jnp.zeros_like(dt))
-        row = _row(parts, now.t, state.x, d_hat, delivered, u, s, dt > 0.0) if record else None
+        row = _row(parts, now.t, state.x, d_hat, delivered, u, s, dt > 0.0, pushed) if record else None
         x = fly(state.x, now.t, drive, pushed, dt)
         if actuators.moves:
             weights = (1 / 6, 4 / 6, 1 / 6)
@@ -186,10 +186,10 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
     flight = _Flight(sensing, x0, none, acting, None if parts.walk_rate is None else none)
     drive, _ = actuators.command(acting, none, parts.plant.velocity(x0), jnp.zeros_like(judged.t_f), judged.t_f)
     state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, drive, flight.pushed))
-    (state, _), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
+    (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
     t, x, drive, pushed = state.at_t_f
     at_t_f = _sight(parts, judged.t_f, fly(x, t, drive, pushed, judged.t_f - t))
-    return _finish(parts, judged, first, state, at_t_f, k2, rows, held=True)
+    return _finish(parts, judged, first, state, at_t_f, k2, rows, flight.pushed, held=True)
 
 
 def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
@@ -226,7 +226,7 @@ def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, see
     first = state.sight
     state = state._replace(at_t_f=(first,))
     state, rows = jax.lax.scan(step, state, (ticks, decays))
-    return _finish(parts, judged, first, state, state.at_t_f[0], k2, rows, held=False)
+    return _finish(parts, judged, first, state, state.at_t_f[0], k2, rows, None, held=False)
 
 
 def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
@@ -277,14 +277,14 @@ def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torqu
     )
 
 
-def _finish(parts: Parts, judged, first, state: _State, at_t_f, k2, rows, *, held: bool) -> Result:
+def _finish(parts: Parts, judged, first, state: _State, at_t_f, k2, rows, pushed, *, held: bool) -> Result:
     log = None
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
         u, s = parts.controller.torque(judged.t_end, hold, state.x, target, state.d_hat, k2(judged.t_end))
         u = state.u if held else u
-        last = _row(parts, judged.t_end, state.x, state.d_hat, u, u, s, jnp.asarray(True))
+        last = _row(parts, judged.t_end, state.x, state.d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     missed = (state.status == OK) & (at_t_f.angle > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
@@ -316,7 +316,7 @@ def _watch(parts: Parts, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)
 
 
-def _row(parts: Parts, t, x, d_hat, u, commanded, s, lasts) -> Log:
-    target = parts.reference(t)
+def _row(parts: Parts, t, x, d_hat, u, commanded, s, lasts, pushed=None) -> Log:
+    target, d = parts.reference(t), parts.disturbance(t, x)
     error, _ = parts.controller.errors(x, target)
-    return Log(t, x, d_hat, u, commanded, s, parts.disturbance(t, x), target, error, lasts)
+    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, lasts)
