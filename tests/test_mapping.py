@@ -77,6 +77,11 @@ def test_a_map_without_an_allowed_pair_is_refused():
         flown("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
 
 
+def test_a_period_is_mapped_in_the_sampled_loop_only():
+    with pytest.raises(ScenarioError, match=r"loop\.period needs the sampled loop"):
+        flown("loop.period=0.1:0.2:2", "controller.delta=0.2:0.3:2", "controller.t_f = 5.0")
+
+
 def test_borders_are_drawn_over_period_and_delta_only():
     loaded, x, y, cells = flown("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2", trials=1)
     lines = mapping.borders(loaded, x, y)

@@ -85,6 +85,8 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
 
     Raises ScenarioError where no pair at all is allowed.
     """
+    if PERIOD in (x.key, y.key) and scenario.loop.mode != "sampled":
+        raise ScenarioError(f'{PERIOD} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     base = changed(scenario, tune=None)  # its bounds would not fit every pair
     pairs = [(a, b) for b in y.values for a in x.values]
     ready: list[Study | str] = []
