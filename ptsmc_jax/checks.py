@@ -190,9 +190,16 @@ def _check_devices(scenario: Scenario) -> None:
     """Disturbances, sensors, filter and wheels of a spacecraft."""
     table, device, estimator = scenario.hardware, scenario.wheels, scenario.filter
     assert table is None or isinstance(table, tables.Hardware)
-    for term in terms(scenario):
-        if isinstance(term, tables.GravityGradient) and has_attitude(term):
-            quaternion(term, "disturbance")
+    for k, term in enumerate(terms(scenario)):
+        if isinstance(term, tables.GravityGradient):
+            name = (
+                f"disturbance.terms[{k}]" if isinstance(scenario.disturbance, tables.SumDisturbance) else "disturbance"
+            )
+            schema.one_attitude(name, term)
+            if has_attitude(term):
+                quaternion(term, name)
+            elif term.sequence is not None:
+                raise ScenarioError(f"{name}.sequence is {schema.show(term.sequence)}, but goes with euler_deg only")
     if table is not None:
         if table.rate_noise is not None and table.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", table.rate_noise_density, "absent where rate_noise is given")
@@ -208,13 +215,20 @@ def _check_devices(scenario: Scenario) -> None:
             "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
         )
     if device is not None:
-        axes = hardware.pyramid() if isinstance(device, tables.PyramidWheels) else np.asarray(device.axes)
+        flat = isinstance(device, tables.PyramidWheels)
+        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if flat else np.asarray(device.axes)
         try:
             hardware.wheels(axes)
         except ValueError as error:
+            if flat:
+                enough = "far enough from 0 and 90 degrees for the wheels to span all directions"
+                raise wrong("wheels.cant_deg", device.cant_deg, enough) from None
             raise ScenarioError(f"wheels.axes is {schema.show(axes.tolist())}: {error}") from None
         if device.momentum is not None and len(device.momentum) != len(axes):
             raise wrong("wheels.momentum", device.momentum, f"a list of {len(axes)} numbers, one for each wheel")
+        limit = device.momentum_limit
+        if limit is not None and any(abs(h) > limit for h in device.momentum or ()):
+            raise wrong("wheels.momentum", device.momentum, f"within wheels.momentum_limit, {limit}")
     if device is None and "peak_wheel_momentum" in scenario.requirements:
         raise ScenarioError("requirements.peak_wheel_momentum needs reaction wheels, but there is no [wheels] table")
 
@@ -238,7 +252,8 @@ def _check_loop(scenario: Scenario) -> None:
             if getattr(scenario.hardware, key) is not None:
                 raise ScenarioError(f'hardware.{key} needs the sampled loop, but loop.mode is "{loop.mode}"')
         for name in ("wheels", "filter"):
-            if getattr(scenario, name) is not None and not isinstance(scenario.filter, tables.NoFilter):
+            value = getattr(scenario, name)
+            if value is not None and not isinstance(value, tables.NoFilter):
                 raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
         if any(isinstance(term, tables.RandomWalk | tables.ChainRandomWalk) for term in terms(scenario)):
             raise ScenarioError(

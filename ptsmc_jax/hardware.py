@@ -123,13 +123,29 @@ class Actuators:
             wanted = quantise(wanted, self.step)
         cut = wanted
         if self.wheels is not None:
-            cut = _within_wheels(self.wheels, wanted, state.h, dt)
+            cut = self._within_wheels(self.wheels, wanted, state, dt)
         limited = limited | jnp.any(cut != wanted)
         if self.rate_limit is not None:
             limited = limited | jnp.any(
                 jnp.abs(cut - state.v) > self.rate_limit * (dt if self.lag is None else dt + self.lag)
             )
         return Drive(state.v, cut, state.h, limited), queue
+
+    def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
+        """Wheel torques that keep the momentum limit at the end of the period, and the torque limit in any case.
+
+        A lag is reckoned with: c (dt - a) + v a flows in the period, a = lag (1 - e^(-dt/lag)). A rate limit is not,
+        and the torque limit has the last word: beyond the momentum limit by what they take is possible.
+        """
+        if device.momentum_limit is not None:
+            assert state.h is not None
+            slow = jnp.zeros_like(dt) if self.lag is None else self.lag * -jnp.expm1(-dt / self.lag)
+            span = jnp.where(dt > slow, dt - slow, 1.0)
+            left = state.h - slow * state.v
+            v = jnp.clip(v, (left - device.momentum_limit) / span, (left + device.momentum_limit) / span)
+        if device.torque_limit is not None:
+            v = jnp.clip(v, -device.torque_limit, device.torque_limit)
+        return v
 
     def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
         """Torque of each channel s [s] into the period and its integral from the start [N m, N m s].
@@ -182,14 +198,3 @@ class Actuators:
         v, impulse = self.channels(drive, dt)
         v = jnp.where(dt > 0.0, v, drive.v)
         return ActuatorState(queue, v, None if drive.h is None else drive.h - impulse)
-
-
-def _within_wheels(device: Wheels, v: Array, h: Array | None, dt: Scalar) -> Array:
-    """Wheel torques that keep the torque limit and, to the end of the period, the momentum limit."""
-    if device.torque_limit is not None:
-        v = jnp.clip(v, -device.torque_limit, device.torque_limit)
-    if device.momentum_limit is not None:
-        assert h is not None
-        safe = jnp.where(dt > 0.0, dt, 1.0)
-        v = jnp.clip(v, (h - device.momentum_limit) / safe, (h + device.momentum_limit) / safe)
-    return v

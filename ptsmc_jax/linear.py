@@ -116,6 +116,9 @@ def margins(parts: Parts) -> dict[str, Margins]:
         kp, kd = (float(v) for v in gains(np.asarray(t_f - tau), t_f, eta, delta, k1, 0.0))
         gain = _last(lambda g, kp=kp, kd=kd: radius(g * kp, g * kd, h, late) < 1.0, 1e-6, 1e6)
         delay = _last(lambda d, kp=kp, kd=kd: radius(kp, kd, h, late + d) < 1.0, 0.0, 200.0) * h
+        if not np.isfinite(delay):  # beyond 200 periods the loop is as good as continuous: its phase margin
+            square = (kd**2 + np.sqrt(kd**4 + 4 * kp**2)) / 2
+            delay = float(np.arctan2(kd * np.sqrt(square), kp) / np.sqrt(square) - h / 2 - late * h)
         stable = radius(kp, kd, h, late)
         found[name] = Margins(kd * h, stable, gain, delay if stable < 1.0 else 0.0)
     return found

@@ -260,12 +260,12 @@ def accuracy_map(
         rows = (len(drawn) + 1) // 2
         figure = Figure(figsize=(10.0, 4.2 * rows), layout="constrained")
         many = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
-        errors = np.concatenate([grids[name].ravel() for name in drawn if "error" in name])
-        torques = np.concatenate([grids[name].ravel() for name in drawn if "torque" in name])
+        errors = np.concatenate([[], *(grids[name].ravel() for name in drawn if "error" in name)])
+        torques = np.concatenate([[], *(grids[name].ravel() for name in drawn if "torque" in name)])
         for axes, name in zip(many, drawn, strict=False):
             seen = errors if "error" in name else torques
             seen = seen[np.isfinite(seen) & (seen > 0)]
-            low, high = seen.min(), min(seen.max(), seen.min() * 1e4)
+            low, high = (seen.min(), min(seen.max(), seen.min() * 1e4)) if seen.size else (1e-12, 1.0)
             norm = matplotlib.colors.LogNorm(low, max(high, 1.01 * low))
             if x[2]:
                 axes.set_xscale("log")
@@ -275,7 +275,7 @@ def accuracy_map(
                 _plain_ticks(axes.yaxis)
             shown = np.ma.masked_invalid(grids[name])
             mesh = axes.pcolormesh(x[1], y[1], shown, norm=norm, cmap="cividis", shading="nearest")
-            figure.colorbar(mesh, ax=axes, extend="max" if seen.max() > high else "neither")
+            figure.colorbar(mesh, ax=axes, extend="max" if seen.size and seen.max() > high else "neither")
             column, row = np.meshgrid(x[1], y[1])
             axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
             limits = axes.get_xlim(), axes.get_ylim()

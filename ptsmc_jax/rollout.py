@@ -100,7 +100,9 @@ class _Flight(NamedTuple):
 
     sensing: Any  # memory of the sensors
     seen: Any  # state as the law saw it at the last sample
-    applied: Array  # mean torque of the last period, what the observer is told
+    applied: tuple[
+        Array, Array | None
+    ]  # mean torque of the last period and momentum of the wheels in it: what the observer is told
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
 
@@ -154,12 +156,13 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
         (now, dt_before, partial), (state, flight) = tick, carry
         dt = now.t_next - now.t
         seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
+        w = parts.plant.velocity(seen)
+        applied = _with_wheels(*flight.applied, (parts.plant.velocity(flight.seen) + w) / 2)
         d_hat = observer.update(
-            jnp.where(partial, first_matrix, matrix), state.d_hat, flight.seen, seen, flight.applied, dt_before
+            jnp.where(partial, first_matrix, matrix), state.d_hat, flight.seen, seen, applied, dt_before
         )
         d_hat = jnp.where(dt_before > 0.0, d_hat, state.d_hat)
         u, s = controller.torque(now.t, now.hold, seen, parts.reference(now.t), d_hat, k2(now.t))
-        w = parts.plant.velocity(seen)
         drive, queue = actuators.command(flight.acting, u, w, dt, now.noise_weight)
         pushed = flight.pushed
         if parts.walk_rate is not None:
@@ -176,14 +179,14 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
         span = _Torques((u,) * len(torques), torques, weights, drive.limited, acting.h)
         from_here = (now.t, state.x, drive, pushed)
         state = _advance(parts, judged, state, now, x, d_hat, span, from_here, dt / parts.substeps)
-        applied = _with_wheels(*actuators.over(drive, jnp.zeros_like(dt), dt), w)
-        return (state, _Flight(sensing, seen, applied, acting, pushed)), row
+        return (state, _Flight(sensing, seen, actuators.over(drive, jnp.zeros_like(dt), dt), acting, pushed)), row
 
     state, none = _begin(parts, judged, x0), jnp.zeros(parts.plant.inputs)
     first = state.sight
     acting = actuators.begin(parts.plant.inputs)
     sensing = None if sensors is None else sensors.begin(seed, trial, x0, ticks.sample[0])
-    flight = _Flight(sensing, x0, none, acting, None if parts.walk_rate is None else none)
+    told = (none, None if actuators.wheels is None else none)
+    flight = _Flight(sensing, x0, told, acting, None if parts.walk_rate is None else none)
     drive, _ = actuators.command(acting, none, parts.plant.velocity(x0), jnp.zeros_like(judged.t_f), judged.t_f)
     state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, drive, flight.pushed))
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))

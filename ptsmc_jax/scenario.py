@@ -32,6 +32,11 @@ class Study:
     requirements: tuple[Requirement, ...]
 
     @property
+    def drawn(self) -> bool:
+        """Whether anything differs from trial to trial."""
+        return self.dispersion.varies or self.parts.sensors is not None or self.parts.walk_rate is not None
+
+    @property
     def catalogue(self) -> dict[str, tuple[str, str]]:
         """The metrics that this plant has: name -> (unit, what it is)."""
         names = metrics.CATALOGUES[self.scenario.plant.kind]

@@ -106,7 +106,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         found["plant"] = msgspec.structs.replace(found["plant"], order=order)
     for name in ("initial", "reference"):
         if name in found:
-            _one_attitude(name, found[name])
+            one_attitude(name, found[name])
     found["requirements"] = {
         key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
     }
@@ -139,7 +139,8 @@ def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Map
     return {**fallback, **given}
 
 
-def _one_attitude(name: str, table: Any) -> None:
+def one_attitude(name: str, table: Any) -> None:
+    """Raise ScenarioError where a table gives its attitude twice."""
     said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
     if len(said) > 1:
         two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)

@@ -294,3 +294,28 @@ def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
     assert float(metrics.settling_time) > 20.0  # the hold law brings it home, and the metrics say when
     assert float(metrics.saturated) > 0.1
     assert np.abs(result.log.u).max() <= 0.1
+
+
+@pytest.mark.parametrize("lag", [None, 0.08])
+def test_momentum_limit_is_kept_and_never_at_the_cost_of_the_torque_limit(lag):
+    limits = hardware.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
+    device = hardware.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
+    run = dataclasses.replace(with_device(device), substeps=4)
+    result = fly(run, np.uint32(1), np.uint32(2), record=True)
+    assert result.log is not None
+    assert np.all(np.abs(result.log.u) <= 0.1 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
+    # with a lag the torque that is still flowing may meet the torque limit first
+    assert float(result.metrics.peak_wheel_momentum) <= 0.45 * (1 + 1e-9) + (0.0 if lag is None else 0.1 * 0.08)
+    assert int(result.status) == rollout.MISSED
+
+
+def test_observer_invents_no_disturbance_from_the_wheels():
+    """20 N m s in one wheel and no disturbance: w x A h is known at both ends of the period, like the rest."""
+    spinning = hardware.wheels(np.eye(3), [20.0, 0.0, 0.0])
+    quiet = signals.Constant(vector([0.0] * 3))
+    run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, disturbance=quiet)
+    run = dataclasses.replace(run, actuators=hardware.Actuators(wheels=spinning))
+    log = fly(run, record=True).log
+    assert log is not None
+    # the trapezium rule of w x A h over a period: h^2/12 w'' H, 0.05 rad/s^3 at the end of the slew
+    assert np.abs(log.d_hat).max() < 1e-3

@@ -72,6 +72,13 @@ def test_margins_end_where_the_loop_does():
             assert (linear.radius(kp, kd, 0.05, 1.0 + share * at.delay / 0.05) < 1.0) == (share < 1)
 
 
+def test_delay_margin_of_a_short_period_is_that_of_continuous_time():
+    found = [linear.margins(parts(20.0, 3.0, 3.0, period=h, t_end=21.0))["hold"].delay for h in (0.02, 0.01, 0.002)]
+    assert np.all(np.isfinite(found))
+    # half a period of the hold is part of the delay
+    np.testing.assert_allclose(np.array(found) + np.array([0.01, 0.005, 0.001]), found[-1] + 0.001, rtol=2e-3)
+
+
 # eta, delta, observer gain, period, delay: from the paper's side to the tuned one
 POINTS = [(3.0, 0.5, 10.0, 0.05, 0), (5.0, 0.5, 10.0, 0.05, 0), (4.0, 1.0, 40.0, 0.05, 0), (2.86, 2.06, 299.0, 0.05, 0),
           (3.0, 1.0, 10.0, 0.1, 0), (3.0, 0.8, 10.0, 0.05, 2)]  # fmt: skip

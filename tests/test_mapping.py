@@ -77,6 +77,32 @@ def test_a_map_without_an_allowed_pair_is_refused():
         flown("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
 
 
+def test_time_after_t_f_is_kept_where_t_f_is_mapped():
+    _, _, _, cells = flown("controller.t_f=4:12:2", "loop.window=0.5:3:2", trials=1)
+    assert [c.status for c in cells] == ["flown"] * 4
+
+
+def test_a_random_walk_alone_makes_trials_differ():
+    text = 'loop = { mode = "sampled", period = 0.1, clock = "flight" }\ncontroller = { t_f = 5.0, delta = 0.5 }\n'
+    _, _, _, cells = flown(
+        "controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + "disturbance.kind = 'random_walk'"
+    )
+    assert all(c.trials == 6 for c in cells)
+
+
+def test_a_map_on_which_everything_fails_is_written(tmp_path):
+    text = SHORT.replace("min_deg = 20.0, max_deg = 60.0", "min_deg = 180.0, max_deg = 180.0")
+    loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text, trials=2)
+    assert all(c.failures == 2 for c in cells)
+    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
+    assert (tmp_path / "map.csv").exists()
+    perfect = "initial.quat_xyzw = [0, 0, 0, 1]\ncontroller = { disturbance_rate_bound = 0, t_f = 5, delta = 0.5 }\n"
+    perfect += "disturbance.kind = 'none'\nloop = { mode = 'sampled', period = 0.1 }"
+    loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", perfect, trials=1)
+    assert all(c.window_error == 0.0 for c in cells)
+    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)  # nothing but zeros to colour
+
+
 def test_a_period_is_mapped_in_the_sampled_loop_only():
     with pytest.raises(ScenarioError, match=r"loop\.period needs the sampled loop"):
         flown("loop.period=0.1:0.2:2", "controller.delta=0.2:0.3:2", "controller.t_f = 5.0")
@@ -88,6 +114,8 @@ def test_borders_are_drawn_over_period_and_delta_only():
     delta, period = lines["$\\delta = (\\eta - 3/2) h$"]
     np.testing.assert_allclose(delta, 1.5 * np.asarray(period))
     assert not mapping.borders(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
+    third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
+    assert not mapping.borders(third, x, y)  # another law, another border
     assert cells
 
 

@@ -213,6 +213,28 @@ BAD = [
         "three numbers",
     ),
     ("disturbance = { kind = 'gravity_gradient', orbit_rate = 0 }", "disturbance.orbit_rate is 0", "greater than 0"),
+    (
+        "disturbance = { kind = 'gravity_gradient', mrp = [0, 0, 0], rotvec_deg = [0, 0, 0] }",
+        "keys rotvec_deg and mrp",
+        "",
+    ),
+    (
+        "disturbance = { kind = 'gravity_gradient', sequence = 'ZYX' }",
+        'disturbance.sequence is "ZYX"',
+        "euler_deg only",
+    ),
+    (
+        "disturbance = { kind = 'sum', terms = [{ kind = 'gravity_gradient', quat_xyzw = [1, 1, 0, 0] }] }",
+        "disturbance.terms[0].quat_xyzw is",
+        UNIT,
+    ),
+    (SAMPLED + "wheels.cant_deg = 1e-5", "wheels.cant_deg is 1e-05", "span all directions"),
+    (
+        SAMPLED + "wheels = { momentum_limit = 1, momentum = [2, 0, 0, 0] }",
+        "wheels.momentum is [2.0, 0.0, 0.0, 0.0]",
+        "within wheels.momentum_limit, 1",
+    ),
+    ("wheels.torque_limit = 1\nfilter.kind = 'none'", "[wheels] needs the sampled loop", 'loop.mode is "continuous"'),
     ("spacecraft.true_inertia = [1, 2, 9]", "spacecraft.true_inertia is [1", "no rigid body"),
     # out of the additive law's reach: 180 degrees from the inertial identity, and paths through there
     ("initial.quat_xyzw = [1, 0, 0, 0]", "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]", CLEAR),

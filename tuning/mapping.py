@@ -114,6 +114,11 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
         current = getattr(getattr(scenario, table, None), name, None)
         number: Any = int(value) if key in WHOLE else value
         changes[f"{table}__{name}"] = [value] * len(current) if isinstance(current, tuple) else number
+    if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
+        loop, t_f = scenario.loop, values.get("controller.t_f", scenario.controller.t_f)
+        assert loop.t_end is not None
+        after = max(loop.t_end - scenario.controller.t_f, values.get("loop.window", loop.window))
+        changes["loop__t_end"] = t_f + after
     return changed(scenario, **changes)
 
 
@@ -134,8 +139,7 @@ def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
 
 
 def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
-    drawn = ready.dispersion.varies or ready.parts.sensors is not None
-    count = trials if drawn else 1
+    count = trials if ready.drawn else 1
     flown = montecarlo.run(common(ready.parts), ready.dispersion, seed, np.arange(count))
     done, counts = flown.finished, flown.counts()
     errors, peaks = flown.metrics.window_error[done], flown.metrics.peak_torque[done]
@@ -160,7 +164,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 
 def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
-    if {x.key, y.key} != {PERIOD, DELTA}:
+    second_order = getattr(scenario.plant, "order", 2) == 2
+    if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order:
         return {}
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
@@ -188,6 +193,8 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
             name: np.array([getattr(cell, name) for cell in cells]).reshape(shape)
             for name in ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
         }
+        if not any(np.isfinite(grid).any() for grid in grids.values()):
+            return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
         lost = np.array([cell.failures + cell.missed > 0 for cell in cells]).reshape(shape)
         made = plotting.accuracy_map(
             (x.key, x.values, x.logarithmic), (y.key, y.values, y.logarithmic), grids, lost, borders(scenario, x, y)

@@ -235,7 +235,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
 
 def _trials(ready: Study, wanted: int) -> int:
     """How many trials differ at all: one where nothing is drawn."""
-    return wanted if ready.dispersion.varies or ready.parts.sensors is not None else 1
+    return wanted if ready.drawn else 1
 
 
 def _rounded(value: float) -> float:
