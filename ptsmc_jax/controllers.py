@@ -4,7 +4,7 @@ Order 2 of the chain is the second-order system (6) with (7), (9), (10) and (24)
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -49,10 +49,6 @@ class Law:
     def hand_over(self) -> Scalar:
         """t_s = t_f - delta [s]."""
         return self.t_f - self.delta
-
-    def with_gains(self, **gains: Any) -> Any:
-        """The law with other gains, by the names of its fields."""
-        return replace(self, **gains)
 
     def align(self, x: Any, target: Any) -> Any:
         """The initial state in the form that the law can bring to the target."""

@@ -126,9 +126,8 @@ class Actuators:
             cut = self._within_wheels(self.wheels, wanted, state, dt)
         limited = limited | jnp.any(cut != wanted)
         if self.rate_limit is not None:
-            limited = limited | jnp.any(
-                jnp.abs(cut - state.v) > self.rate_limit * (dt if self.lag is None else dt + self.lag)
-            )
+            reach = self.rate_limit * (dt if self.lag is None else dt + self.lag)
+            limited = limited | jnp.any(jnp.abs(cut - state.v) > reach)
         return Drive(state.v, cut, state.h, limited), queue
 
     def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
@@ -156,11 +155,8 @@ class Actuators:
         if not self.moves:
             return c, c * s
         gap = c - v
-        near, ramp, slope = (
-            gap,
-            jnp.zeros_like(gap),
-            jnp.zeros_like(gap),
-        )  # what the lag closes; how long it ramps before
+        near = gap  # what the lag closes, after a ramp of this length and slope
+        ramp, slope = jnp.zeros_like(gap), jnp.zeros_like(gap)
         if self.rate_limit is not None:
             reach = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
             near = jnp.clip(gap, -reach, reach)

@@ -13,8 +13,6 @@ import numpy as np
 
 from ptsmc_jax.rollout import Parts
 
-INDEX = "(2 eta - 1) h / tau"  # the measure of how fast the law is for the period
-
 
 def gains(
     t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import theory
+from ptsmc_jax.metrics import CATALOGUES
 from ptsmc_jax.plants import Chain
 from ptsmc_jax.rollout import Log, Parts
 
@@ -218,23 +219,26 @@ def tuning_history(
     return figure
 
 
-def tradeoff(sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | None = None) -> Figure:
-    """Accuracy against torque, a point a trial.
+def tradeoff(
+    sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | None = None, kind: str = "spacecraft"
+) -> Figure:
+    """Accuracy against torque, a point a trial, in the units of this kind of plant.
 
     sets: label -> (window errors (trials,) [-], peak torques (trials,) [N m]).
     """
-    figure, axes = _figure("Accuracy against torque, fresh trials", "peak torque [N m]")
+    error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
+    figure, axes = _figure("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
     markers = ("o", "^", "s", "D")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), _STYLES, markers, strict=False):
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
         axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
-        text = f"{label}: RMS {rms:.2e}, mean peak {mean:.3g} N m"
+        text = f"{label}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
     if limit is not None:
-        axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} N m")
-    axes.set_xlabel("window error [-]")
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14))
+        axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
+    axes.set_xlabel(f"window error [{error_unit}]")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19))
     return figure
 
 
@@ -244,16 +248,18 @@ def accuracy_map(
     grids: Mapping[str, np.ndarray],
     lost: np.ndarray,
     borders: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    kind: str = "spacecraft",
 ) -> Figure:
     """Window error as flown and by linear theory, and peak torques, over two keys.
 
     x, y: key, values, whether on a log scale; grids: name -> (y, x); lost: (y, x) bool, a trial failed or missed t_f.
     """
+    error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
     titles = {
-        "window_error": "RMS window error",
-        "linear_window_error": "its share from noise, linear theory",
-        "peak_torque": "mean peak torque",
-        "largest_peak_torque": "largest peak torque",
+        "window_error": f"RMS window error [{error_unit}]",
+        "linear_window_error": f"its share from noise, linear theory [{error_unit}]",
+        "peak_torque": f"mean peak torque [{unit}]",
+        "largest_peak_torque": f"largest peak torque [{unit}]",
     }
     drawn = [name for name in titles if np.any(np.isfinite(grids[name]))]
     with matplotlib.rc_context(_RC):
@@ -274,7 +280,7 @@ def accuracy_map(
                 axes.set_yscale("log")
                 _plain_ticks(axes.yaxis)
             shown = np.ma.masked_invalid(grids[name])
-            mesh = axes.pcolormesh(x[1], y[1], shown, norm=norm, cmap="cividis", shading="nearest")
+            mesh = axes.pcolormesh(_edges(*x[1:]), _edges(*y[1:]), shown, norm=norm, cmap="cividis")
             figure.colorbar(mesh, ax=axes, extend="max" if seen.size and seen.max() > high else "neither")
             column, row = np.meshgrid(x[1], y[1])
             axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
@@ -286,8 +292,8 @@ def accuracy_map(
             axes.grid(visible=False)
         for axes in many[len(drawn) :]:
             axes.remove()
-        for axes in many[: len(drawn)]:
-            axes.label_outer()
+        for k, axes in enumerate(many[: len(drawn)]):  # numbers on the outer axes, below a gap too
+            axes.tick_params(labelbottom=k + 2 >= len(drawn), labelleft=k % 2 == 0)
         figure.supxlabel(x[0])
         figure.supylabel(y[0])
         handles, labels = many[0].get_legend_handles_labels()
@@ -297,6 +303,14 @@ def accuracy_map(
         if handles:
             figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
     return figure
+
+
+def _edges(values: Sequence[float], logarithmic: bool) -> np.ndarray:
+    """Borders of the cells around these values, half way to the next one on the axis as it is drawn."""
+    middle = np.log(values) if logarithmic else np.asarray(values)
+    between = (middle[:-1] + middle[1:]) / 2
+    edges = np.concatenate([[2 * middle[0] - between[0]], between, [2 * middle[-1] - between[-1]]])
+    return np.exp(edges) if logarithmic else edges
 
 
 def _plain_ticks(line: Any) -> None:
@@ -311,7 +325,7 @@ def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
         figure = Figure(figsize=(8.0, 4.5), layout="constrained")
         axes = figure.subplots()
         axes.set(xlabel=_TIME, ylabel=ylabel)
-        axes.set_title(title, loc="left", pad=14)
+        axes.set_title(title, loc="left", pad=19)
     return figure, axes
 
 

@@ -15,7 +15,7 @@ from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.controllers import Law
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.hardware import Actuators
+from ptsmc_jax.hardware import Actuators, Drive
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
@@ -100,9 +100,8 @@ class _Flight(NamedTuple):
 
     sensing: Any  # memory of the sensors
     seen: Any  # state as the law saw it at the last sample
-    applied: tuple[
-        Array, Array | None
-    ]  # mean torque of the last period and momentum of the wheels in it: what the observer is told
+    # what the observer is told of the last period: mean torque, and momentum of the wheels in it
+    applied: tuple[Array, Array | None]
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
 
@@ -187,7 +186,7 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
     sensing = None if sensors is None else sensors.begin(seed, trial, x0, ticks.sample[0])
     told = (none, None if actuators.wheels is None else none)
     flight = _Flight(sensing, x0, told, acting, None if parts.walk_rate is None else none)
-    drive, _ = actuators.command(acting, none, parts.plant.velocity(x0), jnp.zeros_like(judged.t_f), judged.t_f)
+    drive = Drive(acting.v, acting.v, acting.h, jnp.asarray(False))  # of no period yet
     state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, drive, flight.pushed))
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
     t, x, drive, pushed = state.at_t_f

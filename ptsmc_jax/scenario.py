@@ -1,5 +1,6 @@
 """Scenarios: read, checked as a whole, changed, and turned into the parts that the rollout flies."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -244,8 +245,8 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
             observer.initial_error,
         )
     bound = observer.error_bound()
-    widest = controller.with_gains(
-        t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
+    widest = dataclasses.replace(
+        controller, t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
     )
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:

@@ -89,7 +89,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     store.write(folder, lambda making: reproduction.write(making, made, figures))
     if not quiet:
         _show_reproduction(made, folder)
-    return 0 if reproduction.summary(made)["status"] == "ok" else 1
+    return 0 if made.ok else 1
 
 
 @app.command(name="map")
@@ -110,9 +110,7 @@ def map_(
 
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
-    key, count = _whole("--seed", seed), _whole("--trials", trials)
-    if not 1 <= count <= 1_000_000:
-        raise UsageError(f"--trials is {trials}, but must be a whole number from 1 to 1000000")
+    key, count = _whole("--seed", seed), _whole("--trials", trials, 1, 1_000_000)
     loaded, folder = _prepare(scenario, "map", out)
     from ptsmc_jax import store
 
@@ -203,9 +201,9 @@ def _fail(sentence: str) -> None:
     sys.exit(2)
 
 
-def _whole(option: str, value: str) -> int:
-    if not (value.isascii() and value.isdigit() and len(value) <= 10 and int(value) < 2**32):
-        raise UsageError(f"{option} is {value}, but must be a whole number from 0 to {2**32 - 1}")
+def _whole(option: str, value: str, least: int = 0, most: int = 2**32 - 1) -> int:
+    if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
+        raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
     return int(value)
 
 
@@ -316,7 +314,7 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     groups = {"paper": summary["paper"], "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     table = Table("", *groups, "unit", box=None, pad_edge=False)
-    kind = summary["plant"]
+    kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
     for gain, unit in UNITS[kind].items():
         cells = [group["gains"].get(gain) for group in groups.values()]
         if len(set(cells)) > 1:
@@ -342,7 +340,7 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     for verdict in summary["verdicts"]:
         fields = ("metric", "limit", "unit", "worst", "failures", "trials")
         console.print(verdict_text(*(verdict[field] for field in fields)), soft_wrap=True)
-    if summary["shortest_t_f"] is not None:
-        shortest = summary["shortest_t_f"]
+    shortest = summary.get("shortest_t_f")
+    if shortest is not None:
         console.print(design.text(shortest["limit"], shortest["theory"], shortest["simulated"]), soft_wrap=True)
     console.print(f"results in {folder}", soft_wrap=True)

@@ -197,6 +197,11 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
             return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
         lost = np.array([cell.failures + cell.missed > 0 for cell in cells]).reshape(shape)
         made = plotting.accuracy_map(
-            (x.key, x.values, x.logarithmic), (y.key, y.values, y.logarithmic), grids, lost, borders(scenario, x, y)
+            (x.key, x.values, x.logarithmic),
+            (y.key, y.values, y.logarithmic),
+            grids,
+            lost,
+            borders(scenario, x, y),
+            scenario.plant.kind,
         )
         plotting.save({"map": made}, folder / "figures")

@@ -205,6 +205,7 @@ def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
                 for name, trials in tuning.fresh.items()
             },
             limit,
+            scenario.plant.kind,
         ),
     }
 

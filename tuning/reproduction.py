@@ -20,6 +20,11 @@ class Reproduction:
     claims: list[paper.Claim]
     slips: list[slips.Slip]
 
+    @property
+    def ok(self) -> bool:
+        """Every case was flown to its end."""
+        return all(run.status == "ok" for run in self.cases.values())
+
 
 def reproduce() -> Reproduction:
     """Fly every case of the paper and measure what it claims."""
@@ -31,7 +36,7 @@ def summary(made: Reproduction) -> dict[str, Any]:
     """What `summary.json` says."""
     verdicts = [claim.verdict for claim in made.claims]
     return {
-        "status": "ok" if all(run.status == "ok" for run in made.cases.values()) else "failed",
+        "status": "ok" if made.ok else "failed",
         "verdicts": {word: verdicts.count(word) for word in paper.VERDICTS},
         "claims": [asdict(claim) for claim in made.claims],
         "slips": [asdict(slip) for slip in made.slips],
