@@ -16,7 +16,9 @@ _EXPORTS = {
     "Constant": "signals",
     "Fixed": "signals",
     "Sinusoid": "signals",
+    "Slew": "signals",
     "Spin": "signals",
+    "Swing": "signals",
     "Target": "signals",
     "Chain": "plants",
     "chain": "plants",
@@ -64,7 +66,9 @@ if TYPE_CHECKING:
     from ptsmc_jax.signals import Constant as Constant
     from ptsmc_jax.signals import Fixed as Fixed
     from ptsmc_jax.signals import Sinusoid as Sinusoid
+    from ptsmc_jax.signals import Slew as Slew
     from ptsmc_jax.signals import Spin as Spin
+    from ptsmc_jax.signals import Swing as Swing
     from ptsmc_jax.signals import Target as Target
     from ptsmc_jax.tables import Scenario as Scenario
 

@@ -5,9 +5,10 @@ T(q) = q4 I + [v]x, v' = T(q) w / 2, q4' = -v.w / 2 with the body rate w in body
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax import numerics
+from ptsmc_jax import elementary, numerics
 
 Quaternion = Float[Array, "4"]
 Vector = Float[Array, "3"]
@@ -26,7 +27,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def normalise(q: Quaternion) -> Quaternion:
     """Q / |q|."""
-    return q / jnp.sqrt(jnp.dot(q, q))
+    return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division, not four
 
 
 def rotate(q: Quaternion, y: Vector) -> Vector:
@@ -44,7 +45,8 @@ def t_matrix(q: Quaternion) -> Float[Array, "3 3"]:
 def t_inverse_times(q: Quaternion, y: Vector) -> Vector:
     """T(q)^-1 y in closed form, in the units of y: (q4^2 y + v (v.y) - q4 v x y) / (q4 (q4^2 + v.v))."""
     v, s = q[:3], q[3]
-    return (s * s * y + v * jnp.dot(v, y) - s * jnp.cross(v, y)) / (s * (s * s + jnp.dot(v, v)))
+    scale = 1.0 / (s * (s * s + jnp.dot(v, v)))
+    return scale * (s * s * y + v * jnp.dot(v, y) - s * jnp.cross(v, y))
 
 
 def derivative(q: Quaternion, w: Vector) -> Quaternion:
@@ -65,12 +67,14 @@ def from_rotation_vector(r: Vector) -> Quaternion:
     square = jnp.dot(r, r)
     small = square < 1e-6  # beyond the series' three terms: 1e-6^3 / 2^7 / 7! = 1e-24
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
-    scale = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(angle / 2) / angle)
-    scalar = jnp.where(small, 1 - square / 8 + square**2 / 384, jnp.cos(angle / 2))
+    turns = angle * (0.25 / np.pi)  # of half the angle
+    cosine, sine = elementary.cos_sin_turns(turns - jnp.floor(turns))
+    scale = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, sine / angle)
+    scalar = jnp.where(small, 1 - square / 8 + square**2 / 384, cosine)
     return jnp.append(scale * r, scalar)
 
 
 def angle(q: Quaternion, reference: Quaternion) -> Float[Array, ""]:
     """Angle of the rotation from one attitude to another [rad], 0 to pi, accurate down to 0; gradient 0 there."""
     error = multiply(conjugate(reference), q)
-    return 2.0 * jnp.arctan2(numerics.norm(error[:3]), jnp.abs(error[3]))
+    return 2.0 * elementary.arctan2(numerics.norm(error[:3]), jnp.abs(error[3]))

@@ -37,8 +37,13 @@ def spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     initial = plants.AttitudeState(q, vector(scenario.initial.rate))
     q_f = jnp.asarray(checks.quaternion(scenario.reference, "reference"))
     reference: Any = signals.Fixed(q_f)
-    if isinstance(scenario.reference, t.SpinReference):
-        reference = signals.Spin(q_f, vector(scenario.reference.rate))
+    table = scenario.reference
+    if isinstance(table, t.SpinReference):
+        reference = signals.Spin(q_f, vector(table.rate))
+    elif isinstance(table, t.SinusoidReference):
+        reference = signals.Swing(q_f, vector(table.amplitude), vector(table.frequency), vector(table.phase))
+    elif isinstance(table, t.SlewReference):
+        reference = signals.Slew(q_f, vector(checks.turn(table)), vector(table.duration))
     return model, controllers.PrescribedTime(model, *_gains(scenario)), initial, reference
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import hardware, plants, schema, tables
 from ptsmc_jax.controllers import hurwitz
@@ -15,19 +14,35 @@ from ptsmc_jax.tables import Scenario
 MOST_STEPS = 200_000
 
 
+def _unit(key: str, value: Any) -> np.ndarray:
+    """A quaternion of a scenario, normalised; refused where it is not a unit one already."""
+    array = np.array(value, dtype=float)
+    length = np.linalg.norm(array)
+    if abs(length - 1.0) > 1e-6:
+        raise wrong(key, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
+    return array / length
+
+
+def turn(table: tables.SlewReference) -> np.ndarray:
+    """Rotation vector of a slew, the short way from its attitude to `to_quat_xyzw` (3,) [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    start, end = quaternion(table, "reference"), _unit("reference.to_quat_xyzw", table.to_quat_xyzw)
+    return (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+
+
 def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
     """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
     key, value = attitude_key(table)
     full = f"{name}.{key}"
     if table.sequence is not None and key != "euler_deg":
         raise ScenarioError(f"{name}.sequence is {schema.show(table.sequence)}, but goes with euler_deg only")
-    array = np.array(value, dtype=float)
     if key in ("quat_xyzw", "quat_wxyz"):
-        length = np.linalg.norm(array)
-        if abs(length - 1.0) > 1e-6:
-            raise wrong(full, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
-        array = array / length
-        return array if key == "quat_xyzw" else np.roll(array, -1)
+        unit = _unit(full, value)
+        return unit if key == "quat_xyzw" else np.roll(unit, -1)
+    array = np.array(value, dtype=float)
+    from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
+
     if key == "rotvec_deg":
         return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
     if key == "mrp":
@@ -160,6 +175,8 @@ def _check_plant(scenario: Scenario) -> None:
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
         quaternion(scenario.initial, "initial")
         quaternion(scenario.reference, "reference")
+        if isinstance(scenario.reference, tables.SlewReference):
+            _unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
         _check_devices(scenario)
         return
     controller, n = scenario.controller, plant.order

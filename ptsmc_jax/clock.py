@@ -117,7 +117,7 @@ class Graded:
             slope = a + jnp.exp(u) / self.max_step
             return u - (a * u + jnp.exp(u) / self.max_step - level) / slope
 
-        u = jax.lax.fori_loop(0, 60, lambda _, u: newton(u), jnp.full_like(level, jnp.log(t_f)))
+        u = jax.lax.fori_loop(0, 40, lambda _, u: newton(u), jnp.full_like(level, jnp.log(t_f)))
         u = newton(jax.lax.stop_gradient(u))  # one step from the root has the root's exact derivative
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 

@@ -1,35 +1,123 @@
 """JAX set up before its backend starts: the command and the notebooks call it, the library never does."""
 
 import hashlib
+import json
 import os
 import platform
+import subprocess
+import sys
+import warnings
+from importlib.metadata import version
 from pathlib import Path
 
-# Lets outputs of a fused loop share their common work: several times less arithmetic in `lanes` on a CPU.
-_XLA_OPTIONS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
+# Compiler options for loops on a CPU, no stable interface. The first lets all outputs of a loop's body share their
+# common work, the second compiles the whole loop into one kernel, the third lets that kernel's loops over the trials
+# become vectors however many arrays they touch, the fourth lets the vectors be as wide as the processor's.
+_OPTIONS = (
+    "xla_cpu_use_multi_output_fusion=true",
+    "xla_cpu_small_while_loop_byte_threshold=100000000",
+    "-vectorize-memory-check-threshold=100000",
+    "--xla_cpu_prefer_vector_width=512",
+)
 
 
-def configure(devices: int | None = None, cache: str | Path | None = "default", fusion: bool = True) -> None:
+def configure(devices: int | None = None, cache: str | Path | None = "default", fast: bool = True) -> None:
     """64 bit numbers, one host device per core, compiler options and a persistent compile cache.
 
     devices: number of host devices, all cores that this process may use if None; cache: folder of the compile cache,
-    None for none; by default a folder of this processor's own below the user's cache folder. fusion: let the
-    compiler share work between outputs, about twice as fast; but the compiler of jax 0.10.2 aborts with it on some
-    code of one's own that scatters into several arrays under vmap. Call it before anything runs on JAX; later it
+    None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
+    that make loops 2 to 15 times as fast forward, and reverse mode through them ten times as slow: pass False where
+    you need it, or where the compiler of jax 0.10.2 aborts with them, as it does on some code of one's own that
+    scatters into several arrays under vmap. They are tried out in a process of its own, once for each version of JAX
+    and processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
+    XLA_FLAGS that set `xla_backend_extra_options` are left as they are. Call it before anything runs on JAX; later it
     raises RuntimeError where the backend has already started with something else.
     """
+    folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     flags = os.environ.get("XLA_FLAGS", "")
-    if fusion and "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {_XLA_OPTIONS}".strip()
+    if fast and "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
     import jax
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", devices or len(os.sched_getaffinity(0)))
-    if cache is not None:
-        folder = _cache_folder() if cache == "default" else Path(cache)
+    if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _flags(options: tuple[str, ...]) -> str:
+    """The options as XLA_FLAGS."""
+    extra = ",".join(option for option in options if not option.startswith("--"))
+    plain = [option for option in options if option.startswith("--")]
+    return " ".join([*([f"--xla_backend_extra_options={extra}"] if extra else []), *plain])
+
+
+def _accepted(folder: Path | None) -> tuple[str, ...]:
+    """The options that this machine's compiler takes and that leave the numbers as they are; kept in the cache."""
+    kept = None if folder is None else folder / f"options-{version('jaxlib')}.json"
+    if kept is not None and kept.is_file():
+        try:
+            told = json.loads(kept.read_text(encoding="utf-8"))
+            if told["tried"] == list(_OPTIONS):
+                return tuple(told["accepted"])
+        except (ValueError, KeyError, TypeError):
+            pass  # not ours, or cut short: try again
+    accepted: tuple[str, ...] = _OPTIONS
+    if not _tried(_OPTIONS):
+        accepted = tuple(option for option in _OPTIONS if _tried((option,)))
+        accepted = accepted if _tried(accepted) else ()
+        refused = ", ".join(option for option in _OPTIONS if option not in accepted)
+        warnings.warn(f"this version of XLA refuses {refused}: runs will be slower", RuntimeWarning, stacklevel=3)
+    if kept is not None:
+        try:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_text(json.dumps({"tried": _OPTIONS, "accepted": accepted}), encoding="utf-8")
+        except OSError:
+            pass  # a cache that cannot be written is none
+    return accepted
+
+
+def _tried(options: tuple[str, ...]) -> bool:
+    """Whether a loop compiled with these options gives the numbers that NumPy gives, in a process of its own."""
+    environment = dict(os.environ, JAX_PLATFORMS="cpu", XLA_FLAGS=_flags(options))
+    call = [sys.executable, "-c", _TRIAL]
+    try:
+        return subprocess.run(call, env=environment, capture_output=True, timeout=120, check=False).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
+
+
+# 64 damped pendulums side by side, with a branch and a scalar clock: what a rollout is made of.
+_TRIAL = """
+import sys
+import jax
+import numpy as np
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+
+def run(module, cond, loop, x, steps):
+    def step(carry, k):
+        x, v, most = carry
+        d = module.sin(0.1 * k)
+        a = d - module.sin(x) - 0.1 * v * module.sqrt(1.0 + v * v)
+        v = v + 0.05 * a
+        x = x + 0.05 * v
+        late = cond(k > 50, lambda: module.maximum(most, module.abs(a)), lambda: most)
+        return (x, v, late), None
+    return loop(step, (x, 0.0 * x, 0.0 * x), module.arange(steps) * 1.0)[0]
+
+def plain(step, carry, ks):
+    for k in ks:
+        carry, _ = step(carry, k)
+    return carry, None
+
+x = np.linspace(-3.0, 3.0, 64)
+got = jax.jit(lambda x: run(jnp, jax.lax.cond, jax.lax.scan, x, 100))(jnp.asarray(x))
+expected = run(np, lambda test, yes, no: yes() if test else no(), plain, x, 100)
+sys.exit(any(np.max(np.abs(np.asarray(a) - b)) > 1e-12 for a, b in zip(got, expected)))
+"""
 
 
 def _cache_folder() -> Path:

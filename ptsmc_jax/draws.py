@@ -9,9 +9,12 @@ Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror, Shaw, SC11, 2011) on plain u
 import zlib
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
+
+from ptsmc_jax import elementary
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
@@ -42,7 +45,11 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
             y = ((y << r) | (y >> (32 - r))) ^ x
         x = x + schedule[(group + 1) % 3]
         y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
-    return x, y
+    if jnp.result_type(float) != jnp.float64:  # without 64 bits there is no such number
+        return x, y
+    # packed into one number on the way: XLA then makes one kernel of all rounds, not one of each
+    both = (x.astype(jnp.uint64) << 32) | y.astype(jnp.uint64)
+    return (both >> 32).astype(jnp.uint32), both.astype(jnp.uint32)
 
 
 def stream(seed: Whole, trial: Whole, name: str) -> Key:
@@ -56,8 +63,12 @@ def derive(seed: int, name: str) -> int:
     return int(stream(seed, 0, name).a)
 
 
-def _pairs(key: Key, sample: Whole, count: int) -> list[tuple[Array, Array]]:
-    return [threefry(key, (_word(sample), jnp.uint32(block))) for block in range((count + 1) // 2)]
+def _pairs(key: Key, sample: Whole, count: int) -> tuple[Word, Word]:
+    """The words of so many numbers, two a block: (blocks,) each."""
+    blocks = jnp.arange((count + 1) // 2, dtype=jnp.uint32)
+    number = _word(sample)
+    # a loop over the blocks: the same work, but less code to compile
+    return jax.lax.map(lambda block: threefry(key, (number, block)), blocks)
 
 
 def _unit(word: Array) -> Array:
@@ -68,14 +79,12 @@ def _unit(word: Array) -> Array:
 
 def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
     """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits)."""
-    words = [word for pair in _pairs(key, sample, count) for word in pair]
-    return jnp.stack([_unit(word) for word in words[:count]])
+    return _unit(jnp.stack(_pairs(key, sample, count), axis=1).reshape(-1)[:count])
 
 
 def normals(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
     """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
-    values = []
-    for a, b in _pairs(key, sample, count):
-        radius, angle = jnp.sqrt(-2.0 * jnp.log(_unit(a))), 2.0 * np.pi * _unit(b)
-        values += [radius * jnp.cos(angle), radius * jnp.sin(angle)]
-    return jnp.stack(values[:count])
+    a, b = _pairs(key, sample, count)
+    radius = jnp.sqrt(-2.0 * elementary.log(_unit(a)))
+    pairs = jnp.stack([radius * part for part in elementary.cos_sin_turns(_unit(b))], axis=1)
+    return pairs.reshape(-1)[:count]

@@ -66,14 +66,14 @@ class ActuatorState(NamedTuple):
     """What actuators carry from period to period."""
 
     queue: Array | None  # (delay, m) commands on their way, the oldest first [N m]
-    v: Array  # (channels,) torque at the end of the last period [N m]
+    v: Array | None  # (channels,) torque at the end of the last period [N m]; None where it jumps to the command
     h: Array | None  # (wheels,) stored momentum [N m s]
 
 
 class Drive(NamedTuple):
     """One period: channels move from v toward the target c."""
 
-    v: Array  # (channels,) [N m]
+    v: Array | None  # (channels,) [N m]; None: at c from the start
     c: Array
     h: Array | None  # (wheels,) at the start of the period [N m s]
     limited: Array  # bool: a limit cuts the command
@@ -96,12 +96,17 @@ class Actuators:
         """Whether the torque changes within a period."""
         return self.rate_limit is not None or self.lag is not None
 
+    @property
+    def holds(self) -> bool:
+        """Whether the torque on the body is the target from the start of a period to its end."""
+        return not self.moves and self.wheels is None
+
     def begin(self, inputs: int) -> ActuatorState:
         """At rest: no torque, no command on its way."""
         queue = jnp.zeros((self.delay, inputs)) if self.delay else None
-        if self.wheels is None:
-            return ActuatorState(queue, jnp.zeros(inputs), None)
-        return ActuatorState(queue, jnp.zeros_like(self.wheels.initial), self.wheels.initial)
+        momentum = None if self.wheels is None else self.wheels.initial
+        rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
+        return ActuatorState(queue, rest if self.moves else None, momentum)
 
     def command(self, state: ActuatorState, u: Vector, w: Vector, dt: Scalar, weight: Scalar) -> tuple[Drive, Any]:
         """The period's drive and the queue after it, for the law's command u [N m] at the rate seen w [rad/s].
@@ -126,6 +131,7 @@ class Actuators:
             cut = self._within_wheels(self.wheels, wanted, state, dt)
         limited = limited | jnp.any(cut != wanted)
         if self.rate_limit is not None:
+            assert state.v is not None
             reach = self.rate_limit * (dt if self.lag is None else dt + self.lag)
             limited = limited | jnp.any(jnp.abs(cut - state.v) > reach)
         return Drive(state.v, cut, state.h, limited), queue
@@ -138,9 +144,11 @@ class Actuators:
         """
         if device.momentum_limit is not None:
             assert state.h is not None
-            slow = jnp.zeros_like(dt) if self.lag is None else self.lag * -jnp.expm1(-dt / self.lag)
+            left, slow = state.h, jnp.zeros_like(dt)
+            if self.lag is not None and state.v is not None:
+                slow = self.lag * -jnp.expm1(-dt / self.lag)
+                left = left - slow * state.v
             span = jnp.where(dt > slow, dt - slow, 1.0)
-            left = state.h - slow * state.v
             v = jnp.clip(v, (left - device.momentum_limit) / span, (left + device.momentum_limit) / span)
         if device.torque_limit is not None:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
@@ -152,7 +160,7 @@ class Actuators:
         v' = (c - v) / lag, |v'| at most the rate limit: a ramp until |c - v| is rate limit times lag, then the lag.
         """
         v, c = drive.v, drive.c
-        if not self.moves:
+        if v is None:
             return c, c * s
         gap = c - v
         near = gap  # what the lag closes, after a ramp of this length and slope
@@ -182,9 +190,10 @@ class Actuators:
 
         The momentum [N m s] is that of the middle, None without wheels. So the body's momentum comes out exact.
         """
-        lasts = dt > 0.0
+        v, lasts = drive.c, dt > 0.0
         before, after = (self.channels(drive, s)[1] for s in (start, start + dt))
-        v = jnp.where(lasts, (after - before) / jnp.where(lasts, dt, 1.0), drive.v)
+        if drive.v is not None:
+            v = jnp.where(lasts, (after - before) / jnp.where(lasts, dt, 1.0), drive.v)
         if self.wheels is None or drive.h is None:
             return v, None
         return self.wheels.axes @ v, self.wheels.axes @ (drive.h - (before + after) / 2)
@@ -192,5 +201,5 @@ class Actuators:
     def end(self, drive: Drive, queue: Any, dt: Scalar) -> ActuatorState:
         """State after a period of dt [s]; one of length zero changes nothing."""
         v, impulse = self.channels(drive, dt)
-        v = jnp.where(dt > 0.0, v, drive.v)
+        v = None if drive.v is None else jnp.where(dt > 0.0, v, drive.v)
         return ActuatorState(queue, v, None if drive.h is None else drive.h - impulse)

@@ -3,11 +3,11 @@
 `lanes.vmap` computes what `jax.vmap` does. It traces the function for one trial and evaluates the trace with every
 small array replaced by its components, each a vector over the trials: XLA's CPU backend vectorises arrays (trial,)
 but not arrays (trial, 3). Reshapes and slices become permutations, small contractions become sums, and whatever does
-not depend on the trial stays as it is. A primitive without a rule here goes through `jax.vmap` on its own.
+not depend on the trial stays as it is: its loops keep a scalar, its branches stay branches.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import reduce
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,62 +17,22 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-# Larger arrays (tables over time, say) are not taken apart.
-_LARGEST = 64
+from ptsmc_jax import components
+from ptsmc_jax.components import Lane, Shared, dense_of, object_array, parts_of, plain
 
-_ELEMENTWISE = set(
-    """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type
-    copy copy_p cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p
-    logistic lt max min mul ne neg nextafter not or population_count pow real reduce_precision rem round rsqrt
-    select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan
-    tanh xor""".split()
-)
-_STRUCTURAL = set("broadcast_in_dim concatenate expand_dims pad reshape rev slice squeeze transpose".split())
-_REDUCTIONS = {
-    "reduce_sum": lax.add,
-    "reduce_max": lax.max,
-    "reduce_min": lax.min,
-    "reduce_prod": lax.mul,
-    "reduce_and": lax.bitwise_and,
-    "reduce_or": lax.bitwise_or,
-}
 _CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
 
 
-class _Lane:
-    """A value that differs from trial to trial: as components, or dense as (trial, *shape), or both."""
-
-    def __init__(self, shape: tuple[int, ...], parts: np.ndarray | None = None, dense: Array | None = None):
-        self.shape, self._parts, self._dense = shape, parts, dense
-
-    # What is computed here is not kept: inside a loop's body it belongs to that body alone.
-
-    @property
-    def parts(self) -> np.ndarray:
-        """Object array of the value's shape, each entry (trial,) or, where equal in all trials, ()."""
-        if self._parts is not None:
-            return self._parts
-        dense = self._dense
-        assert dense is not None
-        return _object_array(self.shape, (dense[(slice(None), *i)] for i in np.ndindex(*self.shape)))
-
-    def apart(self) -> "_Lane":
-        """The same value taken apart now, unless it is too large for that."""
-        small = self._parts is None and np.prod(self.shape, dtype=int) <= _LARGEST
-        return _Lane(self.shape, self.parts, self._dense) if small else self
-
-    def dense(self, trials: int) -> Array:
-        """(trial, *shape) array."""
-        if self._dense is not None:
-            return self._dense
-        flat = [jnp.broadcast_to(part, (trials,)) for part in self.parts.flat]
-        return jnp.stack(flat, axis=-1).reshape((trials, *self.shape)) if self.shape else flat[0]
+class LanesWarning(UserWarning):
+    """A primitive without a rule went through `jax.vmap`: right, but slower."""
 
 
-def vmap(function: Callable, in_axes: Any = 0) -> Callable:
+def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callable:
     """`jax.vmap(function, in_axes)` for axes 0 and None, evaluated by components; the outputs' trial axis is 0.
 
-    Composes with jit, vmap, jvp and grad from outside. Raises ValueError where nothing is mapped.
+    Composes with jit, vmap, jvp and grad from outside. A primitive without a rule here goes through `jax.vmap` on its
+    own, with one warning. Raises ValueError where nothing is mapped, with strict=True NotImplementedError at such a
+    primitive.
     """
 
     def mapped(*args: Any) -> Any:
@@ -92,13 +52,13 @@ def vmap(function: Callable, in_axes: Any = 0) -> Callable:
             for leaf, on in zip(leaves, mapped_over, strict=True)
         ]
         closed, out = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, one))
-        trials = sizes.pop()
         values = [
-            _Lane(leaf.shape[1:], dense=leaf).apart() if on else leaf
+            Lane(leaf.shape[1:], dense=leaf).apart() if on else leaf
             for leaf, on in zip(leaves, mapped_over, strict=True)
         ]
-        results = _evaluate(closed.jaxpr, closed.consts, values, trials)
-        return jax.tree.unflatten(jax.tree.structure(out), [_dense(value, trials) for value in results])
+        lanes = _Lanes(sizes.pop(), strict)
+        results = lanes.evaluate(closed, values)
+        return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, lanes.trials) for value in results])
 
     return mapped
 
@@ -110,188 +70,240 @@ def _spread(axis: int | None, tree: Any) -> Any:
     return jax.tree.map(lambda _: axis == 0, tree)
 
 
-def _object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
-    array = np.empty(shape, dtype=object)
-    for index, item in zip(np.ndindex(*shape), items, strict=True):
-        array[index] = item
-    return array
+class _Packed:
+    """How values are handed through JAX's loops and branches: lanes as tuples of components, large ones dense."""
+
+    def __init__(self, variables: Sequence, differs: Sequence[bool], trials: int):
+        self.shapes, self.differs, self.trials = [v.aval.shape for v in variables], differs, trials
+
+    def pack(self, values: Sequence) -> tuple:
+        return tuple(self._pack(*item) for item in zip(values, self.shapes, self.differs, strict=True))
+
+    def _pack(self, value: Any, shape: tuple[int, ...], differs: bool) -> Any:
+        if not differs:
+            return plain(value)
+        if not components.small(shape):
+            return dense_of(value, self.trials)
+        return tuple(jnp.broadcast_to(part, (self.trials,)) for part in parts_of(value).flat)
+
+    def unpack(self, packed: Sequence) -> list:
+        return [self._unpack(*item) for item in zip(packed, self.shapes, self.differs, strict=True)]
+
+    def _unpack(self, value: Any, shape: tuple[int, ...], differs: bool) -> Any:
+        if not differs:
+            return value
+        return Lane(shape, object_array(shape, value)) if components.small(shape) else Lane(shape, dense=value)
 
 
-def _dense(value: Any, trials: int) -> Array:
-    if isinstance(value, _Lane):
-        return value.dense(trials)
-    value = jnp.asarray(value)
-    return jnp.broadcast_to(value, (trials, *value.shape))
+class _Lanes:
+    """Evaluation of traces for so many trials."""
 
+    def __init__(self, trials: int, strict: bool):
+        self.trials, self.strict = trials, strict
 
-def _parts(value: Any) -> np.ndarray:
-    """Components of a value, lane or not."""
-    if isinstance(value, _Lane):
-        return value.parts
-    value = jnp.asarray(value)
-    return _object_array(value.shape, (value[i] for i in np.ndindex(*value.shape)))
+    def evaluate(self, closed: Any, args: Sequence) -> list:
+        """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
+        jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+        known: dict = {}
 
+        def write(variables: Sequence, values: Sequence) -> None:
+            for variable, value in zip(variables, values, strict=True):
+                empty = isinstance(value, Lane) and 0 in value.shape  # nothing in it that could differ
+                known[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
 
-def _evaluate(jaxpr: core.Jaxpr, consts: Sequence, args: Sequence, trials: int) -> list:
-    """Values of the outputs of a trace, for arguments that are lanes or plain arrays."""
-    known: dict = {}
+        def read(atom: Any) -> Any:
+            return atom.val if isinstance(atom, core.Literal) else known[atom]
 
-    def write(variables: Sequence, values: Sequence) -> None:
-        for variable, value in zip(variables, values, strict=True):
-            empty = isinstance(value, _Lane) and 0 in value.shape  # nothing in it that could differ
-            known[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
+        write([*jaxpr.constvars, *jaxpr.invars], [*consts, *args])
+        for eqn in jaxpr.eqns:
+            values = [read(atom) for atom in eqn.invars]
+            laned = any(isinstance(value, Lane) for value in values)
+            write(eqn.outvars, self.apply(eqn, values) if laned else components.bind(eqn, values))
+        return [read(atom) for atom in jaxpr.outvars]
 
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, core.Literal) else known[atom]
-
-    write([*jaxpr.constvars, *jaxpr.invars], [*consts, *args])
-    for eqn in jaxpr.eqns:
-        values = [read(atom) for atom in eqn.invars]
-        if not any(isinstance(value, _Lane) for value in values):
-            results = _bind(eqn, values)
+    def apply(self, eqn: Any, values: list) -> Sequence:
+        """One primitive with at least one lane among its operands."""
+        name, params = eqn.primitive.name, eqn.params
+        if name in _CALLS:
+            return self.evaluate(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], values)
+        if name in _CONTROL:
+            return _CONTROL[name](self, eqn, values)
+        if components.covers(name):
+            results = components.apply(eqn, values)
+            if results is not None:
+                return results
         else:
-            results = _apply(eqn, values, trials)
-        write(eqn.outvars, results)
-    return [read(atom) for atom in jaxpr.outvars]
+            self.without_rule(eqn)
+        mapped = [0 if isinstance(v, Lane) else None for v in values]
+        operands = [v.dense(self.trials) if isinstance(v, Lane) else plain(v) for v in values]
+        dense = jax.vmap(lambda *v: components.bind(eqn, v), mapped)(*operands)
+        return [Lane(out.shape[1:], dense=out) for out in dense]
+
+    def without_rule(self, eqn: Any) -> None:
+        told = f"lanes have no rule for the primitive `{eqn.primitive.name}`{_place(eqn)}"
+        if self.strict:
+            raise NotImplementedError(f"{told}; write it with others, or leave strict mode")
+        warnings.warn(f"{told}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
+
+    def settle(self, jaxpr: Any, before: list[bool], carried: list[bool], after: list[bool]) -> list[bool]:
+        """Which carries of a loop depend on the trial: those that start so, and those that its body makes so.
+
+        before, after: the same for what stands before and after the carries among the body's inputs.
+        """
+        while True:
+            outputs = _dependence(jaxpr, [*before, *carried, *after])
+            wider = [a or b for a, b in zip(carried, outputs, strict=False)]
+            if wider == carried:
+                return carried
+            carried = wider
+
+    def scan(self, eqn: Any, values: list) -> list:
+        params = eqn.params
+        body, constants, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
+        consts = [_apart(value) for value in values[:constants]]
+        init, xs = values[constants : constants + carried], values[constants + carried :]
+        fixed, rowed = _which(consts), _which(xs)
+        differs = self.settle(body.jaxpr, fixed, _which(init), rowed)
+        outputs = _dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
+        state = _Packed(body.jaxpr.invars[constants : constants + carried], differs, self.trials)
+        row = _Packed(body.jaxpr.invars[constants + carried :], rowed, self.trials)
+        out = _Packed(body.jaxpr.outvars[carried:], outputs, self.trials)
+
+        def rows(value: Any, shape: tuple[int, ...]) -> Any:
+            if not isinstance(value, Lane):
+                return plain(value)
+            dense = jnp.moveaxis(value.dense(self.trials), 0, 1)  # (time, trial, *shape)
+            if not components.small(shape):
+                return dense
+            return tuple(components.entries(dense, 2).flat)
+
+        def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
+            results = self.evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
+            return state.pack(results[:carried]), out.pack(results[carried:])
+
+        last, ys = lax.scan(
+            step,
+            state.pack(init),
+            tuple(rows(value, shape) for value, shape in zip(xs, row.shapes, strict=True)),
+            params["length"],
+            params["reverse"],
+            params["unroll"],
+        )
+        results = state.unpack(last)
+        for y, shape, laned in zip(ys, out.shapes, outputs, strict=True):
+            if laned:  # components of (time, trial), or (time, trial, *shape) -> (trial, time, *shape)
+                whole = (params["length"], *shape)
+                if 0 in whole:
+                    y = Lane(whole, np.empty(whole, dtype=object))
+                elif components.small(whole):
+                    steps = range(params["length"])
+                    rows_of = (lax.index_in_dim(part, k, 0, keepdims=False) for k in steps for part in y)
+                    y = Lane(whole, object_array(whole, rows_of))
+                else:
+                    stacked = jnp.stack(y, axis=-1) if components.small(shape) else y
+                    y = Lane(whole, dense=jnp.moveaxis(stacked, 0, 1).reshape((self.trials, *whole)))
+            results.append(y)
+        return results
+
+    def loop(self, eqn: Any, values: list) -> list:
+        """lax.while_loop; where the trials end at different times each stays as it is from its end on."""
+        params = eqn.params
+        test, body = params["cond_jaxpr"], params["body_jaxpr"]
+        first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+        values = [*(_apart(value) for value in values[:second]), *values[second:]]
+        test_consts, body_consts, init = values[:first], values[first:second], values[second:]
+        differs = self.settle(body.jaxpr, _which(body_consts), _which(init), [])
+        (each,) = _dependence(test.jaxpr, [*_which(test_consts), *differs])
+        if each:
+            differs = [True] * len(init)
+        state = _Packed(body.jaxpr.outvars, differs, self.trials)
+
+        def going(carry: tuple) -> Any:
+            (test_value,) = self.evaluate(test, [*test_consts, *state.unpack(carry)])
+            return dense_of(test_value, self.trials) if each else test_value
+
+        def step(carry: tuple) -> tuple:
+            after = state.pack(self.evaluate(body, [*body_consts, *state.unpack(carry)]))
+            if not each:
+                return after
+            on = going(carry)
+            return jax.tree.map(lambda new, old: jnp.where(_along(on, new), new, old), after, carry)
+
+        proceed = (lambda carry: jnp.any(going(carry))) if each else going
+        return state.unpack(lax.while_loop(proceed, step, state.pack(init)))
+
+    def branch(self, eqn: Any, values: list) -> list:
+        """lax.cond and lax.switch: a branch where all trials agree, else all of them and a choice for each trial."""
+        index, *operands = values
+        branches = eqn.params["branches"]
+        if isinstance(index, Lane):
+            each = _Packed(eqn.outvars, [True] * len(eqn.outvars), self.trials)
+            cases = [each.pack(self.evaluate(branch, operands)) for branch in branches]
+            which = index.dense(self.trials)
+            which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
+            return each.unpack(jax.tree.map(lambda *c: lax.select_n(_along(which, c[0], full=True), *c), *cases))
+        operands = [_apart(value) for value in operands]
+        depends = [_dependence(branch.jaxpr, _which(operands)) for branch in branches]
+        one = _Packed(eqn.outvars, [any(d) for d in zip(*depends, strict=True)], self.trials)
+        choices = [lambda branch=branch: one.pack(self.evaluate(branch, operands)) for branch in branches]
+        return one.unpack(lax.switch(plain(index), choices))
+
+    def custom(self, eqn: Any, values: list) -> list:
+        """A function with a derivative rule of its own (custom_jvp), which is kept."""
+        avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+        smooth = [k for k, aval in enumerate(avals) if jnp.issubdtype(aval.dtype, jnp.inexact)]
+        takes = _Packed(eqn.invars, _which(values), self.trials)
+        gives = _Packed(eqn.outvars, [True] * len(eqn.outvars), self.trials)
+
+        @jax.custom_jvp
+        def function(packed: tuple) -> tuple:
+            return gives.pack(self.evaluate(eqn.params["call_jaxpr"], takes.unpack(packed)))
+
+        @function.defjvp
+        def derivative(primals: tuple, tangents: tuple) -> tuple:
+            def both(x: list, slopes: list) -> tuple:
+                def of(varied: list) -> Sequence:
+                    every = dict(enumerate(x)) | dict(zip(smooth, varied, strict=True))
+                    return components.bind(eqn, list(every.values()))
+
+                return jax.jvp(of, ([x[k] for k in smooth],), (slopes,))
+
+            traced = jax.make_jaxpr(both)(avals, [avals[k] for k in smooth])
+            slopes = takes.unpack(tangents[0])
+            results = self.evaluate(traced, [*takes.unpack(primals[0]), *(slopes[k] for k in smooth)])
+            half = len(results) // 2
+            return gives.pack(results[:half]), gives.pack(results[half:])
+
+        return gives.unpack(function(takes.pack(values)))
 
 
-def _bind(eqn: Any, values: Sequence) -> Sequence:
-    out = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
-    return out if eqn.primitive.multiple_results else [out]
+_CONTROL = {"scan": _Lanes.scan, "while": _Lanes.loop, "cond": _Lanes.branch, "custom_jvp_call": _Lanes.custom}
 
 
-def _apply(eqn: Any, values: list, trials: int) -> Sequence:
-    """One primitive with at least one lane among its operands."""
-    name, params = eqn.primitive.name, eqn.params
-    if name in _CALLS:
-        inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
-        if isinstance(inner, core.ClosedJaxpr):
-            return _evaluate(inner.jaxpr, inner.consts, values, trials)
-        return _evaluate(inner, (), values, trials)
-    if name == "scan":
-        return _scan(eqn, values, trials)
-    sizes = [np.prod(v.aval.shape, dtype=int) for v in (*eqn.invars, *eqn.outvars)]
-    if max(sizes) <= _LARGEST:
-        if name in _ELEMENTWISE:
-            return [_elementwise(eqn, values)]
-        if name in _STRUCTURAL:
-            return [_structural(eqn, values)]
-        if name in _REDUCTIONS:
-            return [_reduction(eqn, values[0])]
-        numeric = eqn.outvars[0].aval.dtype != bool
-        if name == "dot_general" and numeric and not any(params["dimension_numbers"][1]):
-            return [_contraction(eqn, values)]
-    dense = jax.vmap(lambda *v: _bind(eqn, v), [0 if isinstance(v, _Lane) else None for v in values])(
-        *(v.dense(trials) if isinstance(v, _Lane) else v for v in values)
-    )
-    return [_Lane(out.shape[1:], dense=out) for out in dense]
+def _which(values: Sequence) -> list[bool]:
+    return [isinstance(value, Lane) for value in values]
 
 
-def _call(eqn: Any, operands: Sequence) -> Array:
-    """An elementwise primitive on components: those equal in all trials are spread over them if any is not."""
-    shape = jnp.broadcast_shapes(*(np.shape(v) for v in operands))
-    return _bind(eqn, [jnp.broadcast_to(v, shape) for v in operands])[0]
+def _apart(value: Any) -> Any:
+    """A value taken apart before the loop or the branch that uses it, if it is small."""
+    if isinstance(value, Lane):
+        return value.apart()
+    if isinstance(value, Shared) or np.ndim(value) == 0 or not components.small(np.shape(value)):
+        return value
+    return Shared(jnp.asarray(value))
 
 
-def _elementwise(eqn: Any, values: list) -> _Lane:
-    shape = eqn.outvars[0].aval.shape
-    parts = [np.broadcast_to(_parts(value), shape) for value in values]
-    return _Lane(shape, _object_array(shape, (_call(eqn, [p[i] for p in parts]) for i in np.ndindex(*shape))))
+def _along(on: Array, value: Array, full: bool = False) -> Array:
+    """(trial,) condition shaped for an array (trial, ...)."""
+    shaped = on.reshape(on.shape + (1,) * (value.ndim - 1))
+    return jnp.broadcast_to(shaped, value.shape) if full else shaped
 
 
-def _structural(eqn: Any, values: list) -> _Lane:
-    """Apply the primitive to the numbers of the components instead, and pick the components by the result."""
-    pool, numbered = [], []
-    for value in values:
-        parts = _parts(value)
-        numbered.append(np.arange(len(pool), len(pool) + parts.size, dtype=np.int32).reshape(parts.shape))
-        pool += list(parts.flat)
-    with jax.ensure_compile_time_eval():
-        chosen = np.asarray(_bind(eqn, [jnp.asarray(n) for n in numbered])[0])
-    return _Lane(chosen.shape, _object_array(chosen.shape, [pool[k] for k in chosen.flat]))
-
-
-def _reduction(eqn: Any, value: _Lane) -> _Lane:
-    kept = [a for a in range(len(value.shape)) if a not in eqn.params["axes"]]
-    shape = tuple(value.shape[a] for a in kept)
-    rows = value.parts.transpose([*kept, *eqn.params["axes"]]).reshape((*shape, -1))
-    return _Lane(
-        shape, _object_array(shape, (_fold(_REDUCTIONS[eqn.primitive.name], rows[i]) for i in np.ndindex(*shape)))
-    )
-
-
-def _fold(operation: Callable, items: Iterable) -> Array:
-    return reduce(lambda a, b: operation(*jnp.broadcast_arrays(a, b)), items)
-
-
-def _contraction(eqn: Any, values: list) -> _Lane:
-    (left_axes, right_axes), _ = eqn.params["dimension_numbers"]
-    kind = eqn.outvars[0].aval.dtype
-    left, right = (np.vectorize(lambda part: lax.convert_element_type(part, kind), [object])(_parts(v)) for v in values)
-    left = np.moveaxis(left, left_axes, range(-len(left_axes), 0))
-    right = np.moveaxis(right, right_axes, range(-len(right_axes), 0))
-    kept_left, kept_right = (array.shape[: array.ndim - len(left_axes)] for array in (left, right))
-    left, right = left.reshape((*kept_left, -1)), right.reshape((*kept_right, -1))
-    shape = (*kept_left, *kept_right)
-    items = (
-        _fold(lax.add, [a * b for a, b in zip(left[i], right[j], strict=True)])
-        for i in np.ndindex(*kept_left)
-        for j in np.ndindex(*kept_right)
-    )
-    return _Lane(shape, _object_array(shape, items))
-
-
-def _scan(eqn: Any, values: list, trials: int) -> list:
-    """lax.scan with carries as tuples of components; what does not depend on the trial stays as it is."""
-    params = eqn.params
-    body, constants, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
-    consts, init, xs = values[:constants], values[constants : constants + carried], values[constants + carried :]
-
-    consts = [value.apart() if isinstance(value, _Lane) else value for value in consts]
-    # which carries depend on the trial: those that start so, and those that a pass through the body makes so
-    differs = [isinstance(value, _Lane) for value in init]
-    while True:
-        inputs = [*(isinstance(v, _Lane) for v in consts), *differs, *(isinstance(v, _Lane) for v in xs)]
-        outputs = _dependence(body.jaxpr, inputs)
-        wider = [a or b for a, b in zip(differs, outputs[:carried], strict=True)]
-        if wider == differs:
-            break
-        differs = wider
-    shapes = [v.aval.shape for v in body.jaxpr.invars]
-    carry_shapes, x_shapes = shapes[constants : constants + carried], shapes[constants + carried :]
-    out_shapes = [v.aval.shape for v in body.jaxpr.outvars]
-
-    def spread(value: Any, laned: bool) -> Any:  # a flat tuple of (trial,) arrays, or the array itself
-        if not laned:
-            return value
-        return tuple(jnp.broadcast_to(part, (trials,)) for part in _parts(value).flat)
-
-    def gather(value: Any, shape: tuple[int, ...], laned: bool) -> Any:
-        return _Lane(shape, _object_array(shape, value)) if laned else value
-
-    def rows(value: Any) -> Any:
-        if not isinstance(value, _Lane):
-            return value
-        dense = jnp.moveaxis(value.dense(trials), 0, 1)  # (time, trial, *shape)
-        return tuple(dense[(slice(None), slice(None), *i)] for i in np.ndindex(*value.shape[1:]))
-
-    def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
-        state = [gather(c, s, d) for c, s, d in zip(carry, carry_shapes, differs, strict=True)]
-        row = [gather(r, s, isinstance(v, _Lane)) for r, s, v in zip(x, x_shapes, xs, strict=True)]
-        out = _evaluate(body.jaxpr, body.consts, [*consts, *state, *row], trials)
-        after = tuple(spread(v, d) for v, d in zip(out[:carried], differs, strict=True))
-        return after, tuple(spread(v, d) for v, d in zip(out[carried:], outputs[carried:], strict=True))
-
-    first = tuple(spread(v, d) for v, d in zip(init, differs, strict=True))
-    last, ys = lax.scan(step, first, tuple(rows(v) for v in xs), params["length"], params["reverse"], params["unroll"])
-    results = [gather(c, s, d) for c, s, d in zip(last, carry_shapes, differs, strict=True)]
-    for y, shape, laned in zip(ys, out_shapes[carried:], outputs[carried:], strict=True):
-        if laned:  # (component) of (time, trial) -> (trial, time, *shape)
-            rows_of = (params["length"], *shape)
-            dense = None if 0 in rows_of else jnp.moveaxis(jnp.stack(y, axis=-1), 0, 1).reshape((trials, *rows_of))
-            y = _Lane(rows_of, np.empty(rows_of, dtype=object) if dense is None else None, dense)
-        results.append(y)
-    return results
+def _place(eqn: Any) -> str:
+    """Where in the user's files an equation stands, as far as JAX knows."""
+    trace = eqn.source_info.traceback
+    frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
+    return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""
 
 
 def _dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:

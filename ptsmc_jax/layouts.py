@@ -15,7 +15,12 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
         "plant": t.SpacecraftPlant,
         "spacecraft": t.Spacecraft,
         "initial": t.Initial,
-        "reference": {"fixed": t.FixedReference, "spin": t.SpinReference, "sinusoid": None, "slew": None},
+        "reference": {
+            "fixed": t.FixedReference,
+            "spin": t.SpinReference,
+            "sinusoid": t.SinusoidReference,
+            "slew": t.SlewReference,
+        },
         "disturbance": {
             "sinusoid": t.SinusoidDisturbance,
             "none": t.NoDisturbance,

@@ -1,8 +1,10 @@
 """What a run is judged by, accumulated interval by interval inside the rollout."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -63,8 +65,6 @@ class Metrics(NamedTuple):
 class Sight(NamedTuple):
     """What the metrics see of the true state at one time."""
 
-    error: Array  # (m,) what the law drives to zero: the attitude error vector [-], for a chain x_1
-    error_rate: Array  # (m,) [1/s]
     angle: Array  # to the reference [rad]; for a chain |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
     momentum: Array  # |J w| [N m s]
@@ -77,6 +77,10 @@ class Span(NamedTuple):
     t_next: Array
     start: Sight
     end: Sight
+    # () -> what the law drives to zero, (m,) [-], for a chain x_1, and its rate [1/s], at both ends
+    errors: Callable[[], tuple[tuple[Array, Array], tuple[Array, Array]]]
+    arrival: Callable[[], tuple[Array, Array]]  # () -> what the law drives to zero and the angle at t_f, if in here
+    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
     commanded: tuple[Array, ...]  # (m,) each [N m]
     delivered: tuple[Array, ...]
     weights: tuple[float, ...]  # sum to 1
@@ -93,18 +97,25 @@ class Judged(NamedTuple):
     settling_angle: Array
 
 
+class Late(NamedTuple):
+    """What is judged from t_f on only."""
+
+    error_at_t_f: Array  # (m,)
+    angle_at_t_f: Array
+    square_error: Array
+    hold_error: Array
+    variation: Array  # (m,) of the delivered torque [N m]
+
+
 class Running(NamedTuple):
     """Accumulators; `settled_at` is the end of the last time spent above the settling angle."""
 
-    square_error: Array
-    hold_error: Array
+    late: Late
     peak_torque: Array
     peak_torque_delivered: Array
     saturated_for: Array
     effort: Array
     settled_at: Array
-    last_torque: Array  # (m,) delivered at the end of the last interval [N m]
-    variation: Array  # (m,) of the delivered torque after t_f [N m]
     peak_rate: Array
     peak_momentum: Array
     peak_wheel_momentum: Array  # NaN without wheels
@@ -114,15 +125,12 @@ def begin(first: Sight, judged: Judged, inputs: int) -> Running:
     """Accumulators at t = 0 for a plant with this many inputs."""
     zero = jnp.zeros_like(judged.t_f)
     return Running(
-        square_error=zero,
-        hold_error=zero,
+        late=Late(jnp.zeros(inputs), zero, zero, zero, jnp.zeros(inputs)),
         peak_torque=zero,
         peak_torque_delivered=zero,
         saturated_for=zero,
         effort=zero,
         settled_at=jnp.where(_unsettled(first, judged), jnp.inf, 0.0),
-        last_torque=jnp.zeros(inputs),
-        variation=jnp.zeros(inputs),
         peak_rate=first.rate,
         peak_momentum=first.momentum,
         peak_wheel_momentum=jnp.full_like(zero, jnp.nan),
@@ -133,19 +141,11 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     """Accumulators after one interval; one of length zero changes nothing."""
     dt = span.t_next - span.t
     lasts = dt > 0.0
-    safe_dt = jnp.where(lasts, dt, 1.0)
-    after = span.t_next > judged.t_f
-
     delivered = span.delivered
     largest, largest_delivered = (
         jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques])) for torques in (span.commanded, delivered)
     )
-    nodes = list(zip(span.weights, span.commanded, delivered, strict=True))
-    effort = sum(w * jnp.sum(jnp.abs(v)) for w, _, v in nodes)
-    # total variation after t_f: the jump at the start of the interval, then what happens inside
-    jump = jnp.where(span.t > judged.t_f, jnp.abs(delivered[0] - running.last_torque), 0.0)
-    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
-    variation = jump + jnp.where(span.t >= judged.t_f, inside, 0.0)
+    effort = sum(w * jnp.sum(jnp.abs(v)) for w, v in zip(span.weights, delivered, strict=True))
 
     # the angle falls below the threshold inside the interval: linear interpolation; stays above: not yet settled
     above, above_next = _unsettled(span.start, judged), _unsettled(span.end, judged)
@@ -153,37 +153,55 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
     crossing = span.t + dt * (span.start.angle - judged.settling_angle) / drop
     settled_at = jnp.where(above_next, jnp.inf, jnp.where(above, crossing, running.settled_at))
 
-    new = Running(
-        square_error=running.square_error + _square_error(span, judged, safe_dt),
-        hold_error=jnp.where(after, jnp.maximum(running.hold_error, numerics.norm(span.end.error)), 0.0),
+    new = running._replace(
         peak_torque=jnp.maximum(running.peak_torque, largest),
         peak_torque_delivered=jnp.maximum(running.peak_torque_delivered, largest_delivered),
         saturated_for=running.saturated_for + dt * span.limited,
         effort=running.effort + dt * effort,
         settled_at=settled_at,
-        last_torque=delivered[-1],
-        variation=running.variation + variation,
         peak_rate=jnp.maximum(running.peak_rate, span.end.rate),
         peak_momentum=jnp.maximum(running.peak_momentum, span.end.momentum),
         peak_wheel_momentum=running.peak_wheel_momentum
         if span.wheel_momentum is None
         else jnp.fmax(running.peak_wheel_momentum, jnp.max(jnp.abs(span.wheel_momentum))),
     )
-    return numerics.select(lasts, new, running)
+    late = jax.lax.cond(
+        lasts & (span.t_next >= judged.t_f),
+        lambda: _late(running.late, span, judged),
+        lambda: running.late,
+    )
+    return numerics.select(lasts, new, running)._replace(late=late)
 
 
-def finish(running: Running, at_t_f: Sight, judged: Judged) -> Metrics:
-    """Metrics of the run from its accumulators and what was seen at t_f."""
-    terminal_error = numerics.norm(at_t_f.error)
-    square_error = running.square_error / judged.window
-    still = judged.t_end - judged.t_f
-    chattering = jnp.max(running.variation) / jnp.where(still > 0.0, still, 1.0)
-    none = square_error == 0.0
+def _late(late: Late, span: Span, judged: Judged) -> Late:
+    """What is judged from t_f on, after an interval that reaches t_f."""
+    delivered, errors = span.delivered, span.errors()
+    crosses = span.t < judged.t_f
+    error_at_t_f, angle_at_t_f = jax.lax.cond(crosses, span.arrival, lambda: (late.error_at_t_f, late.angle_at_t_f))
+    # total variation after t_f: the jump at the start of the interval, then what happens inside
+    jump = jnp.where(span.t > judged.t_f, jnp.abs(delivered[0] - span.last_torque), 0.0)
+    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
+    error_next, _ = errors[1]
+    held = jnp.maximum(late.hold_error, numerics.norm(error_next))
+    return Late(
+        error_at_t_f=error_at_t_f,
+        angle_at_t_f=angle_at_t_f,
+        square_error=late.square_error + _square_error(span, *errors, judged),
+        hold_error=jnp.where(span.t_next > judged.t_f, held, late.hold_error),
+        variation=late.variation + jump + jnp.where(span.t >= judged.t_f, inside, 0.0),
+    )
+
+
+def finish(running: Running, judged: Judged) -> Metrics:
+    """Metrics of the run from its accumulators."""
+    late, still = running.late, judged.t_end - judged.t_f
+    terminal_error = numerics.norm(late.error_at_t_f)
+    chattering = jnp.max(late.variation) / jnp.where(still > 0.0, still, 1.0)
     return Metrics(
         terminal_error=terminal_error,
-        terminal_angle=at_t_f.angle,
-        window_error=jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square_error))),
-        hold_error=jnp.maximum(running.hold_error, terminal_error),
+        terminal_angle=late.angle_at_t_f,
+        window_error=numerics.sqrt(late.square_error / judged.window),
+        hold_error=jnp.maximum(late.hold_error, terminal_error),
         peak_torque=running.peak_torque,
         peak_torque_delivered=running.peak_torque_delivered,
         saturated=running.saturated_for / judged.t_end,
@@ -200,14 +218,16 @@ def _unsettled(sight: Sight, judged: Judged) -> Array:
     return ~(sight.angle < judged.settling_angle)  # an angle that is no number is not settled
 
 
-def _square_error(span: Span, judged: Judged, dt: Scalar) -> Scalar:
+def _square_error(span: Span, start: tuple, end: tuple, judged: Judged) -> Scalar:
     """Integral of |error|^2 over the part of the interval inside the window; fourth order, once differentiable in t_f.
 
     The error in between is the cubic through both ends and slopes (Hermite), its square the parabola through the ends
     and the middle, integrated exactly.
     """
-    middle = (span.start.error + span.end.error) / 2 + dt / 8 * (span.start.error_rate - span.end.error_rate)
-    g0, g1, g2 = (jnp.sum(e * e) for e in (span.start.error, middle, span.end.error))
+    dt = span.t_next - span.t
+    (error, rate), (error_next, rate_next) = start, end
+    middle = (error + error_next) / 2 + dt / 8 * (rate - rate_next)
+    g0, g1, g2 = (jnp.sum(e * e) for e in (error, middle, error_next))
 
     def fraction(t: Array) -> Array:
         return jnp.clip((t - span.t) / dt, 0.0, 1.0)

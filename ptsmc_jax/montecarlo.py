@@ -15,7 +15,7 @@ from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.rollout import Parts
 
-BLOCK = 128  # trials in one block: their state stays in the cache
+BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
 
 
 @dataclass(frozen=True)
@@ -52,25 +52,36 @@ def one(parts: Parts, dispersion: Dispersion, seed, trial) -> tuple:
     return result.metrics, result.status, result.bad_time, drawn.initial
 
 
-def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> Trials:
+def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, block: int = BLOCK) -> Trials:
     """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
 
-    A trial that fails is marked by its status and kept.
+    block: trials that a device flies at a time. A trial that fails is marked by its status and kept.
     """
     trials = np.asarray(trials, dtype=np.uint32)
-    devices = jax.local_devices()
-    block = min(BLOCK, -(-trials.size // len(devices)))
-    rows = -(-trials.size // (block * len(devices))) * len(devices)
-    padded = np.resize(trials, rows * block).reshape(rows, block)
-    results = _blocks(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded), len(devices))
-    flat = jax.tree.map(lambda v: np.asarray(v).reshape(rows * block, *v.shape[2:])[: trials.size], results)
-    return Trials(trials, *flat)
+    devices = len(jax.local_devices())
+    padded = np.resize(trials, -(-trials.size // devices) * devices)
+    results = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded), devices, block)
+    return Trials(trials, *jax.tree.map(lambda v: np.asarray(v)[: trials.size], results))
 
 
-@partial(jax.jit, static_argnames="devices")
-def _blocks(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, devices: int) -> tuple:
-    fly = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial))
-    return spread(lambda rows: jax.lax.map(fly, rows), trials, devices)
+@partial(jax.jit, static_argnames=("devices", "block"))
+def _fly(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, devices: int, block: int) -> tuple:
+    def mine(trials: jax.Array) -> tuple:
+        return blocks(lambda trial: one(parts, dispersion, seed, trial), trials, block)
+
+    return spread(mine, trials, devices)
+
+
+def blocks(fly: Callable, trials: jax.Array, block: int = BLOCK) -> Any:
+    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block` trials each."""
+    count = trials.shape[0]
+    rows = max(1, -(-count // block))
+    size = -(-count // rows)
+    if rows == 1:
+        return lanes.vmap(fly)(trials)
+    padded = jnp.concatenate([trials, trials[: rows * size - count]])
+    results = jax.lax.map(lanes.vmap(fly), padded.reshape(rows, size))
+    return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 
 def spread(function: Callable, shared: jax.Array, devices: int) -> Any:

@@ -24,15 +24,26 @@ def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array,
     s: any shape; width: scalar in the units of s, at least 0. The slope at s = 0 is 1/width, and 0 for the exact sign.
     """
     exact = width <= 0.0
-    safe_width = jnp.where(exact, 1.0, width)
-    return jnp.where(exact, jnp.sign(s), jnp.tanh(s / safe_width))
+    steepness = 1.0 / jnp.where(exact, 1.0, width)
+    return jnp.where(exact, jnp.sign(s), jnp.tanh(s * steepness))
+
+
+@jax.custom_jvp
+def sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root whose derivative at 0 is set to 0, where that of a norm has no value."""
+    return jnp.sqrt(square)
+
+
+@sqrt.defjvp
+def _sqrt_jvp(primals: tuple, tangents: tuple) -> tuple:
+    root = sqrt(*primals)
+    at_zero = root == 0.0
+    return root, jnp.where(at_zero, 0.0, tangents[0] * 0.5 / jnp.where(at_zero, 1.0, root))
 
 
 def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
     """2-norm over all entries (Frobenius norm of a matrix), in the units of x; its gradient at x = 0 is set to 0."""
-    square = jnp.sum(x * x)
-    at_zero = square == 0.0
-    return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, square)))
+    return sqrt(jnp.sum(x * x))
 
 
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
@@ -63,17 +74,19 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> An
 
 _TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
 _DOUBLINGS = 40  # norms up to 2^39
+_FEW = 4  # of them
 
 
-def phi_functions(x: Float[Array, "n n"], order: int) -> list[Float[Array, "n n"]]:
+def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = None) -> list[Float[Array, "n n"]]:
     """phi_0(x) = e^x and phi_1 .. phi_order, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x, of a square matrix [-].
 
     Scaling and doubling, phi_k(2x) = 2^-k (phi_0 phi_k + sum_(j=1..k) phi_j / (k-j)!) (Skaflestad and Wright, Applied
     Numerical Mathematics 59, 2009): nothing cancels for small x, eigenvalues may repeat, and no LAPACK is called, whose
-    batched solves were seen to lock up when two of them shared a small thread pool.
+    batched solves were seen to lock up when two of them shared a small thread pool. largest: `row_norm` of the largest
+    of many matrices, which then take as many doublings as that one and no more.
     """
     one = jnp.eye(x.shape[-1], dtype=x.dtype)
-    size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(x), axis=1)))
+    size = jax.lax.stop_gradient(row_norm(x) if largest is None else largest)
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
     small = x * 2.0**-doublings
     top = one / factorial(order + _TERMS)
@@ -83,14 +96,27 @@ def phi_functions(x: Float[Array, "n n"], order: int) -> list[Float[Array, "n n"
     for k in range(order - 1, -1, -1):
         phi.insert(0, one / factorial(k) + small @ phi[0])
 
-    def double(step: Any, phi: list[Array]) -> list[Array]:
-        larger = [
-            (phi[0] @ phi[k] + sum((phi[j] / factorial(k - j) for j in range(1, k + 1)), 0.0 * one)) / 2**k
-            for k in range(order + 1)
-        ]
-        return select(step < doublings, larger, phi)
+    def step(k: Any, phi: list[Array]) -> list[Array]:
+        return jax.lax.cond(k < doublings, _double, lambda phi: phi, phi)
 
-    return jax.lax.fori_loop(0, _DOUBLINGS, double, phi)
+    # a loop of fixed length can be run backwards; few matrices need more than the first doublings
+    phi = jax.lax.fori_loop(0, _FEW, step, phi)
+    return jax.lax.cond(
+        doublings > _FEW, lambda phi: jax.lax.fori_loop(_FEW, _DOUBLINGS, step, phi), lambda phi: phi, phi
+    )
+
+
+def _double(phi: list[Array]) -> list[Array]:
+    """phi_k(2x) from phi_k(x)."""
+    return [
+        (phi[0] @ phi[k] + sum((phi[j] / factorial(k - j) for j in range(1, k + 1)), 0.0 * phi[0])) / 2**k
+        for k in range(len(phi))
+    ]
+
+
+def row_norm(x: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Largest sum of magnitudes in a row."""
+    return jnp.max(jnp.sum(jnp.abs(x), axis=1))
 
 
 class Decay(NamedTuple):
@@ -102,10 +128,15 @@ class Decay(NamedTuple):
     ends: tuple[Array, Array, Array]  # weights of the forcing at the start, the middle (twice) and the end [s]
 
 
-def decay(a: Float[Array, "n n"], dt: Scalar) -> Decay:
-    """Coefficients of Cox and Matthews, J. Comput. Phys. 176 (2002), eqs. (26)-(29), for m' = -A m + forcing."""
-    half, phi_half = phi_functions(-a * dt / 2, 1)
-    full, p1, p2, p3 = phi_functions(-a * dt, 3)
+def decay(a: Float[Array, "n n"], dt: Scalar, longest: Scalar | None = None) -> Decay:
+    """Coefficients of Cox and Matthews, J. Comput. Phys. 176 (2002), eqs. (26)-(29), for m' = -A m + forcing.
+
+    longest: of many steps dt [s] that this one is among; see `phi_functions`.
+    """
+    largest = None if longest is None else row_norm(a) * longest
+    halves = phi_functions(-a * dt / 2, 3, None if largest is None else largest / 2)
+    half, phi_half, *_ = halves
+    full, p1, p2, p3 = _double(halves)
     ends = (dt * (p1 - 3 * p2 + 4 * p3), dt * 2 * (p2 - 2 * p3), dt * (4 * p3 - p2))
     return Decay(half, full, dt / 2 * phi_half, ends)
 

@@ -15,7 +15,7 @@ from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.controllers import Law
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.hardware import Actuators, Drive
+from ptsmc_jax.hardware import Actuators
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
@@ -90,7 +90,6 @@ class _State(NamedTuple):
     u: Array  # delivered at the end of the last interval
     sight: metrics.Sight
     running: metrics.Running
-    at_t_f: tuple  # what the state at t_f is computed from
     status: Array
     bad_time: Array
 
@@ -100,8 +99,8 @@ class _Flight(NamedTuple):
 
     sensing: Any  # memory of the sensors
     seen: Any  # state as the law saw it at the last sample
-    # what the observer is told of the last period: mean torque, and momentum of the wheels in it
-    applied: tuple[Array, Array | None]
+    # what the observer is told of the last period: mean torque, and momentum of the wheels in it; None: torque held
+    applied: tuple[Array, Array | None] | None
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
 
@@ -140,23 +139,29 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
 
     def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
         step = dt / parts.substeps
-        for k in range(parts.substeps):
+
+        def substep(k: Scalar, x: Any) -> Any:
             u, stored = actuators.over(drive, k * step, step)
 
-            def rate(time: Scalar, y: Any, u: Array = u, stored: Array | None = stored) -> Any:
+            def rate(time: Scalar, y: Any) -> Any:
                 d = parts.disturbance(time, y)
-                u = _with_wheels(u, stored, parts.plant.velocity(y))
-                return parts.plant.rate(y, u, d if pushed is None else d + pushed)
+                acting = _with_wheels(u, stored, parts.plant.velocity(y))
+                return parts.plant.rate(y, acting, d if pushed is None else d + pushed)
 
-            x = numerics.rk4(rate, t + k * step, x, step)
-        return parts.plant.normalise(x)
+            return numerics.rk4(rate, t + k * step, x, step)
+
+        if parts.substeps == 1:
+            return parts.plant.normalise(substep(jnp.zeros_like(dt), x))
+        starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+        return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
 
     def period(carry: tuple[_State, _Flight], tick: tuple) -> tuple[tuple[_State, _Flight], Any]:
         (now, dt_before, partial), (state, flight) = tick, carry
         dt = now.t_next - now.t
         seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
         w = parts.plant.velocity(seen)
-        applied = _with_wheels(*flight.applied, (parts.plant.velocity(flight.seen) + w) / 2)
+        told = (state.u, None) if flight.applied is None else flight.applied
+        applied = _with_wheels(*told, (parts.plant.velocity(flight.seen) + w) / 2)
         d_hat = observer.update(
             jnp.where(partial, first_matrix, matrix), state.d_hat, flight.seen, seen, applied, dt_before
         )
@@ -176,22 +181,23 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
             weights, torques = (1.0,), (delivered,)
         acting = actuators.end(drive, queue, dt)
         span = _Torques((u,) * len(torques), torques, weights, drive.limited, acting.h)
-        from_here = (now.t, state.x, drive, pushed)
-        state = _advance(parts, judged, state, now, x, d_hat, span, from_here, dt / parts.substeps)
-        return (state, _Flight(sensing, seen, actuators.over(drive, jnp.zeros_like(dt), dt), acting, pushed)), row
+        start = state.x
+
+        def until(t: Scalar) -> Any:
+            return fly(start, now.t, drive, pushed, t - now.t)
+
+        state = _advance(parts, judged, state, now, x, d_hat, span, until, dt / parts.substeps)
+        told = None if actuators.holds else actuators.over(drive, jnp.zeros_like(dt), dt)
+        return (state, _Flight(sensing, seen, told, acting, pushed)), row
 
     state, none = _begin(parts, judged, x0), jnp.zeros(parts.plant.inputs)
     first = state.sight
     acting = actuators.begin(parts.plant.inputs)
     sensing = None if sensors is None else sensors.begin(seed, trial, x0, ticks.sample[0])
     told = (none, None if actuators.wheels is None else none)
-    flight = _Flight(sensing, x0, told, acting, None if parts.walk_rate is None else none)
-    drive = Drive(acting.v, acting.v, acting.h, jnp.asarray(False))  # of no period yet
-    state = state._replace(at_t_f=(jnp.zeros_like(judged.t_f), x0, drive, flight.pushed))
+    flight = _Flight(sensing, x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none)
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
-    t, x, drive, pushed = state.at_t_f
-    at_t_f = _sight(parts, judged.t_f, fly(x, t, drive, pushed, judged.t_f - t))
-    return _finish(parts, judged, first, state, at_t_f, k2, rows, flight.pushed, held=True)
+    return _finish(parts, judged, first, state, k2, rows, flight.pushed, held=True)
 
 
 def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
@@ -205,7 +211,9 @@ def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, see
     controller = parts.controller
     observer: Observer = parts.observer
     k2 = observer.error_bound()
-    decays = jax.vmap(lambda dt: numerics.decay(observer.decay_matrix(), dt))(ticks.t_next - ticks.t)
+    lengths = ticks.t_next - ticks.t
+    longest = jax.lax.stop_gradient(jnp.max(lengths))
+    decays = jax.vmap(lambda dt: numerics.decay(observer.decay_matrix(), dt, longest))(lengths)
 
     def step(state: _State, tick: tuple) -> tuple[_State, Any]:
         now, linear = tick
@@ -222,13 +230,12 @@ def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, see
         _, _, (u_end, _) = rate(now.t_next, x, d_hat)
         torques = (u, u_middle, u_end)
         span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
-        return _advance(parts, judged, state, now, x, d_hat, span, None, dt), row
+        return _advance(parts, judged, state, now, x, d_hat, span, lambda t: x, dt), row
 
     state = _begin(parts, judged, x0)
     first = state.sight
-    state = state._replace(at_t_f=(first,))
     state, rows = jax.lax.scan(step, state, (ticks, decays))
-    return _finish(parts, judged, first, state, state.at_t_f[0], k2, rows, None, held=False)
+    return _finish(parts, judged, first, state, k2, rows, None, held=False)
 
 
 def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
@@ -240,7 +247,6 @@ def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
         u=none,
         sight=sight,
         running=metrics.begin(sight, judged, parts.plant.inputs),
-        at_t_f=(),
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
@@ -258,29 +264,36 @@ class _Torques(NamedTuple):
     wheel_momentum: Array | None
 
 
-def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torques, at_t_f, step) -> _State:
-    """The state after an interval: metrics, status and what the state at t_f is computed from (None: this sight).
+def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torques, until, step) -> _State:
+    """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
     step: longest integration step taken in it [s].
     """
+    law, reference = parts.controller, parts.reference
     sight = _sight(parts, now.t_next, x)
-    span = metrics.Span(now.t, now.t_next, state.sight, sight, *torques)
-    crosses = (now.t < judged.t_f) & (judged.t_f <= now.t_next)
+
+    def errors() -> tuple:
+        return law.errors(state.x, reference(now.t)), law.errors(x, reference(now.t_next))
+
+    def arrival() -> tuple:
+        reached, target = until(judged.t_f), reference(judged.t_f)
+        return law.errors(reached, target)[0], law.angle(reached, target)
+
+    span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
     status, bad_time = _watch(parts, state, now.t_next, step, x, torques.delivered[-1])
     return _State(
         x=x,
         d_hat=d_hat,
-        u=torques.delivered[-1],
+        u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
         sight=sight,
         running=metrics.update(state.running, span, judged),
-        at_t_f=numerics.select(crosses, (sight,) if at_t_f is None else at_t_f, state.at_t_f),
         status=status,
         bad_time=bad_time,
     )
 
 
-def _finish(parts: Parts, judged, first, state: _State, at_t_f, k2, rows, pushed, *, held: bool) -> Result:
-    log = None
+def _finish(parts: Parts, judged, first, state: _State, k2, rows, pushed, *, held: bool) -> Result:
+    log, angle_at_t_f = None, state.running.late.angle_at_t_f
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
@@ -288,29 +301,20 @@ def _finish(parts: Parts, judged, first, state: _State, at_t_f, k2, rows, pushed
         u = state.u if held else u
         last = _row(parts, judged.t_end, state.x, state.d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
-    missed = (state.status == OK) & (at_t_f.angle > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
+    missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
     bad_time = jnp.where(missed, judged.t_f, state.bad_time)
-    return Result(metrics.finish(state.running, at_t_f, judged), status, bad_time, log)
+    return Result(metrics.finish(state.running, judged), status, bad_time, log)
 
 
 def _sight(parts: Parts, t: Scalar, x: Any) -> metrics.Sight:
-    target = parts.reference(t)
-    error, error_rate = parts.controller.errors(x, target)
-    return metrics.Sight(
-        error,
-        error_rate,
-        parts.controller.angle(x, target),
-        parts.plant.speed(x),
-        numerics.norm(parts.plant.momentum(x)),
-    )
+    angle = parts.controller.angle(x, parts.reference(t))
+    return metrics.Sight(angle, parts.plant.speed(x), numerics.norm(parts.plant.momentum(x)))
 
 
 def _watch(parts: Parts, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array) -> tuple[Array, Array]:
     """Status and first bad time after an interval; the first thing that goes wrong stays."""
-    finite = jnp.all(jnp.isfinite(u))
-    for leaf in jax.tree.leaves(x):
-        finite = finite & jnp.all(jnp.isfinite(leaf))
+    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((x, u))))
     fast = parts.plant.too_fast(x, dt)
     near = parts.controller.clearance(x, parts.reference(t)) < SINGULAR_CLEARANCE
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)

@@ -197,9 +197,22 @@ def _frequencies(scenario: Scenario) -> dict[str, float]:
     found = {"disturbance.frequency": float(max(waves))}
     if scenario.initial is not None:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate))
-        found["reference.rate"] = float(np.linalg.norm(getattr(scenario.reference, "rate", 0.0)))
+        found |= _reference_frequencies(scenario.reference)
         found["controller.eta"] = 2.0 * scenario.controller.eta / scenario.controller.t_f  # of the slew
     return found
+
+
+def _reference_frequencies(table: Any) -> dict[str, float]:
+    """How fast the reference turns and changes [rad/s], by the key that says so."""
+    if isinstance(table, t.SpinReference):
+        return {"reference.rate": float(np.linalg.norm(table.rate))}
+    if isinstance(table, t.SinusoidReference):
+        turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
+        return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
+    if isinstance(table, t.SlewReference):  # largest rate of the quintic, and the motion's own time
+        turning = 1.875 * float(np.linalg.norm(checks.turn(table)))
+        return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
+    return {}
 
 
 def _fastest(scenario: Scenario) -> float:
@@ -229,7 +242,14 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     value = getattr(getattr(scenario, table), name, None)
     if value is None:  # of a term in a sum
         value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
-    return wrong(key, value, f"lower: {asks}")
+    return wrong(key, value, f"{'longer' if key == 'reference.duration' else 'lower'}: {asks}")
+
+
+@jax.jit  # one program, where each of its operations would be one
+def _boundary_layer(controller: Any, observer: Any) -> tuple:
+    """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
+    bound = observer.error_bound()
+    return controller.boundary_layer(jnp.maximum(bound.floor, bound.start))
 
 
 def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, saves: object) -> clock.Graded:
@@ -244,13 +264,12 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
             observer.disturbance_rate_bound,
             observer.initial_error,
         )
-    bound = observer.error_bound()
     widest = dataclasses.replace(
         controller, t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
     )
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:
-        before, after = widest.boundary_layer(jnp.maximum(bound.floor, bound.start))
+        before, after = _boundary_layer(widest, observer)
         layer = (float(before), float(after))
     rate, frequency = widest.hold_rate(), _fastest(scenario)
     order = scenario.plant.order if isinstance(scenario.plant, t.ChainPlant) else 1

@@ -53,6 +53,60 @@ class Spin:
         return Target(turned, self.rate, jnp.zeros(3))
 
 
+def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
+    """Target at t [s] of a reference attitude given as a function of time; its derivatives are exact (autodiff).
+
+    w = 2 vec(q* q') and w' = 2 vec(q* q''), since q*' q' = |q'|^2 has no vector part.
+    """
+    q = path(t)
+    q_dot, q_ddot = time_derivative(path, t), time_derivative(lambda t: time_derivative(path, t), t)
+    inverse = attitude.conjugate(q)
+    return Target(q, 2.0 * attitude.multiply(inverse, q_dot)[:3], 2.0 * attitude.multiply(inverse, q_ddot)[:3])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Swing:
+    """A reference that swings about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
+
+    q: Leaf  # (4,) the attitude it swings about
+    amplitude: Leaf  # (3,) of the rotation vector, per axis [rad]
+    frequency: Leaf  # (3,) [rad/s]
+    phase: Leaf  # (3,) [rad]
+
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]."""
+
+        def path(t: Time) -> Float[Array, "4"]:
+            turn = self.amplitude * jnp.sin(self.frequency * t + self.phase)
+            return attitude.multiply(self.q, attitude.from_rotation_vector(turn))
+
+        return moving(path, t)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Slew:
+    """A reference that turns about a fixed axis from rest to rest: q_f(t) = q exp(share(t / duration) turn).
+
+    share(x) = 10 x^3 - 15 x^4 + 6 x^5, 0 before and 1 after: its first two derivatives vanish at both ends.
+    """
+
+    q: Leaf  # (4,) attitude until t = 0
+    turn: Leaf  # (3,) rotation vector to the attitude from t = duration on [rad]
+    duration: Leaf  # [s]
+
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]."""
+
+        def path(t: Time) -> Float[Array, "4"]:
+            x = jnp.clip(t / self.duration, 0.0, 1.0)
+            share = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+            return attitude.multiply(self.q, attitude.from_rotation_vector(share * self.turn))
+
+        return moving(path, t)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Origin:

@@ -78,6 +78,19 @@ class SpinReference(Attitude, frozen=True):
     rate: Three = (0.0, 0.0, 0.0)
 
 
+class SinusoidReference(Attitude, frozen=True):
+    kind: Literal["sinusoid"] = "sinusoid"
+    amplitude: Three = (0.1, 0.1, 0.1)
+    frequency: Three = (0.1, 0.1, 0.1)
+    phase: Three = (0.0, 0.0, 0.0)
+
+
+class SlewReference(Attitude, frozen=True):
+    kind: Literal["slew"] = "slew"
+    to_quat_xyzw: Four = (0.0, 0.0, 0.0, 1.0)
+    duration: Positive = 30.0
+
+
 class NoDisturbance(Table, frozen=True):
     kind: Literal["none"] = "none"
 
@@ -319,7 +332,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     plant: SpacecraftPlant | ChainPlant
     spacecraft: Spacecraft | None = None
     initial: Initial | None = None
-    reference: FixedReference | SpinReference | None = None
+    reference: FixedReference | SpinReference | SinusoidReference | SlewReference | None = None
     disturbance: (
         NoDisturbance
         | ConstantDisturbance

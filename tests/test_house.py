@@ -16,7 +16,7 @@ from tests.helpers import ROOT
 FLOORS = {
     "ptsmc_jax": """
         configure
-        numerics
+        numerics elementary
         draws
         attitude
         plants
@@ -25,6 +25,7 @@ FLOORS = {
         sensors
         metrics
         rollout
+        components
         lanes
         theory linear
         requirements

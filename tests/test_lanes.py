@@ -1,5 +1,6 @@
 """`lanes.vmap` against `jax.vmap`, over a table of functions: one row for each kind of primitive and of structure."""
 
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -372,7 +373,26 @@ CASES = {
 }  # fmt: skip
 
 
+# what has no rule of its own
+WITHOUT_RULE = {
+    f"others: {name}"
+    for name in (
+        "custom_vjp", "solve", "inverse and determinant", "cholesky and eigh", "solve with a constant matrix", "svd",
+        "fft", "convolve", "random numbers",
+    )
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_lanes_compute_what_vmap_does(name):
     function, *args = CASES[name]
-    check(function, *args)
+    with pytest.warns(lanes.LanesWarning, match="no rule") if name in WITHOUT_RULE else nullcontext():
+        check(function, *args)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_strict_lanes_refuse_what_has_no_rule_and_nothing_else(name):
+    function, *args = CASES[name]
+    refused = pytest.raises(NotImplementedError, match="lanes have no rule for the primitive `")
+    with refused if name in WITHOUT_RULE else nullcontext():
+        jax.eval_shape(lanes.vmap(function, strict=True), *args)

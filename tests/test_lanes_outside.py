@@ -92,6 +92,7 @@ OUTSIDE = {
 }  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.lanes.LanesWarning")
 @pytest.mark.parametrize("name", OUTSIDE)
 def test_lanes_compose_with_transformations_from_outside(name):
     got, expected = (jax.jit(partial(OUTSIDE[name], vmap))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
@@ -129,6 +130,7 @@ ROWS = [
 ]  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.lanes.LanesWarning")
 @pytest.mark.parametrize(("function", "args", "in_axes"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
 def test_arguments_mapped_and_shared(function, args, in_axes):
     check(function, *args, in_axes=in_axes)
@@ -208,6 +210,77 @@ def test_what_no_trial_touches_is_computed_once(run):
     assert [eqn.outvars[0].aval.shape for eqn in exponentials] == [()]
     (times, states) = jax.eval_shape(lanes.vmap(run), S)[1]
     assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))
+
+
+def primitives(jaxpr):
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jaxprs_in_params(eqn.params):
+            yield from primitives(inner)
+
+
+def test_a_branch_on_the_time_stays_a_branch():
+    def run(s):
+        late = lambda c, k: lax.cond(k > 3, lambda: jnp.exp(c), lambda: c)  # noqa: E731
+        return lax.scan(lambda c, k: (late(c, k), None), s, jnp.arange(6))[0]
+
+    def by_trial(s):
+        return lax.cond(s > 0, lambda: jnp.exp(s), lambda: s)
+
+    branches, selected = (list(primitives(jax.make_jaxpr(lanes.vmap(f))(S).jaxpr)) for f in (run, by_trial))
+    (cond,) = [eqn for eqn in branches if eqn.primitive.name == "cond"]
+    assert [v.aval.shape for v in cond.outvars] == [(TRIALS,)]
+    assert not [eqn for eqn in selected if eqn.primitive.name == "cond"]
+
+
+def test_a_loop_that_all_trials_leave_at_once_tests_one_number():
+    def run(s):
+        return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, s))
+
+    (loop,) = [e for e in primitives(jax.make_jaxpr(lanes.vmap(run))(S).jaxpr) if e.primitive.name == "while"]
+    assert sorted(v.aval.shape for v in loop.outvars) == [(), (TRIALS,)]
+
+
+def test_custom_derivatives_are_evaluated_by_components():
+    traced = jax.make_jaxpr(lambda x: jax.jvp(lanes.vmap(cubed), (x,), (x,)))(X)
+    shapes = {v.aval.shape for eqn in primitives(traced.jaxpr) for v in eqn.outvars if eqn.primitive.name == "mul"}
+    assert shapes == {(TRIALS,)}
+
+
+@jax.custom_jvp
+def scaled(n, x):
+    return n * x**2
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents):
+    return scaled(*primals), 7.0 * primals[0] * tangents[1]  # not the true slope, so that it shows
+
+
+@pytest.mark.parametrize("in_axes", [(0, 0), (None, 0), (0, None)])
+def test_custom_derivatives_beside_whole_numbers_survive(in_axes):
+    n, x = (jnp.arange(TRIALS), jnp.arange(TRIALS) * 0.5)
+    n, x = (v if axis == 0 else v[3] for v, axis in zip((n, x), in_axes, strict=True))
+    got, expected = (
+        jax.jit(lambda x, vmap=vmap: jax.jvp(lambda x: vmap(scaled, in_axes)(n, x), (x,), (jnp.ones_like(x),)))(x)
+        for vmap in (lanes.vmap, jax.vmap)
+    )
+    agree(got, expected)
+
+
+def test_a_large_carry_is_carried_whole():
+    big = draw(70)
+    traced = jax.make_jaxpr(lanes.vmap(lambda t: lax.scan(lambda c, _: (2 * c, None), t, None, 3)[0]))(big)
+    (loop,) = [eqn for eqn in primitives(traced.jaxpr) if eqn.primitive.name == "scan"]
+    assert [v.aval.shape for v in loop.outvars] == [(TRIALS, 70)]
+
+
+def test_the_warning_and_the_error_name_the_primitive_and_the_place():
+    matrices = jnp.stack([jnp.eye(3), 2 * jnp.eye(3)])
+    with pytest.warns(lanes.LanesWarning, match="`cholesky`.*jax.vmap evaluates it, which may be slow"):
+        lanes.vmap(jnp.linalg.cholesky)(matrices)
+    with pytest.raises(NotImplementedError, match=r"`random_seed` \(.*test_lanes_outside\.py:\d+\)"):
+        lanes.vmap(lambda i: jax.random.key(i), strict=True)(jnp.arange(3))
 
 
 def test_large_arrays_are_not_taken_apart():

@@ -73,20 +73,33 @@ def test_settling_time(run):
 
 
 def span(t, t_next, angles, torque=0.0, delivered=None):
-    start, end = (metrics.Sight(vector([a / 2, 0, 0]), jnp.zeros(3), vector(a), vector(a), vector(a)) for a in angles)
+    start, end = (metrics.Sight(vector(a), vector(a), vector(a)) for a in angles)
     u = vector([torque, 0.0, 0.0])
     got = u if delivered is None else vector([delivered, 0.0, 0.0])
+    first, last = ((vector([a / 2, 0, 0]), jnp.zeros(3)) for a in angles)
     return metrics.Span(
-        vector(t), vector(t_next), start, end, (u,), (got,), (1.0,), jnp.asarray(delivered is not None), None
+        t=vector(t),
+        t_next=vector(t_next),
+        start=start,
+        end=end,
+        errors=lambda: (first, last),
+        arrival=lambda: (last[0], end.angle),
+        last_torque=jnp.zeros(3),
+        commanded=(u,),
+        delivered=(got,),
+        weights=(1.0,),
+        limited=jnp.asarray(delivered is not None),
+        wheel_momentum=None,
     )
 
 
 def judge(spans, t_end=4.0):
     judged = metrics.Judged(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
-    running = metrics.begin(spans[0].start, judged, 3)
+    running, torque = metrics.begin(spans[0].start, judged, 3), jnp.zeros(3)
     for one in spans:
-        running = metrics.update(running, one, judged)
-    return metrics.finish(running, spans[1].start, judged)
+        running = metrics.update(running, one._replace(last_torque=torque), judged)
+        torque = one.delivered[-1] if one.t_next > one.t else torque
+    return metrics.finish(running, judged)
 
 
 def test_settling_interpolates_restarts_and_is_nan_where_it_never_comes():
@@ -110,16 +123,18 @@ def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
 def test_an_interval_of_length_zero_changes_nothing():
     plain = [span(0, 1, (1.0, 0.5), 1.0), span(1, 4, (0.5, 0.2), 0.5)]
     with_empty = [plain[0], span(1, 1, (9.0, 9.0), 99.0), plain[1]]
-    judged = metrics.Judged(vector(1.0), vector(4.0), vector(1.0), vector(0.1))
-    results = []
-    for spans in (plain, with_empty):
-        running = metrics.begin(spans[0].start, judged, 3)
-        for one in spans:
-            running = metrics.update(running, one, judged)
-        results.append(metrics.finish(running, plain[1].start, judged))
-    for a, b in zip(*results, strict=True):
+    for a, b in zip(judge(plain), judge(with_empty), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_catalogue_names_every_metric():
     assert tuple(metrics.CATALOGUE) == metrics.Metrics._fields
+
+
+@pytest.mark.parametrize("flight", [False, True])
+def test_the_last_row_holds_the_torque_of_the_last_period(flight):
+    """Periods beyond t_end, of length zero, and the first one before t = 0 leave nothing behind."""
+    run = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), flight=flight, reach=(25.0, 2.0))
+    log = rollout.simulate_jit(run, np.uint32(1), np.uint32(4), record=True).log
+    rows = np.flatnonzero(np.asarray(log.lasts))
+    np.testing.assert_array_equal(log.u[rows[-1]], log.u[rows[-2]])

@@ -70,9 +70,18 @@ def test_perfect_estimate_gives_the_exact_solution(eta, rate):
     np.testing.assert_allclose(np.asarray(log.s)[before], exact.s, rtol=0, atol=3e-9)
 
 
-def test_exact_solution_for_a_moving_reference():
-    spin = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.004, -0.006, 0.005))
-    run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=spin, rate=(0.01, 0.0, -0.01))), 2)
+TILTED = vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06))
+MOVING = {
+    "spin": signals.Spin(TILTED, vector(0.004, -0.006, 0.005)),
+    "sinusoid": signals.Swing(TILTED, vector(0.1, -0.05, 0.08), vector(0.1, 0.15, 0.2), vector(0.0, 1.0, 2.0)),
+    "slew": signals.Slew(TILTED, vector(0.3, 0.4, -0.2), vector(25.0)),
+}
+
+
+@pytest.mark.parametrize("kind", MOVING)
+def test_exact_solution_for_a_moving_reference(kind):
+    moving = MOVING[kind]
+    run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=moving, rate=(0.01, 0.0, -0.01))), 2)
     log = fly(run, record=True).log
     assert log is not None
     before = np.asarray(log.t) < 19.89

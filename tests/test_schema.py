@@ -101,6 +101,14 @@ COMPLETE = [
     *({"initial": {**attitude, "rate": [0.0, 0.0, 0.1]}} for attitude in ATTITUDES),
     *({"reference": {"kind": "fixed", **attitude}} for attitude in ATTITUDES),
     *({"reference": {"kind": "spin", **attitude, "rate": [0.0, 0.0, 0.01]}} for attitude in ATTITUDES),
+    *(
+        {"reference": {**moving, **attitude}}
+        for attitude in ATTITUDES
+        for moving in (
+            {"kind": "sinusoid", "amplitude": [0.1] * 3, "frequency": [0.2] * 3, "phase": [0.3] * 3},
+            {"kind": "slew", "to_quat_xyzw": [0.6, 0.0, 0.0, 0.8], "duration": 20.0},
+        )
+    ),
     {"spacecraft": {"inertia": [[10.0, 1.0, 0.0], [1.0, 12.0, 0.5], [0.0, 0.5, 14.0]]}},
     {"disturbance": {"kind": "constant", "amplitude": [0.01, 0.01, 0.01]}},
     {"disturbance": {"kind": "none"}},

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, signals
+from ptsmc_jax import attitude, scenario, signals
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
@@ -116,3 +116,79 @@ def test_signals_are_frozen_pytrees_and_every_number_is_a_leaf(signal, leaves):
     name = dataclasses.fields(signal)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError):
         setattr(signal, name, jnp.zeros(3))
+
+
+# references that swing and slew
+
+
+def body_rate(r, r_dot):
+    """Rate of exp(r) in the axes it leads to: the right Jacobian of SO(3) times r' (Chirikjian 2011, eq. 10.86)."""
+    zero = jnp.zeros(())
+    x = jnp.stack([jnp.stack(row) for row in ([zero, -r[2], r[1]], [r[2], zero, -r[0]], [-r[1], r[0], zero])])
+    angle = jnp.sqrt(r @ r)
+    jacobian = jnp.eye(3) - (1 - jnp.cos(angle)) / angle**2 * x + (angle - jnp.sin(angle)) / angle**3 * (x @ x)
+    return jacobian @ r_dot
+
+
+SWING = signals.Swing(vector(START.as_quat()), vector(0.4, -0.2, 0.7), vector(0.1, 0.3, 0.05), vector(0.2, 1.0, -0.5))
+
+
+@pytest.mark.parametrize("t", [0.0, 3.0, 41.0])
+def test_swing_against_the_jacobian_of_the_rotation_vector(t):
+    def vector_at(t):
+        return SWING.amplitude * jnp.sin(SWING.frequency * t + SWING.phase)
+
+    def rate_at(t):
+        return body_rate(vector_at(t), SWING.amplitude * SWING.frequency * jnp.cos(SWING.frequency * t + SWING.phase))
+
+    got = target(SWING, vector(t))
+    exact = (START * Rotation.from_rotvec(np.array(vector_at(t)))).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=20 * EPS)
+    np.testing.assert_allclose(got.w, rate_at(t), rtol=0, atol=1e-14)
+    _, w_dot = jax.jvp(rate_at, (vector(t),), (vector(1.0),))
+    np.testing.assert_allclose(got.w_dot, w_dot, rtol=0, atol=1e-13)  # rates of 0.1 rad/s, polynomials twice derived
+
+
+def test_swing_about_one_axis_is_a_pendulum():
+    swing = signals.Swing(vector(START.as_quat()), vector(0.0, 0.5, 0.0), vector(1.0, 0.2, 1.0), vector(0.0, 0.3, 0.0))
+    for t in TIMES:
+        got = target(swing, vector(t))
+        phase = 0.2 * t + 0.3
+        np.testing.assert_allclose(got.w, [0.0, 0.1 * np.cos(phase), 0.0], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(got.w_dot, [0.0, -0.02 * np.sin(phase), 0.0], rtol=0, atol=1e-13)
+
+
+TURN = np.array([0.5, -1.5, 2.0])
+
+
+@pytest.mark.parametrize("t", [-5.0, 0.0, 0.02, 7.0, 20.0, 39.9, 40.0, 60.0])
+def test_slew_is_a_quintic_about_a_fixed_axis(t):
+    slew = signals.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))
+    got, x = target(slew, vector(t)), np.clip(t / 40.0, 0.0, 1.0)
+    share, rate = x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / 40.0
+    second = 60 * x * (1 - x) * (1 - 2 * x) / 40.0**2
+    exact = (START * Rotation.from_rotvec(share * TURN)).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=20 * EPS)
+    np.testing.assert_allclose(got.w, rate * TURN, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(got.w_dot, second * TURN, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("signal", [SWING, signals.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))])
+def test_moving_references_solve_the_kinematics(signal):
+    for t in (0.5, 11.0, 39.0):
+        _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(signal, vector(t))
+        np.testing.assert_allclose(first, kinematics, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(v_dot, first[:3], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(v_ddot, second[:3], rtol=0, atol=1e-13)
+
+
+def test_moving_references_are_built_as_their_tables_say():
+    swing = scenario.study(scenario.from_tables({"reference": {"kind": "sinusoid", "mrp": [0.1, 0.0, 0.0]}}))
+    half = 4 * np.arctan(0.1) / 2
+    np.testing.assert_allclose(swing.parts.reference.q, [np.sin(half), 0.0, 0.0, np.cos(half)], atol=1e-15)
+    np.testing.assert_array_equal(swing.parts.reference.amplitude, [0.1] * 3)
+    table = {"kind": "slew", "quat_xyzw": [0.6, 0.0, 0.0, 0.8], "to_quat_xyzw": [0.0, 0.0, 0.0, -1.0], "duration": 20.0}
+    slew = scenario.study(scenario.from_tables({"reference": table})).parts.reference
+    np.testing.assert_allclose(slew.turn, [-2 * np.arcsin(0.6), 0.0, 0.0], atol=1e-15)  # the short way
+    end = slew(jnp.asarray(20.0)).q
+    np.testing.assert_allclose(end * np.sign(end[3]), [0.0, 0.0, 0.0, 1.0], atol=1e-15)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax import lanes, montecarlo, rollout
+from ptsmc_jax import montecarlo, rollout
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.rollout import Parts
@@ -47,5 +47,5 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
         ]
         return error, jnp.stack(over) if over else jnp.zeros(0)
 
-    errors, over = lanes.vmap(fly)(problem.trials)
+    errors, over = montecarlo.blocks(fly, problem.trials)
     return 0.5 * jnp.log(jnp.mean(errors[: problem.averaged] ** 2)), over.T

@@ -28,8 +28,7 @@ POLISHED = 3  # starts that are polished
 POLISH_STEPS = 40  # iterations of each, at most
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
-CANDIDATES = 32  # points flown for each start that is chosen, a multiple of TOGETHER
-TOGETHER = 8  # of them in one batch
+CANDIDATES = 32  # points flown for each start that is chosen
 CHARGE, APART = 3.0, 0.15
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
 SCREENED = 4096  # trials looked through for those that a limit depends on
@@ -71,9 +70,7 @@ def starting_points(problem: Problem, bounds: Bounds, own: np.ndarray, starts: i
     share = qmc.LatinHypercube(len(bounds.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
     share = 0.02 + 0.96 * share
     z = np.log(share / (1.0 - share))
-    batches = z.reshape(-1, TOGETHER, z.shape[1])
-    flown = _fly(problem, bounds, batches, _divisor(len(batches)))
-    f, c = (np.asarray(v).reshape(len(z), *v.shape[2:]) for v in flown)
+    f, c = map(np.asarray, _fly(problem, bounds, z, _divisor(len(z))))
     merit = f + CHARGE * np.log1p(c.max(axis=(1, 2), initial=0.0))
     order = [k for k in np.argsort(merit) if np.isfinite(merit[k])]
     chosen: list[int] = []
@@ -225,10 +222,10 @@ def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
 def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """Measures f and c of (batches, points, gains) free reals, without derivatives, batch after batch."""
+    """Measures f and c of (points, gains) free reals, without derivatives, point after point."""
 
     def share(z: jax.Array) -> tuple:
-        return jax.lax.map(jax.vmap(lambda z: measure(problem, bounds.gains(z))), z)
+        return jax.lax.map(lambda z: measure(problem, bounds.gains(z)), z)
 
     return montecarlo.spread(share, z, devices)
 
@@ -248,7 +245,7 @@ def _evaluate(problem: Problem, bounds: Bounds, z: np.ndarray) -> tuple[np.ndarr
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
 def _compiled(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """Tangents forward, as one more batch axis."""
+    """Tangents forward, as one more batch axis; start after start, so that a branch on the time stays a branch."""
 
     def one(z: jax.Array) -> tuple:
         def twice(z: jax.Array) -> tuple:
@@ -258,4 +255,4 @@ def _compiled(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> t
         (f_slope, c_slope), (f, c) = jax.jacfwd(twice, has_aux=True)(z)
         return bounds.gains(z), f, c, f_slope, c_slope
 
-    return montecarlo.spread(jax.vmap(one), z, devices)
+    return montecarlo.spread(lambda z: jax.lax.map(one, z), z, devices)

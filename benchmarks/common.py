@@ -1,0 +1,112 @@
+"""What the benchmarks share: the study that they fly, the C program, medians of interleaved runs."""
+
+import ctypes
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import scenario
+from ptsmc_jax.clock import Anchored
+from ptsmc_jax.rollout import Parts
+from ptsmc_jax.scenario import Study
+
+HERE = Path(__file__).parent
+SCENARIO = HERE.parent / "scenarios" / "first_flight.toml"
+C_METRICS = (
+    "peak_torque terminal_error terminal_angle window_error hold_error effort settling_time chattering peak_rate "
+    "peak_momentum"
+).split()
+
+
+def study(noise: bool = False, **changes) -> Study:
+    """The first flight's study with its sensors' noise or without."""
+    quiet = {} if noise else {"hardware__attitude_noise": None, "hardware__rate_noise": None}
+    return scenario.study(scenario.replace(scenario.read(SCENARIO), **quiet, **changes))
+
+
+def machine() -> str:
+    """One line on what this runs on."""
+    cores = len(os.sched_getaffinity(0))
+    name = next((x.split(":")[1].strip() for x in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in x),
+                platform.processor())  # fmt: skip
+    wide = "AVX-512" if "avx512f" in Path("/proc/cpuinfo").read_text() else "no AVX-512"
+    return f"{cores} cores of {name} ({wide}), Python {platform.python_version()}, jax {jax.__version__}, float64"
+
+
+def medians(runs: dict[str, Callable], repeats: int = 7) -> dict[str, float]:
+    """Seconds of each run, the median over rounds in which all take turns; a first round is not counted."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(repeats + 1):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            jax.block_until_ready(run())
+            if turn:
+                times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(seconds)) for name, seconds in times.items()}
+
+
+def steps(parts: Parts) -> int:
+    """Control periods of a run, those of length zero included."""
+    assert isinstance(parts.clock, Anchored)
+    return parts.clock.before + parts.clock.after
+
+
+@dataclass
+class Program:
+    """`loop.c`, compiled with these settings."""
+
+    lanes: int = 16
+    metrics: bool = True
+    full: bool = True
+
+    def __post_init__(self):
+        self.folder = tempfile.TemporaryDirectory()
+        library = Path(self.folder.name) / "loop.so"
+        options = [f"-DLANES={self.lanes}", f"-DMETRICS={int(self.metrics)}", f"-DFULL={int(self.full)}"]
+        flags = f"-O3 -march=native -ffast-math -shared -fPIC {'-fopenmp' if self.lanes > 1 else ''}".split()
+        subprocess.run(["gcc", *flags, *options, str(HERE / "loop.c"), "-o", str(library), "-lm"], check=True)
+        self.library = ctypes.CDLL(str(library))
+
+    def prepare(self, parts: Parts, q0: np.ndarray) -> Callable[[], np.ndarray]:
+        """What flies these initial attitudes (trials, 4) with the constants of these parts: () -> (trials, columns)."""
+        clock, law, d, watch = parts.clock, parts.controller, parts.disturbance, parts.observer
+        ticks = clock.ticks(law.t_f, law.delta)
+        nodes = np.ascontiguousarray(np.concatenate([ticks.t, ticks.t_next[-1:]]))
+        k2 = watch.error_bound()
+        target = np.asarray(parts.reference(jnp.zeros(())).q)
+        first = jnp.sum(jnp.where(ticks.noise_weight < 1.0, ticks.t_next - ticks.t, 0.0))
+        assert isinstance(clock, Anchored)
+        values = [
+            parts.plant.inertia, parts.plant.inertia_inverse, target,
+            law.t_f, law.eta, law.delta, law.k1, law.sign_width, k2.rate, k2.start, k2.floor,
+            d.amplitude, d.frequency, d.phase, clock.period, parts.t_end, parts.window, parts.settling_angle,
+            watch.update_matrix(clock.period), watch.update_matrix(first),
+        ]  # fmt: skip
+        constants = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
+        aligned = np.ascontiguousarray(np.where((q0[:, 3] * target[3] < 0)[:, None], -q0, q0))
+        out = np.zeros((len(q0), len(C_METRICS) + 2 if self.metrics else 1))
+
+        def at(array: np.ndarray) -> ctypes.c_void_p:
+            return ctypes.c_void_p(array.ctypes.data)
+
+        def fly() -> np.ndarray:
+            self.library.fly(at(constants), at(nodes), len(nodes) - 1, at(aligned), len(q0), at(out))
+            return out
+
+        return fly
+
+
+def say(text: str) -> None:
+    """Print at once."""
+    print(text)
+    sys.stdout.flush()

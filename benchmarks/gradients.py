@@ -1,0 +1,82 @@
+"""What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer."""
+
+import jax
+
+from ptsmc_jax.configure import configure
+
+configure()
+
+import jax.numpy as jnp  # noqa: E402
+from common import machine, medians, say, study  # noqa: E402
+
+from ptsmc_jax import montecarlo  # noqa: E402
+from tuning.objective import Problem, measure  # noqa: E402
+
+GAINS = ("eta", "delta", "observer_gain")
+AT = jnp.asarray([2.9, 1.0, 100.0])
+LENGTHS = (1_000, 10_000, 100_000)
+
+
+def problem(ready, trials: int) -> Problem:
+    """The first flight's tuning problem on so many trials."""
+    numbers = jnp.arange(trials, dtype=jnp.uint32)
+    return Problem(ready.parts, ready.dispersion, jnp.uint32(0), numbers, jnp.asarray([0.5]), trials, GAINS,
+                   ("peak_torque",))  # fmt: skip
+
+
+@jax.jit
+def value(problem: Problem, gains):
+    """What tuning measures, without derivatives."""
+    return measure(problem, gains)
+
+
+@jax.jit
+def value_and_gradient(problem: Problem, gains):
+    """The same with its derivatives by the gains, forward."""
+
+    def twice(gains):
+        measured = measure(problem, gains)
+        return measured, measured
+
+    return jax.jacfwd(twice, has_aux=True)(gains)
+
+
+@jax.jit
+def everything(problem: Problem):
+    """The forward run with all its metrics, on the same one device."""
+
+    def one(trial):
+        return montecarlo.one(problem.parts, problem.dispersion, problem.seed, trial)[0]
+
+    return montecarlo.blocks(one, problem.trials)
+
+
+def ratios() -> None:
+    """Times on one device."""
+    for noise in (True, False):
+        for trials in (128, 1024):
+            some = problem(study(noise), trials)
+            seconds = medians({
+                "forward": lambda some=some: value(some, AT),
+                "all metrics": lambda some=some: everything(some),
+                "gradient": lambda some=some: value_and_gradient(some, AT),
+            })  # fmt: skip
+            cost = seconds["gradient"]
+            say(f"noise {'on ' if noise else 'off'} {trials:5d} trials: value and gradient take {cost * 1e3:6.1f} ms, "
+                f"{cost / seconds['forward']:.1f} times the value alone, "
+                f"{cost / seconds['all metrics']:.1f} times a run with all metrics")  # fmt: skip
+
+
+def memory() -> None:
+    """What the compiled gradient of 128 trials allocates, as the compiler tells it."""
+    say("\nmemory of value and gradient, 128 trials:")
+    for steps in LENGTHS:
+        some = problem(study(True, loop__period=45.0 / steps), 128)
+        told = value_and_gradient.lower(some, AT).compile().memory_analysis()
+        say(f"  {steps:7d} periods: {told.temp_size_in_bytes / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    say(machine())
+    ratios()
+    memory()

@@ -1,0 +1,68 @@
+"""Cold and warm start of the commands, each in a process of its own, and what compiling the sampled loop takes."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+PTSMC = Path(sys.executable).with_name("ptsmc")
+FIRST_FLIGHT = str(Path(__file__).parent.parent / "scenarios" / "first_flight.toml")
+COMMANDS = {
+    "--version": ["--version"],
+    "--help": ["--help"],
+    "simulate --no-figures": ["simulate", "--no-figures"],
+    "simulate first_flight.toml --no-figures": ["simulate", FIRST_FLIGHT, "--trial", "0", "--no-figures"],
+    "simulate": ["simulate"],
+    "map (9 x 9) --no-figures": ["map", FIRST_FLIGHT, "--no-figures"],
+    "reproduce": ["reproduce"],
+}
+WARM = 5
+
+
+def run(arguments: list[str], cache: str) -> float:
+    """Seconds of one call with this compile cache."""
+    with tempfile.TemporaryDirectory() as out:
+        extra = [] if arguments[0].startswith("--") else ["--quiet", "--out", str(Path(out) / "made")]
+        start = time.perf_counter()
+        done = subprocess.run([str(PTSMC), *arguments, *extra], env=dict(os.environ, XDG_CACHE_HOME=cache),
+                              capture_output=True, check=False)  # fmt: skip
+        assert done.returncode in (0, 1), done.stderr.decode()
+        return time.perf_counter() - start
+
+
+def compiling() -> None:
+    """Seconds to trace, lower and compile the sampled loop for a batch and for one run."""
+    from ptsmc_jax.configure import configure
+
+    configure(cache=None)
+    import jax.numpy as jnp
+    from common import study
+
+    from ptsmc_jax import montecarlo, rollout
+
+    devices = {f"torque_{name}": value for name, value in (("limit", 0.5), ("rate_limit", 5.0), ("lag", 0.1))}
+    every = {f"hardware__{k}": v for k, v in {**devices, "delay": 1, "torque_step": 1e-4, "rate_bias": 1e-6}.items()}
+    for name, ready in (("noise off", study()), ("noise on", study(True)), ("every device", study(True, **every))):
+        batch = (ready.parts, ready.dispersion, jnp.uint32(0), jnp.arange(512, dtype=jnp.uint32), 2, montecarlo.BLOCK)
+        for what, function, args in (("batch", montecarlo._fly, batch), ("one run", rollout.simulate_jit,
+                                                                         (ready.parts, 0, 0))):  # fmt: skip
+            start = time.perf_counter()
+            lowered = function.trace(*args).lower()
+            traced = time.perf_counter()
+            lowered.compile()
+            print(f"  {name:14s} {what:8s} traced in {traced - start:.2f} s, compiled in "
+                  f"{time.perf_counter() - traced:.2f} s")  # fmt: skip
+
+
+if __name__ == "__main__":
+    for name, arguments in COMMANDS.items():
+        with tempfile.TemporaryDirectory() as cache:
+            cold = run(arguments, cache)
+            warm = float(np.median([run(arguments, cache) for _ in range(WARM)]))
+        print(f"  ptsmc {name:42s} cold {cold:6.2f} s   warm {warm:5.2f} s")
+        sys.stdout.flush()
+    compiling()

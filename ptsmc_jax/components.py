@@ -1,0 +1,256 @@
+"""Small arrays as components, each a vector over the trials, and what the plain primitives do to them: for `lanes`."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+# Larger arrays (tables over time, say) are not taken apart.
+LARGEST = 64
+
+
+def small(shape: tuple[int, ...]) -> bool:
+    """Whether an array of this shape is taken apart."""
+    return math.prod(shape) <= LARGEST
+
+
+class Lane:
+    """A value that differs from trial to trial: as components, or dense as (trial, *shape), or both."""
+
+    def __init__(self, shape: tuple[int, ...], parts: np.ndarray | None = None, dense: Array | None = None):
+        self.shape, self._parts, self._dense = shape, parts, dense
+
+    # What is computed here is not kept: inside a loop's body it belongs to that body alone.
+
+    @property
+    def parts(self) -> np.ndarray:
+        """Object array of the value's shape, each entry (trial,) or, where equal in all trials, ()."""
+        if self._parts is not None:
+            return self._parts
+        assert self._dense is not None
+        return entries(self._dense, 1)
+
+    def apart(self) -> "Lane":
+        """The same value taken apart now, unless it is too large for that."""
+        return Lane(self.shape, self.parts, self._dense) if self._parts is None and small(self.shape) else self
+
+    def dense(self, trials: int) -> Array:
+        """(trial, *shape) array."""
+        if self._dense is not None:
+            return self._dense
+        flat = [jnp.broadcast_to(part, (trials,)) for part in self.parts.flat]
+        return jnp.stack(flat, axis=-1).reshape((trials, *self.shape)) if self.shape else flat[0]
+
+
+class Shared:
+    """A small array equal in all trials, taken apart once, outside the loop that uses it."""
+
+    def __init__(self, array: Array):
+        self.array, self.parts = array, parts_of(array)
+
+
+def object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
+    """An array of anything."""
+    array = np.empty(shape, dtype=object)
+    for index, item in zip(np.ndindex(*shape), items, strict=True):
+        array[index] = item
+    return array
+
+
+def entries(array: Any, leading: int = 0) -> np.ndarray:
+    """The entries of an array over all axes but the first `leading` ones, as an object array of arrays."""
+    kept, shape = array.shape[:leading], array.shape[leading:]
+    if not shape:
+        return object_array((), [array])
+    flat = lax.reshape(array, (*kept, math.prod(shape)))
+    return object_array(shape, (lax.index_in_dim(flat, k, leading, keepdims=False) for k in range(math.prod(shape))))
+
+
+def parts_of(value: Any) -> np.ndarray:
+    """Components of a value, lane or not."""
+    if isinstance(value, Lane | Shared):
+        return value.parts
+    return entries(jnp.asarray(value))
+
+
+def plain(value: Any) -> Any:
+    """A value that is equal in all trials, as JAX takes it."""
+    return value.array if isinstance(value, Shared) else value
+
+
+def dense_of(value: Any, trials: int) -> Array:
+    """(trial, *shape) array of a value, lane or not."""
+    if isinstance(value, Lane):
+        return value.dense(trials)
+    value = jnp.asarray(plain(value))
+    return jnp.broadcast_to(value, (trials, *value.shape))
+
+
+def bind(eqn: Any, values: Sequence) -> Sequence:
+    """A primitive on arrays: its outputs."""
+    out = eqn.primitive.bind(*map(plain, values), **eqn.primitive.get_bind_params(eqn.params))
+    return out if eqn.primitive.multiple_results else [out]
+
+
+def apply(eqn: Any, values: Sequence) -> list[Lane] | None:
+    """The outputs of a primitive with at least one lane among its operands; None where they must stay dense."""
+    rule = _RULES[eqn.primitive.name]
+    if all(small(v.aval.shape) for v in (*eqn.invars, *eqn.outvars)):
+        return rule(eqn, values)
+    return None
+
+
+def covers(name: str) -> bool:
+    """Whether there is a rule for the primitive."""
+    return name in _RULES
+
+
+def _alike(parts: Sequence) -> list[Array]:
+    """Components spread over the trials if any of them differs from trial to trial."""
+    shape = max((np.shape(part) for part in parts), key=len)
+    return [part if np.shape(part) == shape else lax.broadcast(part, shape) for part in parts]
+
+
+def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
+    shape = eqn.outvars[0].aval.shape
+    parts = [np.broadcast_to(parts_of(value), shape) for value in values]
+    params = eqn.primitive.get_bind_params(eqn.params)
+    items = (eqn.primitive.bind(*_alike([p[i] for p in parts]), **params) for i in np.ndindex(*shape))
+    return [Lane(shape, object_array(shape, items))]
+
+
+def _bitcast(eqn: Any, values: Sequence) -> list[Lane] | None:
+    sizes = [v.aval.dtype.itemsize for v in (eqn.invars[0], eqn.outvars[0])]
+    return _elementwise(eqn, values) if sizes[0] == sizes[1] else None
+
+
+def _structural(eqn: Any, values: Sequence) -> list[Lane]:
+    """Move the components as the primitive moves the entries of an array."""
+    shape, params = eqn.outvars[0].aval.shape, eqn.params
+    parts = [parts_of(value) for value in values]
+    match eqn.primitive.name:
+        case "reshape" | "squeeze" | "expand_dims" if params.get("dimensions") is None or len(shape) < 2:
+            moved = parts[0].reshape(shape)
+        case "broadcast_in_dim":
+            spread = [1] * len(shape)
+            for axis, size in zip(params["broadcast_dimensions"], parts[0].shape, strict=True):
+                spread[axis] = size
+            moved = np.broadcast_to(parts[0].reshape(spread), shape)
+        case "slice":
+            steps = params["strides"] or (1,) * len(shape)
+            moved = parts[0][tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
+        case "concatenate":
+            moved = np.concatenate(parts, params["dimension"])
+        case "stack":
+            moved = np.stack(parts, params["axis"])
+        case "transpose":
+            moved = parts[0].transpose(params["permutation"])
+        case _:
+            return _renumbered(eqn, values)
+    return [Lane(shape, moved)]
+
+
+def _renumbered(eqn: Any, values: Sequence) -> list[Lane]:
+    """Apply the primitive to the numbers of the components instead, and pick the components by the result."""
+    pool, numbered = [], []
+    for value in values:
+        parts = parts_of(value)
+        numbered.append(np.arange(len(pool), len(pool) + parts.size, dtype=np.int32).reshape(parts.shape))
+        pool += list(parts.flat)
+    with jax.ensure_compile_time_eval():
+        outputs = [np.asarray(chosen) for chosen in bind(eqn, [jnp.asarray(n) for n in numbered])]
+    return [Lane(out.shape, object_array(out.shape, [pool[k] for k in out.flat])) for out in outputs]
+
+
+def _reduction(eqn: Any, values: Sequence) -> list[Lane]:
+    (value,), axes = values, eqn.params["axes"]
+    kept = [a for a in range(len(value.shape)) if a not in axes]
+    shape = tuple(value.shape[a] for a in kept)
+    rows = value.parts.transpose([*kept, *axes]).reshape((*shape, -1))
+    operation = _REDUCTIONS[eqn.primitive.name]
+    return [Lane(shape, object_array(shape, (_fold(operation, rows[i]) for i in np.ndindex(*shape))))]
+
+
+def _fold(operation: Callable, items: Iterable) -> Array:
+    return reduce(lambda a, b: operation(*_alike([a, b])), items)
+
+
+def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
+    kind = eqn.outvars[0].aval.dtype
+    if jnp.issubdtype(kind, bool):
+        return None
+    contracted, batched = eqn.params["dimension_numbers"]
+
+    def rows(value: Any, own: Any, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+        """(batch, kept, contracted), flat, of the result's type."""
+        parts = parts_of(value)
+        kept = [a for a in range(parts.ndim) if a not in (*axes, *batch)]
+        sizes = [math.prod(parts.shape[a] for a in group) for group in (batch, kept, axes)]
+        flat = parts.transpose([*batch, *kept, *axes]).reshape(sizes)
+        return (
+            flat
+            if own == kind
+            else object_array(flat.shape, (lax.convert_element_type(part, kind) for part in flat.flat))
+        )
+
+    kinds = [v.aval.dtype for v in eqn.invars]
+    left, right = (rows(*row) for row in zip(values, kinds, contracted, batched, strict=True))
+    shape = eqn.outvars[0].aval.shape
+    items = (
+        _fold(lax.add, [lax.mul(*_alike(pair)) for pair in zip(left[k, i], right[k, j], strict=True)])
+        for k in range(left.shape[0])
+        for i in range(left.shape[1])
+        for j in range(right.shape[1])
+    )
+    return [Lane(shape, object_array(shape, items))]
+
+
+def _cumulative(eqn: Any, values: Sequence) -> list[Lane]:
+    axis, backwards = eqn.params["axis"], eqn.params["reverse"]
+    operation = _CUMULATIVE[eqn.primitive.name]
+    parts = np.moveaxis(values[0].parts.copy(), axis, 0)
+    order = range(len(parts))[::-1] if backwards else range(len(parts))
+    for before, k in pairwise(order):
+        for i in np.ndindex(*parts.shape[1:]):
+            parts[(k, *i)] = operation(*_alike([parts[(before, *i)], parts[(k, *i)]]))
+    return [Lane(values[0].shape, np.moveaxis(parts, 0, axis))]
+
+
+_REDUCTIONS = {
+    "reduce_sum": lax.add,
+    "reduce_max": lax.max,
+    "reduce_min": lax.min,
+    "reduce_prod": lax.mul,
+    "reduce_and": lax.bitwise_and,
+    "reduce_or": lax.bitwise_or,
+    "reduce_xor": lax.bitwise_xor,
+}
+_CUMULATIVE = {"cumsum": lax.add, "cumprod": lax.mul, "cummax": lax.max, "cummin": lax.min}
+_ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp clz complex conj
+    convert_element_type copy copy_p cos cosh digamma div eq eq_to erf erf_inv erfc exp exp2 expm1
+    floor ge gt imag integer_pow is_finite le le_to lgamma log log1p logistic lt lt_to max min mul ne
+    neg nextafter not or population_count pow real reduce_precision rem round rsqrt select_n
+    shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub
+    tan tanh xor""".split()
+_STRUCTURAL = """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
+    transpose""".split()
+# An index that differs from trial to trial wants whole arrays.
+_INDEXING = """argmax argmin dynamic_slice dynamic_update_slice gather scatter scatter-add scatter-mul scatter-min
+    scatter-max sort top_k""".split()
+_RULES: dict[str, Callable[[Any, Sequence], list[Lane] | None]] = {
+    **dict.fromkeys(_ELEMENTWISE, _elementwise),
+    **dict.fromkeys(_STRUCTURAL, _structural),
+    **dict.fromkeys(_REDUCTIONS, _reduction),
+    **dict.fromkeys(_CUMULATIVE, _cumulative),
+    **dict.fromkeys(_INDEXING, lambda eqn, values: None),
+    "optimization_barrier": lambda eqn, values: None,
+    "bitcast_convert_type": _bitcast,
+    "dot_general": _contraction,
+}
