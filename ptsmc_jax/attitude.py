@@ -62,6 +62,16 @@ def vector_rates(q: Quaternion, w: Vector, w_dot: Vector) -> tuple[Vector, Vecto
     return first, second
 
 
+def from_vector_part(v: Vector, side: Float[Array, ""]) -> tuple[Quaternion, Float[Array, ""]]:
+    """Unit quaternion with this vector part and a scalar of the sign of `side` (0: positive), and 1 - |v|^2.
+
+    Where |v| >= 1 no such quaternion exists: its scalar is then +-1e-6.
+    """
+    square = 1.0 - jnp.dot(v, v)
+    scalar = jnp.sqrt(jnp.maximum(square, 1e-12))
+    return jnp.append(v, jnp.where(side < 0.0, -scalar, scalar)), square
+
+
 def from_rotation_vector(r: Vector) -> Quaternion:
     """Unit quaternion of the rotation by |r| [rad] about r; smooth at r = 0."""
     square = jnp.dot(r, r)

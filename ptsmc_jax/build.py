@@ -27,8 +27,16 @@ def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
     )
 
 
-def spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
-    """Nominal plant, law, initial state and reference of a spacecraft."""
+def plant(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
+    """Nominal plant, law, initial state and reference."""
+    if isinstance(scenario.plant, t.SystemPlant):
+        model = checks.system(scenario.plant)
+        law = controllers.PrescribedTimeSystem(model, *_gains(scenario))
+        return model, law, vector(scenario.plant.x0), signals.Now()
+    return _spacecraft(scenario) if isinstance(scenario.plant, t.SpacecraftPlant) else _chain(scenario)
+
+
+def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     assert scenario.spacecraft is not None
     assert scenario.initial is not None
     assert scenario.reference is not None
@@ -44,11 +52,13 @@ def spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
         reference = signals.Swing(q_f, vector(table.amplitude), vector(table.frequency), vector(table.phase))
     elif isinstance(table, t.SlewReference):
         reference = signals.Slew(q_f, vector(checks.turn(table)), vector(table.duration))
-    return model, controllers.PrescribedTime(model, *_gains(scenario)), initial, reference
+    assert isinstance(scenario.controller, t.Controller)
+    multiplicative = scenario.controller.error == "multiplicative"
+    law = controllers.PrescribedTimeMultiplicative if multiplicative else controllers.PrescribedTime
+    return model, law(model, *_gains(scenario)), initial, reference
 
 
-def chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
-    """Nominal plant, law, initial state and reference of an integrator chain."""
+def _chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     assert isinstance(scenario.plant, t.ChainPlant)
     assert isinstance(scenario.controller, t.ChainController)
     model = plants.chain(scenario.plant.order)
@@ -56,25 +66,29 @@ def chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     return model, controller, vector(scenario.plant.x0), signals.Origin()
 
 
-def observer(scenario: Scenario, model: plants.Plant) -> Any:
+def observer(scenario: Scenario, model: plants.Plant) -> observers.Observer:
     """The observer; its model is the nominal plant."""
-    table = scenario.controller
-    if isinstance(scenario.observer, t.NoObserver):
-        return observers.NoObserver(model, vector(table.disturbance_bound))
-    bounds = (vector(table.disturbance_rate_bound), vector(table.initial_estimate_error))
-    return observers.NonlinearObserver(model, vector(scenario.observer.gain), *bounds)
+    law, table = scenario.controller, scenario.observer
+    if isinstance(table, t.NoObserver):
+        return observers.NoObserver(model, vector(law.disturbance_bound))
+    common = (model, vector(table.gain), vector(law.disturbance_rate_bound), vector(law.initial_estimate_error))
+    if isinstance(table, t.FiniteTimeObserver | t.EachFiniteTimeObserver):
+        return observers.FiniteTimeObserver(*common, vector(table.sign_width))
+    if isinstance(table, t.Prescribed):
+        return observers.PrescribedTimeObserver(*common, *(vector(v) for v in (table.mu, table.t_o, table.delta_o)))
+    return observers.NonlinearObserver(*common)
 
 
 def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
     """The disturbance as a function of time and state, and the rate of its random walk (None: none)."""
     signal, walk = [], None
     for table in checks.terms(scenario):
-        if isinstance(table, t.RandomWalk | t.ChainRandomWalk):
+        if isinstance(table, t.RandomWalk | t.EachRandomWalk):
             step = vector(table.density) / np.sqrt(scenario.loop.period)
             walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # independent walks add up to one
-        elif isinstance(table, t.ConstantDisturbance | t.ChainConstantDisturbance):
+        elif isinstance(table, t.ConstantDisturbance | t.EachConstant):
             signal.append(signals.Constant(vector(table.amplitude)))
-        elif isinstance(table, t.SinusoidDisturbance | t.ChainSinusoidDisturbance):
+        elif isinstance(table, t.SinusoidDisturbance | t.EachSinusoid):
             values = (table.amplitude, table.frequency, table.phase, table.bias)
             signal.append(signals.Sinusoid(*(vector(v) for v in values)))
         elif isinstance(table, t.GravityGradient):
@@ -98,7 +112,7 @@ def true_body(scenario: Scenario) -> plants.Spacecraft:
 def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     """Star tracker, gyro and filter, or a chain's sensor; None where the law sees the true state."""
     table, period = scenario.hardware, scenario.loop.period
-    if isinstance(table, t.ChainHardware):
+    if isinstance(table, t.StateHardware):
         return None if table.state_noise is None else sensing.StateSensor(vector(table.state_noise))
     filtered = isinstance(scenario.filter, t.SteadyStateFilter)
     table = table or t.Hardware()
@@ -140,7 +154,7 @@ def actuators(scenario: Scenario) -> hardware.Actuators | None:
 def dispersion(scenario: Scenario) -> dispersions.Dispersion:
     """What is drawn for each trial."""
     table = scenario.dispersion
-    if isinstance(table, t.ChainDispersion):
+    if isinstance(table, t.StateDispersion):
         if isinstance(table.x0, t.UniformState):
             return dispersions.Dispersion(state=dispersions.UniformState(vector(table.x0.half_width)))
         if isinstance(table.x0, t.NormalState):

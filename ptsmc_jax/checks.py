@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import hardware, plants, schema, tables
+from ptsmc_jax import hardware, layouts, plants, schema, systems, tables
 from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
@@ -24,11 +24,13 @@ def _unit(key: str, value: Any) -> np.ndarray:
 
 
 def turn(table: tables.SlewReference) -> np.ndarray:
-    """Rotation vector of a slew, the short way from its attitude to `to_quat_xyzw` (3,) [rad]."""
+    """Rotation vector of a slew from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
     from scipy.spatial.transform import Rotation
 
     start, end = quaternion(table, "reference"), _unit("reference.to_quat_xyzw", table.to_quat_xyzw)
-    return (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+    short = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+    angle = np.linalg.norm(short)
+    return short * (1.0 - 2.0 * np.pi / angle) if table.way == "long" and angle > 0.0 else short
 
 
 def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
@@ -74,8 +76,20 @@ def attitude_key(table: tables.Attitude) -> tuple[str, Any]:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """The scenario with the defaults that depend on other keys: t_end, and what is tuned within which bounds."""
+    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds."""
     loop, t_f = scenario.loop, scenario.controller.t_f
+    observer, disturbance = _each("observer", scenario.observer, scenario), scenario.disturbance
+    if isinstance(observer, tables.Prescribed):
+        t_o = t_f / 3 if observer.t_o is None else observer.t_o
+        delta_o = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
+        delta_o = min(delta_o, t_o / 4) if observer.delta_o is None else observer.delta_o
+        observer = msgspec.structs.replace(observer, t_o=t_o, delta_o=delta_o)
+    if isinstance(disturbance, tables.SumDisturbance):
+        each = tuple(_each("disturbance", term, scenario) for term in disturbance.terms)
+        disturbance = msgspec.structs.replace(disturbance, terms=each)
+    else:
+        disturbance = _each("disturbance", disturbance, scenario)
+    scenario = msgspec.structs.replace(scenario, observer=observer, disturbance=disturbance)
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
     tune = scenario.tune
@@ -86,7 +100,7 @@ def resolve(scenario: Scenario) -> Scenario:
         default = {
             "eta": (least + 0.05, least + 6.0),
             "delta": (lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)),
-            "observer_gain": (0.5, 300.0),
+            "observer_gain": _gain_bounds(scenario),
             "k1": (0.1, 10.0),
             "sign_width": (1e-5, 1e-1),
         }
@@ -96,18 +110,51 @@ def resolve(scenario: Scenario) -> Scenario:
         bounds = {**{key: default[key] for key in free if key in default}, **tune.bounds}
         tune = msgspec.structs.replace(tune, free=free, bounds=bounds)
     dispersion = scenario.dispersion
-    if isinstance(dispersion, tables.ChainDispersion) and dispersion.x0 is not None:
-        assert isinstance(scenario.plant, tables.ChainPlant)
+    if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
         key = _spread(dispersion.x0)
-        width = getattr(dispersion.x0, key) or (1.0,) * scenario.plant.order
+        width = getattr(dispersion.x0, key) or (1.0,) * len(initial_state(scenario))
         dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
     return msgspec.structs.replace(scenario, loop=loop, tune=tune, dispersion=dispersion)
+
+
+def inputs(scenario: Scenario) -> int:
+    """How many inputs the plant has."""
+    plant = scenario.plant
+    return (
+        3
+        if isinstance(plant, tables.SpacecraftPlant)
+        else len(plant.x0) // 2
+        if isinstance(plant, tables.SystemPlant)
+        else 1
+    )
+
+
+def initial_state(scenario: Scenario) -> tuple[float, ...]:
+    """x0 of a chain or a system."""
+    assert not isinstance(scenario.plant, tables.SpacecraftPlant)
+    return scenario.plant.x0
+
+
+def _each(name: str, table: Any, scenario: Scenario) -> Any:
+    """A table with its lists of one number for each input, where they are absent, filled in."""
+    known = layouts.EACH.get((name, table.kind), {})
+    absent = {key: (value,) * inputs(scenario) for key, value in known.items() if getattr(table, key) == ()}
+    return msgspec.structs.replace(table, **absent)
+
+
+def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
+    """Where an observer's gain is looked for: a finite-time one's is a bound on the disturbance's rate."""
+    if isinstance(scenario.observer, tables.FiniteTimeObserver | tables.EachFiniteTimeObserver):
+        least = max(1.1 * scenario.controller.disturbance_rate_bound, 1e-6)
+        return least, 1e3 * least
+    return 0.5, 300.0
 
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
     _check_plant(scenario)
     _check_available(scenario)
+    _check_observer(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
     if scenario.tune is not None:
@@ -134,14 +181,11 @@ def _check_available(scenario: Scenario) -> None:
     def refuse(key: str, value: Any, allowed: str) -> None:
         raise ScenarioError(f"{key} = {schema.show(value)} {NOT_YET}; allowed is {allowed}")
 
-    error = getattr(scenario.controller, "error", "additive")
-    if error != "additive":
-        refuse("controller.error", error, '"additive"')
     if scenario.dispersion is not None:
         for key in scenario.dispersion.__struct_fields__:
             value = getattr(scenario.dispersion, key)
             if value is not None and key not in ("attitude", "x0"):
-                other = "x0" if isinstance(scenario.dispersion, tables.ChainDispersion) else "attitude"
+                other = "x0" if isinstance(scenario.dispersion, tables.StateDispersion) else "attitude"
                 refuse(f"dispersion.{key}", msgspec.to_builtins(value), other)
     for key, value in scenario.requirements.items():
         if isinstance(value, tables.Limit) and (value.quantile is not None or value.confidence is not None):
@@ -179,8 +223,52 @@ def _check_plant(scenario: Scenario) -> None:
             _unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
         _check_devices(scenario)
         return
-    controller, n = scenario.controller, plant.order
-    assert isinstance(controller, tables.ChainController)
+    if isinstance(plant, tables.SystemPlant):
+        _check_system(plant)
+    else:
+        _check_chain(plant, scenario.controller)
+    m, n = inputs(scenario), len(plant.x0)
+    for k, term in enumerate(terms(scenario)):
+        name = f"disturbance.terms[{k}]" if len(terms(scenario)) > 1 else "disturbance"
+        _check_each(name, "disturbance", term, m)
+    _check_each("observer", "observer", scenario.observer, m)
+    noise = getattr(scenario.hardware, "state_noise", None)
+    if noise is not None and len(noise) != n:
+        raise wrong("hardware.state_noise", noise, f"a list of {n} numbers, one for each state")
+
+
+def _check_each(name: str, table: str, found: Any, m: int) -> None:
+    for key in layouts.EACH.get((table, found.kind), {}):
+        value = getattr(found, key)
+        if len(value) != m:
+            raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
+
+
+def _check_system(plant: tables.SystemPlant) -> None:
+    if plant.system is None:
+        raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
+    if len(plant.x0) % 2:
+        raise wrong("plant.x0", plant.x0, "x_1 followed by x_2, as many numbers each")
+    try:
+        found = system(plant)
+    except ValueError as error:
+        raise ScenarioError(f"plant.system is {schema.show(plant.system)}: {error}") from None
+    if found.inputs * 2 != len(plant.x0):
+        n = found.inputs
+        raise wrong("plant.x0", plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
+
+
+def system(plant: tables.SystemPlant) -> plants.System:
+    """The system that a scenario names, or holds; raises ValueError where there is none."""
+    if isinstance(plant.system, plants.System):
+        return plant.system
+    if not isinstance(plant.system, str):
+        raise ValueError(f"allowed is {systems.ALLOWED}")
+    return systems.load(plant.system)
+
+
+def _check_chain(plant: tables.ChainPlant, controller: Any) -> None:
+    n = plant.order
     if len(plant.x0) != n:
         raise wrong("plant.x0", plant.x0, f"a list of plant.order = {n} numbers")
     if not controller.eta > n:
@@ -192,9 +280,21 @@ def _check_plant(scenario: Scenario) -> None:
         raise wrong(
             "controller.a", controller.a, "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
         )
-    noise = getattr(scenario.hardware, "state_noise", None)
-    if noise is not None and len(noise) != n:
-        raise wrong("hardware.state_noise", noise, f"a list of plant.order = {n} numbers")
+
+
+def _check_observer(scenario: Scenario) -> None:
+    observer, controller = scenario.observer, scenario.controller
+    if isinstance(observer, tables.Prescribed):
+        assert observer.t_o is not None
+        assert observer.delta_o is not None
+        if observer.t_o > controller.t_f:
+            raise wrong("observer.t_o", observer.t_o, f"at most controller.t_f, {controller.t_f}")
+        if observer.delta_o >= observer.t_o:
+            raise wrong("observer.delta_o", observer.delta_o, f"less than observer.t_o, {observer.t_o}")
+    if isinstance(observer, tables.FiniteTimeObserver | tables.EachFiniteTimeObserver):
+        least = controller.disturbance_rate_bound
+        if min(observer.gain) < least or min(observer.gain) <= 0.0:
+            raise wrong("observer.gain", observer.gain, f"at least controller.disturbance_rate_bound, {least}, each")
 
 
 def terms(scenario: Scenario) -> tuple[Any, ...]:
@@ -272,7 +372,7 @@ def _check_loop(scenario: Scenario) -> None:
             value = getattr(scenario, name)
             if value is not None and not isinstance(value, tables.NoFilter):
                 raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
-        if any(isinstance(term, tables.RandomWalk | tables.ChainRandomWalk) for term in terms(scenario)):
+        if any(isinstance(term, tables.RandomWalk | tables.EachRandomWalk) for term in terms(scenario)):
             raise ScenarioError(
                 f'disturbance.kind = "random_walk" needs the sampled loop, but loop.mode is "{loop.mode}"'
             )
@@ -284,12 +384,11 @@ def _check_dispersion(scenario: Scenario) -> None:
         angles = dispersion.attitude
         if angles.min_deg > angles.max_deg:
             raise wrong("dispersion.attitude.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
-    if isinstance(dispersion, tables.ChainDispersion) and dispersion.x0 is not None:
-        assert isinstance(scenario.plant, tables.ChainPlant)
-        key = _spread(dispersion.x0)
+    if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
+        key, states = _spread(dispersion.x0), len(initial_state(scenario))
         value = getattr(dispersion.x0, key)
-        if len(value) != scenario.plant.order:
-            raise wrong(f"dispersion.x0.{key}", value, f"a list of plant.order = {scenario.plant.order} numbers")
+        if len(value) != states:
+            raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
 
 
 def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
@@ -309,7 +408,7 @@ def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
     if "observer_gain" in tune.free and not _has_gain(scenario):
         raise ScenarioError(
             f'tune.free is {schema.show(tune.free)}, but observer.kind = "none" has no gain; '
-            'allowed is observer_gain with observer.kind = "nonlinear"'
+            "allowed is observer_gain with an observer of another kind"
         )
     for name, (lower, upper) in tune.bounds.items():
         key = f"tune.bounds.{name}"

@@ -1,11 +1,11 @@
-"""The paper's prescribed-time sliding mode laws: spacecraft (56), (57), (59), (60); chains (36)-(40), (52).
+"""The paper's prescribed-time sliding mode laws: spacecraft (56)-(60), own plants (29), chains (36)-(40), (52).
 
 Order 2 of the chain is the second-order system (6) with (7), (9), (10) and (24).
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,100 +13,47 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
+from ptsmc_jax.laws import Law, Motion, SecondOrder
 from ptsmc_jax.numerics import Leaf
-from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft
+from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft, System
 from ptsmc_jax.signals import Target
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
 
 
-class SurfaceGains(NamedTuple):
-    """What both phases of the law share: s = c eps' + e eps, desired 2 eps'' = -a eps' - b s - switching."""
-
-    c: Array  # [s]
-    e: Array  # [-]
-    a: Array  # [1/s]
-    b: Array  # [1/s^2] before the hand-over, [1/s] after
-
-
 @dataclass(frozen=True)
-class Law:
-    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
+class _Attitude(SecondOrder):
+    """What both laws for a spacecraft share: K1 acts with an effective gain of K1/2 in (60)."""
 
-    The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
-    enough, and with delta > 0 V(t_f) is only small.
-    """
+    model: Spacecraft  # the nominal plant
 
-    model: Any  # the nominal plant
-    t_f: Leaf  # prescribed time [s]
-    eta: Leaf  # eta > 2, and greater than the order of a chain [-]
-    delta: Leaf  # hand-over this long before t_f, Remark 1 [s]
-    k1: Leaf  # K1 of (10), (40) and (60) [1/s]
-    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
+    def pull(self) -> Scalar:
+        """K1 of (60) [1/s]: half of what (29)'s K1 does."""
+        return self.k1
 
-    @property
-    def hand_over(self) -> Scalar:
-        """t_s = t_f - delta [s]."""
-        return self.t_f - self.delta
-
-    def align(self, x: Any, target: Any) -> Any:
-        """The initial state in the form that the law can bring to the target."""
-        return x
-
-    def clearance(self, x: Any, target: Any) -> Scalar:
-        """How far the law is from a singularity of its own [-]; 1 where it has none."""
-        return jnp.ones_like(self.t_f)
-
-    def torque(
-        self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
-    ) -> tuple[Vector, Vector]:
-        """Commanded input (m,) and sliding variable; d_hat: estimated disturbance, k2: K2, bound on its error."""
-        raise NotImplementedError
-
-    @property
-    def order(self) -> int:
-        """Order n of the error's motion: 2, or that of a chain."""
-        return 2
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
 
     def switching_rate(self, k2: Scalar) -> Scalar:
-        """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2."""
-        raise NotImplementedError
-
-    def boundary_layer(self, k2: Scalar) -> tuple[Scalar, Scalar]:
-        """Fastest rate of the smooth sign's boundary layer before and after the hand-over [1/s], for K2 up to k2."""
-        after = self.switching_rate(k2) / self.sign_width
-        return self.t_f ** (self.order - 1) * after, after
-
-    def hold_rate(self) -> float:
-        """Fastest decay after the hand-over [1/s]."""
-        raise NotImplementedError
-
-    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
-        """What is driven to zero, (m,), and its derivative."""
-        raise NotImplementedError
-
-    def angle(self, x: Any, target: Any) -> Scalar:
-        """What settles: the angle to the reference [rad], for a chain |x_1|."""
-        raise NotImplementedError
+        """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
+        return 0.5 * numerics.norm(self.model.inertia_inverse) * k2
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PrescribedTime(Law):
+class PrescribedTime(_Attitude):
     """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
 
-    Differences from the paper: sign(s) is tanh(s / sign_width) (0: exact); `T` of (1) is both torque and matrix and
-    q both quaternion and its scalar, here the torque is u and the scalar q4; (29), which this law is a case of, lacks
-    the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference, (60) and (57) have them; ||T J^-1||, whose
-    norm the paper leaves open, is the Frobenius norm, which is smooth and not below the spectral norm that the proof
-    needs; K1 acts with an effective gain of K1/2 in (60). The law is singular at q4 = 0, 180 degrees from the inertial
-    frame's identity wherever the reference is, and cannot cross it: `align` chooses the sign of q, `clearance` says
-    how far away the singularity is. So "bounded control" is not global: the bound grows like 1/q4. After the
-    hand-over nothing stays "at the origin": the rates are 1 and K1/2.
+    (56), (57) before and (59), (60) after the hand-over. Besides what `SecondOrder` says: `T` of (1) is both torque and
+    matrix and q both quaternion and its scalar, here the torque is u and the scalar q4. The law is singular at q4 = 0,
+    180 degrees from the inertial frame's identity wherever the reference is, and cannot cross it: `align` chooses the
+    sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the bound grows
+    like 1/q4. Between attitudes on either side of the identity the path leads past it, which may be the long way round:
+    from 150 to -150 degrees about an axis the body turns by 300 degrees. After the hand-over nothing stays "at the
+    origin": the rates are 1 and K1/2.
     """
-
-    model: Spacecraft  # the nominal plant
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""
@@ -123,50 +70,142 @@ class PrescribedTime(Law):
         v_dot, _ = attitude.vector_rates(x.q, x.w, jnp.zeros(3))
         return x.q[:3] - target.q[:3], v_dot - reference_rate
 
-    def angle(self, x: AttitudeState, target: Target) -> Scalar:
-        """Angle between the attitude and its reference [rad]."""
-        return attitude.angle(x.q, target.q)
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T J^-1| of (57) [1/(kg m^2)]."""
+        return numerics.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
 
-    def gains(self, t: Scalar, hold: Bool[Array, ""]) -> SurfaceGains:
-        """Gains of the surfaces (56) and (59) and of the laws (57) and (60) at t [s]; `hold`: after the hand-over."""
-        tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
-        return SurfaceGains(
-            c=tau,
-            e=jnp.where(hold, 1.0, self.eta),
-            a=jnp.where(hold, 2.0, 2.0 * (self.eta - 1.0) / tau),
-            b=jnp.where(hold, self.k1, 2.0 * self.eta / tau**2),
-        )
-
-    def torque(
-        self, t: Scalar, hold: Bool[Array, ""], x: AttitudeState, target: Target, d_hat: Vector, k2: Scalar
-    ) -> tuple[Vector, Vector]:
-        """Commanded torque [N m] by (57) before and (60) after the hand-over, and the sliding variable s (56), (59).
-
-        d_hat: estimated disturbance [N m]; k2: K2, bound on the 2-norm of its error [N m].
-        """
-        gains = self.gains(t, hold)
-        error, error_rate = self.errors(x, target)
-        s = gains.c * error_rate + gains.e * error
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 eps_1'' = wanted [1/s^2]: w x J w - d_hat + J T^-1 (wanted + 2 q_1f'' - T' w)."""
         _, reference_acceleration = target.vector_rates()
         t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
-        switching = numerics.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse) * k2
-        wanted = (
-            2.0 * reference_acceleration
-            - t_dot_w
-            - switching * numerics.smooth_sign(s, self.sign_width)
-            - gains.a * error_rate
-            - gains.b * s
-        )
-        u = self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ attitude.t_inverse_times(x.q, wanted)
-        return u, s
+        turned = attitude.t_inverse_times(x.q, wanted + 2.0 * reference_acceleration - t_dot_w)
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
+
+    def motion(
+        self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
+    ) -> Motion:
+        """q4^2 = 1 - |v|^2 stands for the clearance; at or below 0 the path leaves the unit ball."""
+        rate_f, acceleration_f = target.vector_rates()
+        q, square = attitude.from_vector_part(target.q[:3] + error, target.q[3])
+        w = 2.0 * attitude.t_inverse_times(q, rate_f + error_rate)
+        turning = 2.0 * (acceleration_f + acceleration) + 0.5 * jnp.dot(w, w) * q[:3]
+        return Motion(AttitudeState(q, w), attitude.t_inverse_times(q, turning), square)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PrescribedTimeMultiplicative(_Attitude):
+    """The same law on the vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
+
+    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2, and
+
+        u = w x J w - d_hat + J (R w_f' - w_e x R w_f) + J T(q_e)^-1 (wanted + |w_e|^2 v / 2).
+
+    Singular only at q_e4 = 0, a true error of 180 degrees, which a run from rest below that never meets; with an
+    initial rate |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough. `align` makes q_e4 positive at t = 0, and it stays so: v
+    and -v lead along the same path, the short way round.
+    """
+
+    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
+        """The same attitude with the sign of q for which q_e4 >= 0."""
+        opposite = jnp.dot(x.q, target.q) < 0.0
+        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+
+    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+        """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""
+        return jnp.dot(x.q, target.q)
+
+    def _relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
+        """q_e, w_e, R w_f and R w_f' - w_e x R w_f, the derivative of R w_f less what R w_f' leaves out."""
+        q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
+        back = attitude.conjugate(q_e)
+        carried = attitude.rotate(back, target.w)
+        w_e = x.w - carried
+        return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
+
+    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
+        """V [-] and its derivative [1/s]."""
+        q_e, w_e, _, _ = self._relative(x, target)
+        v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
+        return q_e[:3], v_dot
+
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T(q_e) J^-1| [1/(kg m^2)]."""
+        q_e, *_ = self._relative(x, target)
+        return numerics.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
+
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 v'' = wanted [1/s^2]."""
+        q_e, w_e, _, feedforward = self._relative(x, target)
+        turned = attitude.t_inverse_times(q_e, wanted + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
+
+    def motion(
+        self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
+    ) -> Motion:
+        """q_e4^2 = 1 - |v|^2 stands for the clearance."""
+        q_e, square = attitude.from_vector_part(error, jnp.ones_like(self.t_f))
+        w_e = 2.0 * attitude.t_inverse_times(q_e, error_rate)
+        q = attitude.multiply(target.q, q_e)
+        carried = attitude.rotate(attitude.conjugate(q_e), target.w)
+        x = AttitudeState(q, w_e + carried)
+        _, _, _, feedforward = self._relative(x, target)
+        turning = attitude.t_inverse_times(q_e, 2.0 * acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return Motion(x, feedforward + turning, square)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PrescribedTimeSystem(SecondOrder):
+    """Law (29) for a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation.
+
+    x_1 is the error, so F may know the time: a moving reference is part of it. dF/dx2 G must be invertible along the
+    run, and F(t, 0, x_2) = 0 must hold for one x_2 only, which x_2 then goes to. (57) is this law with dF/dx2 = T/2,
+    the disturbance's input matrix J^-1 and its K1 twice the K1 of (29); (29)'s K |dF/dx2| is `influence` / 2 times K2,
+    with the disturbance's own input matrix inside the norm: K2 bounds d, not what it does to x_2'.
+    """
+
+    model: System  # the nominal plant
+
+    def clearance(self, x: Vector, target: Scalar) -> Scalar:
+        """Det of dF/dx2 G with its rows made of length 1 [-]: at 0 the law is singular."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        return numerics.volume(slope @ gain)
+
+    def errors(self, x: Vector, target: Scalar) -> tuple[Vector, Vector]:
+        """x_1 and F(t, x), (n,) each."""
+        return self.model.position(x), self.model.position_rate(target, x)
+
+    def angle(self, x: Vector, target: Scalar) -> Scalar:
+        """|x_1|."""
+        return numerics.norm(self.model.position(x))
+
+    def influence(self, x: Vector, target: Scalar) -> Scalar:
+        """2 |dF/dx2 D|."""
+        return 2.0 * numerics.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
+
+    def invert(self, x: Vector, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
+        return numerics.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
+
+    def motion(self, target: Scalar, start: Vector, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
+        """x_2 from F(t, x_1, x_2) = x_1' by Newton's method from the initial x_2: one step where F is linear in x_2."""
+        n = self.model.inputs
+
+        def newton(_: Any, x: Vector) -> Vector:
+            off = self.model.position_rate(target, x) - error_rate
+            return jnp.concatenate([error, x[n:] - numerics.solve(self.model.slope(target, x), off)])
+
+        x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n:]]))
+        w_dot = numerics.solve(self.model.slope(target, x), acceleration - self.model.carried(target, x))
+        return Motion(x, w_dot, jnp.abs(self.clearance(x, target)))
 
     def switching_rate(self, k2: Scalar) -> Scalar:
-        """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
-        return 0.5 * numerics.norm(self.model.inertia_inverse) * k2
-
-    def hold_rate(self) -> float:
-        """Fastest decay after the hand-over [1/s]: 1 on the surface (59), K1/2 toward it."""
-        return max(1.0, float(self.k1) / 2)
+        """|dF/dx2 D| K2 at t = 0 in x = 0, about."""
+        origin = jnp.zeros(2 * self.model.inputs)
+        return 0.5 * self.influence(origin, jnp.zeros_like(self.t_f)) * k2
 
 
 def expansion(eta: Scalar, order: int) -> list[Scalar]:

@@ -9,7 +9,23 @@ from ptsmc_jax import tables as t
 # A table is a struct, or one for each kind, the default first; a kind without a struct is not available yet.
 Kinds = dict[str, type[t.Table] | None]
 _LAWS: Kinds = {"pd": None, "terminal": None, "fixed_time": None}
-_OBSERVERS: Kinds = {"finite_time": None, "prescribed_time": None}
+_STATE_OBSERVERS: Kinds = {
+    "nonlinear": t.EachNonlinearObserver,
+    "finite_time": t.EachFiniteTimeObserver,
+    "prescribed_time": t.EachPrescribedTimeObserver,
+}
+_STATE_DISTURBANCES: Kinds = {
+    "sinusoid": t.EachSinusoid,
+    "constant": t.EachConstant,
+    "random_walk": t.EachRandomWalk,
+    "sum": t.SumDisturbance,
+}
+_STATE_LOOP: dict[str, type[t.Table] | Kinds] = {
+    "loop": t.Loop,
+    "hardware": t.StateHardware,
+    "dispersion": t.StateDispersion,
+    "tune": t.Tune,
+}
 TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the plant
     "spacecraft": {
         "plant": t.SpacecraftPlant,
@@ -30,7 +46,12 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
             "sum": t.SumDisturbance,
         },
         "controller": {"prescribed_time": t.Controller, **_LAWS},
-        "observer": {"nonlinear": t.NonlinearObserver, "none": t.NoObserver, **_OBSERVERS},
+        "observer": {
+            "nonlinear": t.NonlinearObserver,
+            "none": t.NoObserver,
+            "finite_time": t.FiniteTimeObserver,
+            "prescribed_time": t.PrescribedTimeObserver,
+        },
         "loop": t.Loop,
         "hardware": t.Hardware,
         "wheels": {"pyramid": t.PyramidWheels, "axes": t.AxesWheels},
@@ -40,19 +61,17 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
     },
     "chain": {
         "plant": t.ChainPlant,
-        "disturbance": {
-            "sinusoid": t.ChainSinusoidDisturbance,
-            "none": t.NoDisturbance,
-            "constant": t.ChainConstantDisturbance,
-            "random_walk": t.ChainRandomWalk,
-            "sum": t.SumDisturbance,
-        },
+        "disturbance": {"sinusoid": t.EachSinusoid, "none": t.NoDisturbance, **_STATE_DISTURBANCES},
         "controller": {"prescribed_time": t.ChainController, **_LAWS},
-        "observer": {"none": t.NoObserver, "nonlinear": t.ChainNonlinearObserver, **_OBSERVERS},
-        "loop": t.Loop,
-        "hardware": t.ChainHardware,
-        "dispersion": t.ChainDispersion,
-        "tune": t.Tune,
+        "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
+        **_STATE_LOOP,
+    },
+    "system": {
+        "plant": t.SystemPlant,
+        "disturbance": {"none": t.NoDisturbance, **_STATE_DISTURBANCES},
+        "controller": {"prescribed_time": t.SystemController, **_LAWS},
+        "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
+        **_STATE_LOOP,
     },
 }
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
@@ -70,10 +89,23 @@ _CASE_I: dict[str, Mapping[str, Any]] = {
 }
 
 
+# What lists of one number for each input hold where they are absent: table and kind -> key -> number.
+EACH: dict[tuple[str, str], dict[str, float]] = {
+    ("disturbance", "random_walk"): {"density": 1e-4},
+    ("disturbance", "constant"): {"amplitude": 0.01},
+    ("disturbance", "sinusoid"): {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0},
+    ("observer", "nonlinear"): {"gain": 10.0},
+    ("observer", "prescribed_time"): {"gain": 10.0},
+    ("observer", "finite_time"): {"gain": 0.2},
+}
+
+
 def defaults(kind: str, order: int) -> dict[str, Mapping[str, Any]]:
     """Defaults that no single key tells: the paper's Case I; a chain's, Figs. 1 and 2 for order 2 and 3."""
     if kind == "spacecraft":
         return _CASE_I
+    if kind == "system":
+        return {}
     x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
     poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
     return {"plant": {"x0": x0}, "controller": {"eta": order + 1.0, "a": poles_at_minus_one}}

@@ -28,20 +28,20 @@ CATALOGUE = {
     "peak_momentum": ("N m s", "largest 2-norm of the body's angular momentum"),
     "peak_wheel_momentum": ("N m s", "largest momentum stored in one reaction wheel"),
 }
-# The same for an integrator chain, whose x_1 is the error, in the states' own units; what it lacks is left out.
-CHAIN_CATALOGUE = {
+# The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
+STATE_CATALOGUE = {
     "terminal_error": ("x1", "|x_1| at t_f"),
     "window_error": ("x1", "RMS of |x_1| over the window after t_f"),
     "hold_error": ("x1", "largest |x_1| from t_f to t_end"),
-    "peak_torque": ("u", "largest commanded input, before the actuator"),
-    "peak_torque_delivered": ("u", "largest delivered input"),
+    "peak_torque": ("u", "largest commanded component of the input, before the actuator"),
+    "peak_torque_delivered": ("u", "largest delivered component of the input"),
     "saturated": ("-", "fraction of the time in which a limit of the actuators cuts the command"),
-    "effort": ("u s", "integral of the magnitude of the delivered input"),
+    "effort": ("u s", "integral of the 1-norm of the delivered input"),
     "settling_time": ("s", "time from which |x_1| stays below settling_angle"),
-    "chattering": ("u/s", "total variation of the delivered input per second after t_f"),
+    "chattering": ("u/s", "total variation of the delivered input per second after t_f, largest component"),
     "peak_rate": ("x2", "largest |x_2|"),
 }
-CATALOGUES = {"spacecraft": CATALOGUE, "chain": CHAIN_CATALOGUE}  # by the kind of the plant
+CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 
 
 class Metrics(NamedTuple):
@@ -65,7 +65,7 @@ class Metrics(NamedTuple):
 class Sight(NamedTuple):
     """What the metrics see of the true state at one time."""
 
-    angle: Array  # to the reference [rad]; for a chain |x_1|
+    angle: Array  # to the reference [rad]; for other plants |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
     momentum: Array  # |J w| [N m s]
 
@@ -77,7 +77,7 @@ class Span(NamedTuple):
     t_next: Array
     start: Sight
     end: Sight
-    # () -> what the law drives to zero, (m,) [-], for a chain x_1, and its rate [1/s], at both ends
+    # () -> what the law drives to zero, (m,) [-], for other plants x_1, and its rate [1/s], at both ends
     errors: Callable[[], tuple[tuple[Array, Array], tuple[Array, Array]]]
     arrival: Callable[[], tuple[Array, Array]]  # () -> what the law drives to zero and the angle at t_f, if in here
     last_torque: Array  # (m,) delivered at the end of the interval before [N m]

@@ -46,6 +46,16 @@ def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
     return sqrt(jnp.sum(x * x))
 
 
+def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
+    """sign(x) |x|^(1/2) as x / (x^2 + width^2)^(1/4), whose slope at 0 is width^(-1/2); where width is 0, exact.
+
+    The exact root's slope at 0, which has no value, is set to 0.
+    """
+    square = x * x + width * width
+    at_zero = square == 0.0
+    return jnp.where(at_zero, 0.0, x / jnp.sqrt(jnp.sqrt(jnp.where(at_zero, 1.0, square))))
+
+
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
     """B + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
@@ -89,9 +99,9 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     size = jax.lax.stop_gradient(row_norm(x) if largest is None else largest)
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
     small = x * 2.0**-doublings
-    top = one / factorial(order + _TERMS)
+    top = one / float(factorial(order + _TERMS))
     for k in range(_TERMS - 1, -1, -1):
-        top = one / factorial(order + k) + small @ top
+        top = one / float(factorial(order + k)) + small @ top
     phi = [top]
     for k in range(order - 1, -1, -1):
         phi.insert(0, one / factorial(k) + small @ phi[0])
@@ -114,6 +124,43 @@ def _double(phi: list[Array]) -> list[Array]:
     ]
 
 
+def solve(a: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """a^-1 b for a small matrix, b (n,) or (n, columns), written out: Gauss-Jordan elimination, the larger pivot first.
+
+    For the inside of a loop, where LAPACK has no place. A singular matrix gives numbers that are not finite.
+    """
+    return _eliminated(a, b)[0]
+
+
+def volume(a: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Determinant of a matrix whose rows are made of length 1 [-]: +-1 where they are orthogonal, 0 where singular."""
+    _, determinant = _eliminated(a, jnp.zeros_like(a[:, 0]))
+    return jnp.where(jnp.isfinite(determinant), determinant, 0.0)  # a column without a pivot
+
+
+def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
+    """a^-1 b, and the determinant of a with its rows made of length 1."""
+    n = a.shape[0]
+    scales = [1.0 / jnp.where(size > 0.0, size, 1.0) for size in (norm(row) for row in a)]
+    rows = [a[i] * scales[i] for i in range(n)]
+    right = [b[i] * scales[i] for i in range(n)]
+    determinant = jnp.ones_like(a[0, 0])
+    for k in range(n):
+        for i in range(k + 1, n):  # the largest entry of the column rises to row k
+            larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = jnp.where(larger, rows[i], rows[k]), jnp.where(larger, rows[k], rows[i])
+            right[k], right[i] = jnp.where(larger, right[i], right[k]), jnp.where(larger, right[k], right[i])
+            determinant = jnp.where(larger, -determinant, determinant)
+        determinant = determinant * rows[k][k]
+        inverse = 1.0 / rows[k][k]
+        rows[k], right[k] = rows[k] * inverse, right[k] * inverse
+        for i in range(n):
+            if i != k:
+                factor = rows[i][k]
+                rows[i], right[i] = rows[i] - factor * rows[k], right[i] - factor * right[k]
+    return jnp.stack(right), determinant
+
+
 def row_norm(x: Float[Array, "n n"]) -> Float[Array, ""]:
     """Largest sum of magnitudes in a row."""
     return jnp.max(jnp.sum(jnp.abs(x), axis=1))
@@ -128,12 +175,11 @@ class Decay(NamedTuple):
     ends: tuple[Array, Array, Array]  # weights of the forcing at the start, the middle (twice) and the end [s]
 
 
-def decay(a: Float[Array, "n n"], dt: Scalar, longest: Scalar | None = None) -> Decay:
+def decay(a: Float[Array, "n n"], dt: Scalar, largest: Scalar | None = None) -> Decay:
     """Coefficients of Cox and Matthews, J. Comput. Phys. 176 (2002), eqs. (26)-(29), for m' = -A m + forcing.
 
-    longest: of many steps dt [s] that this one is among; see `phi_functions`.
+    largest: `row_norm` of a dt for the largest of many steps that this one is among; see `phi_functions`.
     """
-    largest = None if longest is None else row_norm(a) * longest
     halves = phi_functions(-a * dt / 2, 3, None if largest is None else largest / 2)
     half, phi_half, *_ = halves
     full, p1, p2, p3 = _double(halves)

@@ -1,4 +1,4 @@
-"""What is controlled: the rigid spacecraft of (1) and (2), and the integrator chain of (6) and (35)."""
+"""What is controlled: the rigid spacecraft of (1), (2), the chain of (6), (35), and systems (25) of one's own."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -17,9 +17,10 @@ Scalar = Float[Array, ""]
 
 
 class Plant(ABC):
-    """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = known(x, u) + d.
+    """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = known(t, x, u) + d.
 
-    M is `inertia`, constant, (m, m); u, d and w are (m,). The rollout, the observers and the metrics need no more.
+    u, d and w are (m,). M is (m, m) and, unless `mass` says otherwise, the constant `inertia`, against which observers
+    read their gains. The rollout, the observers and the metrics need no more.
     """
 
     inertia: Any  # (m, m)
@@ -34,13 +35,34 @@ class Plant(ABC):
     def velocity(self, x: Any) -> Float[Array, " m"]:
         """W of a state; of a state's derivative, w'."""
 
+    def mass(self, t: Scalar, x: Any) -> Float[Array, "m m"]:
+        """M."""
+        return self.inertia
+
     @abstractmethod
-    def known(self, x: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
+    def known(self, t: Scalar, x: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
         """What drives w besides the disturbance."""
 
     @abstractmethod
-    def rate(self, x: Any, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> Any:
+    def rate(self, t: Scalar, x: Any, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> Any:
         """Time derivative of the state."""
+
+    @abstractmethod
+    def input_for(self, t: Scalar, x: Any, w_dot: Float[Array, " m"], d: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The input with which w' is this under a disturbance d."""
+
+    def unexplained(self, t: Scalar, x: Any, x_dot: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The disturbance that explains the motion, M w' - known(t, x, u)."""
+        return self.mass(t, x) @ self.velocity(x_dot) - self.known(t, x, u)
+
+    def unexplained_impulse(
+        self, t: Scalar, x: Any, x_next: Any, u: Float[Array, " m"], dt: Scalar
+    ) -> Float[Array, " m"]:
+        """Its integral over a period dt [s] that ends at t, by the trapezium rule from the states at both ends."""
+        before = t - dt
+        known = 0.5 * (self.known(before, x, u) + self.known(t, x_next, u))
+        mass = 0.5 * (self.mass(before, x) + self.mass(t, x_next))
+        return mass @ (self.velocity(x_next) - self.velocity(x)) - dt * known
 
     def normalise(self, x: Any) -> Any:
         """The state with its constraints met again, which integration meets but for its error."""
@@ -86,14 +108,20 @@ class Spacecraft(Plant):
         """W [rad/s]; of a derivative, w' [rad/s^2]."""
         return x.w
 
-    def known(self, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
+    def known(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
         """J w' without the disturbance, u - w x J w [N m]."""
         return u - self.gyroscopic(x.w)
 
-    def rate(self, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
+    def rate(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
         """Time derivative of the state under torque and disturbance [N m], (1) and (2)."""
         w_dot = self.inertia_inverse @ (u + disturbance - self.gyroscopic(x.w))
         return AttitudeState(attitude.derivative(x.q, x.w), w_dot)
+
+    def input_for(
+        self, t: Scalar, x: AttitudeState, w_dot: Float[Array, "3"], d: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """J w' + w x J w - d [N m]."""
+        return self.inertia @ w_dot + self.gyroscopic(x.w) - d
 
     def normalise(self, x: AttitudeState) -> AttitudeState:
         """The state with |q| = 1 again."""
@@ -148,13 +176,21 @@ class Chain(Plant):
         """x_n, (1,)."""
         return x[-1:]
 
-    def known(self, x: Float[Array, " n"], u: Float[Array, "1"]) -> Float[Array, "1"]:
+    def known(self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"]) -> Float[Array, "1"]:
         """f(x) + g(x) u, (1,)."""
         return self.drift(x) + self.input_gain(x) * u
 
-    def rate(self, x: Float[Array, " n"], u: Float[Array, "1"], disturbance: Float[Array, "1"]) -> Float[Array, " n"]:
+    def rate(
+        self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"], disturbance: Float[Array, "1"]
+    ) -> Float[Array, " n"]:
         """Time derivative of the state, (35)."""
-        return jnp.concatenate([x[1:], self.known(x, u) + disturbance])
+        return jnp.concatenate([x[1:], self.known(t, x, u) + disturbance])
+
+    def input_for(
+        self, t: Scalar, x: Float[Array, " n"], w_dot: Float[Array, "1"], d: Float[Array, "1"]
+    ) -> Float[Array, "1"]:
+        """(x_n' - f(x) - d) / g(x)."""
+        return (w_dot - d - self.drift(x)) / self.input_gain(x)
 
     def speed(self, x: Float[Array, " n"]) -> Scalar:
         """|x_2| = |x_1'|."""
@@ -170,11 +206,138 @@ def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> C
     if order < 2:
         raise ValueError(f"order is {order}, but must be at least 2")
 
-    def wrapped(function: Callable | None) -> Any:
-        plain = function is not None and jax.tree.leaves(function) == [function]  # no pytree itself
-        return jax.tree_util.Partial(function) if plain else function
+    return Chain(order, _called(f), _called(g))
 
-    return Chain(order, wrapped(f), wrapped(g))
+
+def _called(function: Callable | None) -> Any:
+    """A function as a pytree that can be called."""
+    plain = function is not None and jax.tree.leaves(function) == [function]  # no pytree itself
+    return jax.tree_util.Partial(function) if plain else function
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class System(Plant):
+    """Second-order system (25) of one's own: x_1' = F, x_2' = H + G u + D d; all are functions of (t, x_1, x_2).
+
+    x_1, x_2, u and d are (n,), the state (2n,) is x_1 followed by x_2. Time is an argument, since x_1 is an error:
+    where the reference moves, F knows it. Its M is D^-1. Build it with `system`.
+    """
+
+    F: Any  # -> (n,)
+    H: Any  # -> (n,)
+    G: Any  # -> (n, n)
+    D: Any  # -> (n, n), or None for the identity
+    inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
+    inertia_inverse: Leaf  # (n, n)
+
+    def _at(self, function: Any, t: Scalar, x: Float[Array, " twice"]) -> Array:
+        n = self.inputs
+        return function(t, x[:n], x[n:])
+
+    def position(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_1."""
+        return x[: self.inputs]
+
+    def velocity(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_2."""
+        return x[self.inputs :]
+
+    def position_rate(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_1' = F."""
+        return self._at(self.F, t, x)
+
+    def slope(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """dF/dx2."""
+        n = self.inputs
+        return jax.jacfwd(self.F, argnums=2)(t, x[:n], x[n:])
+
+    def carried(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """What of x_1'' no acceleration makes: dF/dt + dF/dx1 F."""
+        n = self.inputs
+        x_1, x_2 = x[:n], x[n:]
+        moved = (jnp.ones_like(t), self.F(t, x_1, x_2))
+        return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), moved)[1]
+
+    def drift(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """H."""
+        return self._at(self.H, t, x)
+
+    def input_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """G."""
+        return self._at(self.G, t, x)
+
+    def disturbance_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """D."""
+        return jnp.eye(self.inputs) if self.D is None else self._at(self.D, t, x)
+
+    def mass(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """D^-1."""
+        one = jnp.eye(self.inputs)
+        return one if self.D is None else numerics.solve(self.disturbance_gain(t, x), one)
+
+    def known(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
+        """D^-1 (H + G u)."""
+        driven = self.drift(t, x) + self.input_gain(t, x) @ u
+        return driven if self.D is None else numerics.solve(self.disturbance_gain(t, x), driven)
+
+    def rate(
+        self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
+    ) -> Float[Array, " twice"]:
+        """Time derivative of the state, (25)."""
+        driven = self.drift(t, x) + self.input_gain(t, x) @ u + self.disturbance_gain(t, x) @ disturbance
+        return jnp.concatenate([self.position_rate(t, x), driven])
+
+    def input_for(
+        self, t: Scalar, x: Float[Array, " twice"], w_dot: Float[Array, " n"], d: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """G^-1 (x_2' - H - D d)."""
+        driven = w_dot - self.drift(t, x) - self.disturbance_gain(t, x) @ d
+        return numerics.solve(self.input_gain(t, x), driven)
+
+    def speed(self, x: Float[Array, " twice"]) -> Scalar:
+        """|x_2|."""
+        return numerics.norm(self.velocity(x))
+
+    def columns(self, x: Any) -> dict[str, Any]:
+        """The states x_1 and x_2, one after the other."""
+        return {"x": x}
+
+
+def system(
+    n: int,
+    F: Callable,
+    H: Callable,
+    G: Callable,
+    D: Callable | None = None,
+    inertia: object = None,
+) -> System:
+    """Second-order system (25) with n inputs from JAX functions of (t, x_1, x_2); see `System`.
+
+    F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None. inertia: (n, n)
+    that observers read their gains against (A = l inertia^-1), the identity if None: gains are then in 1/s.
+    Raises ValueError where a function does not take such arguments or returns another shape.
+    """
+    if n < 1:
+        raise ValueError(f"n is {n}, but must be at least 1")
+    one = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    vector = jax.ShapeDtypeStruct((n,), one.dtype)
+    for name, function, shape in (("F", F, (n,)), ("H", H, (n,)), ("G", G, (n, n)), ("D", D, (n, n))):
+        if function is None:
+            continue
+        try:
+            returned = jax.eval_shape(function, one, vector, vector)
+        except Exception as error:
+            raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {error}") from error
+        if getattr(returned, "shape", None) != shape:
+            raise ValueError(
+                f"{name}(t, x_1, x_2) returns {getattr(returned, 'shape', type(returned).__name__)}, but for n = {n} "
+                f"must return an array of shape {shape}"
+            )
+    scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
+    if scale.shape != (n, n) or not np.all(np.isfinite(scale)) or np.linalg.matrix_rank(scale) < n:
+        raise ValueError(f"inertia must be an invertible ({n}, {n}) matrix")
+    return System(_called(F), _called(H), _called(G), _called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale)))
 
 
 def spacecraft(inertia: object) -> Spacecraft:

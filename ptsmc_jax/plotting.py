@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import theory
+from ptsmc_jax.controllers import PrescribedTime
 from ptsmc_jax.metrics import CATALOGUES
-from ptsmc_jax.plants import Chain
+from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.rollout import Log, Parts
 
 # Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
@@ -43,9 +44,9 @@ def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str,
     }
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
-    if isinstance(parts.plant, Chain):
-        return {"states": states(parts, log), **figures}
-    return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
+    if isinstance(parts.plant, Spacecraft):
+        return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
+    return {"states": states(parts, log), **figures}
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
@@ -68,7 +69,7 @@ def attitude(parts: Parts, log: Log, title: str = "Attitude") -> Figure:
 
 
 def states(parts: Parts, log: Log, title: str = "States") -> Figure:
-    """States of a chain over time."""
+    """States of a chain or a system over time."""
     figure, axes = _figure(title, "state")
     _components(axes, log.t, log.x, "x")
     _mark(axes, parts)
@@ -185,9 +186,10 @@ def disturbance(parts: Parts, log: Log) -> Figure:
 
 def _names(parts: Parts) -> tuple[str, str, str]:
     """Labels of the error and the input, and the input's unit behind a number."""
-    if isinstance(parts.plant, Chain):
+    if not isinstance(parts.plant, Spacecraft):
         return "$|x_1|$", "input u", ""
-    return "|$\\varepsilon_1$| [-]", "torque [N m]", " N m"
+    additive = isinstance(parts.controller, PrescribedTime)
+    return "|$\\varepsilon_1$| [-]" if additive else "|v| [-]", "torque [N m]", " N m"
 
 
 def tuning_history(

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
-from ptsmc_jax.controllers import Law
 from ptsmc_jax.draws import Whole
 from ptsmc_jax.hardware import Actuators
+from ptsmc_jax.laws import Law
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
@@ -29,7 +29,7 @@ STATUS = {
     OK: ("ok", ""),
     DIVERGED: ("diverged", "the state is not finite"),
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
-    SINGULAR: ("singular", "the law's singularity (q4 = 0 for the additive error) came nearer than 1e-3"),
+    SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
@@ -86,12 +86,20 @@ class Result(NamedTuple):
 
 class _State(NamedTuple):
     x: Any
-    d_hat: Array
+    memory: Array  # of the observer
     u: Array  # delivered at the end of the last interval
     sight: metrics.Sight
     running: metrics.Running
     status: Array
     bad_time: Array
+
+
+class _Course(NamedTuple):
+    """What a run begins with and is judged by."""
+
+    judged: metrics.Judged
+    x0: Any
+    side: Array  # of the law's singularity on which it starts, +-1
 
 
 class _Flight(NamedTuple):
@@ -112,19 +120,23 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     """
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
-    x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    target = parts.reference(jnp.zeros_like(parts.t_end))
+    x0 = parts.controller.align(parts.initial, target)
+    side = jnp.where(parts.controller.clearance(x0, target) < 0.0, -1.0, 1.0)
+    course = _Course(judged, x0, jax.lax.stop_gradient(side))
     loop = _continuous if isinstance(parts.clock, Graded) else _sampled
-    return loop(parts, ticks, judged, x0, seed, trial, record)
+    return loop(parts, ticks, course, seed, trial, record)
 
 
 # One compiled program for all parts of the same structure.
 simulate_jit = jax.jit(simulate, static_argnames="record")
 
 
-def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, trial, record) -> Result:
+def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
     """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
     controller = parts.controller
     observer: Observer = parts.observer
+    model = observer.model
     sensors: Sensor | None = parts.sensors
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = observer.error_bound()
@@ -146,7 +158,7 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
             def rate(time: Scalar, y: Any) -> Any:
                 d = parts.disturbance(time, y)
                 acting = _with_wheels(u, stored, parts.plant.velocity(y))
-                return parts.plant.rate(y, acting, d if pushed is None else d + pushed)
+                return parts.plant.rate(time, y, acting, d if pushed is None else d + pushed)
 
             return numerics.rk4(rate, t + k * step, x, step)
 
@@ -162,10 +174,10 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
         w = parts.plant.velocity(seen)
         told = (state.u, None) if flight.applied is None else flight.applied
         applied = _with_wheels(*told, (parts.plant.velocity(flight.seen) + w) / 2)
-        d_hat = observer.update(
-            jnp.where(partial, first_matrix, matrix), state.d_hat, flight.seen, seen, applied, dt_before
-        )
-        d_hat = jnp.where(dt_before > 0.0, d_hat, state.d_hat)
+        impulse = model.unexplained_impulse(now.t, flight.seen, seen, applied, dt_before)
+        memory = observer.update(jnp.where(partial, first_matrix, matrix), state.memory, impulse, now.t, dt_before)
+        memory = jnp.where(dt_before > 0.0, memory, state.memory)
+        d_hat = observer.estimate(memory)
         u, s = controller.torque(now.t, now.hold, seen, parts.reference(now.t), d_hat, k2(now.t))
         drive, queue = actuators.command(flight.acting, u, w, dt, now.noise_weight)
         pushed = flight.pushed
@@ -186,18 +198,20 @@ def _sampled(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, 
         def until(t: Scalar) -> Any:
             return fly(start, now.t, drive, pushed, t - now.t)
 
-        state = _advance(parts, judged, state, now, x, d_hat, span, until, dt / parts.substeps)
+        state = _advance(parts, course, state, now, x, memory, span, until, dt / parts.substeps)
         told = None if actuators.holds else actuators.over(drive, jnp.zeros_like(dt), dt)
         return (state, _Flight(sensing, seen, told, acting, pushed)), row
 
-    state, none = _begin(parts, judged, x0), jnp.zeros(parts.plant.inputs)
+    state, none = _begin(parts, course), jnp.zeros(parts.plant.inputs)
     first = state.sight
     acting = actuators.begin(parts.plant.inputs)
-    sensing = None if sensors is None else sensors.begin(seed, trial, x0, ticks.sample[0])
+    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, ticks.sample[0])
     told = (none, None if actuators.wheels is None else none)
-    flight = _Flight(sensing, x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none)
+    flight = _Flight(
+        sensing, course.x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none
+    )
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
-    return _finish(parts, judged, first, state, k2, rows, flight.pushed, held=True)
+    return _finish(parts, course, first, state, k2, rows, flight.pushed, held=True)
 
 
 def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
@@ -205,52 +219,57 @@ def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
     return u if stored is None else u - jnp.cross(w, stored)
 
 
-def _continuous(parts: Parts, ticks: Ticks, judged: metrics.Judged, x0: Any, seed, trial, record) -> Result:
+def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
     """Law and observer inside the integrator's stages; the observer's linear part exact in every step."""
     del seed, trial  # nothing is drawn
     controller = parts.controller
     observer: Observer = parts.observer
+    model = observer.model
     k2 = observer.error_bound()
     lengths = ticks.t_next - ticks.t
-    longest = jax.lax.stop_gradient(jnp.max(lengths))
-    decays = jax.vmap(lambda dt: numerics.decay(observer.decay_matrix(), dt, longest))(lengths)
+    slopes = jax.vmap(observer.decay_matrix)(ticks.t, ticks.t_next)
+    largest = jnp.max(jax.vmap(lambda a, dt: numerics.row_norm(a) * dt)(slopes, lengths))
+    decays = jax.vmap(lambda a, dt: numerics.decay(a, dt, largest))(slopes, lengths)
 
     def step(state: _State, tick: tuple) -> tuple[_State, Any]:
         now, linear = tick
         dt = now.t_next - now.t
 
-        def rate(t: Scalar, x: Any, d_hat: Array) -> tuple[Any, Array, tuple[Array, Array]]:
-            u, s = controller.torque(t, now.hold, x, parts.reference(t), d_hat, k2(t))
-            x_dot = parts.plant.rate(x, u, parts.disturbance(t, x))
-            return x_dot, observer.forcing(x, x_dot, u), (u, s)
+        def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
+            u, s = controller.torque(t, now.hold, x, parts.reference(t), observer.estimate(memory), k2(t))
+            x_dot = parts.plant.rate(t, x, u, parts.disturbance(t, x))
+            seen = model.unexplained(t, x, x_dot, u)
+            return x_dot, observer.forcing(t, (now.t, now.t_next), memory, seen), (u, s)
 
-        x, d_hat, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, state.d_hat, dt)
-        row = _row(parts, now.t, state.x, state.d_hat, u, u, s, dt > 0.0) if record else None
+        x, memory, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, state.memory, dt)
+        d_hat = observer.estimate(state.memory)
+        row = _row(parts, now.t, state.x, d_hat, u, u, s, dt > 0.0) if record else None
         x = parts.plant.normalise(x)
-        _, _, (u_end, _) = rate(now.t_next, x, d_hat)
+        _, _, (u_end, _) = rate(now.t_next, x, memory)
         torques = (u, u_middle, u_end)
         span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
-        return _advance(parts, judged, state, now, x, d_hat, span, lambda t: x, dt), row
+        return _advance(parts, course, state, now, x, memory, span, lambda t: x, dt), row
 
-    state = _begin(parts, judged, x0)
+    state = _begin(parts, course)
     first = state.sight
     state, rows = jax.lax.scan(step, state, (ticks, decays))
-    return _finish(parts, judged, first, state, k2, rows, None, held=False)
+    return _finish(parts, course, first, state, k2, rows, None, held=False)
 
 
-def _begin(parts: Parts, judged: metrics.Judged, x0: Any) -> _State:
+def _begin(parts: Parts, course: _Course) -> _State:
+    judged, x0 = course.judged, course.x0
     zero, none = jnp.zeros_like(judged.t_f), jnp.zeros(parts.plant.inputs)
     sight = _sight(parts, zero, x0)
     state = _State(
         x=x0,
-        d_hat=none,
+        memory=parts.observer.begin(),
         u=none,
         sight=sight,
         running=metrics.begin(sight, judged, parts.plant.inputs),
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
-    status, bad_time = _watch(parts, state, zero, zero, x0, none)
+    status, bad_time = _watch(parts, course, state, zero, zero, x0, none)
     return state._replace(status=status, bad_time=bad_time)
 
 
@@ -264,12 +283,12 @@ class _Torques(NamedTuple):
     wheel_momentum: Array | None
 
 
-def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torques, until, step) -> _State:
+def _advance(parts, course, state: _State, now: Ticks, x, memory, torques: _Torques, until, step) -> _State:
     """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
     step: longest integration step taken in it [s].
     """
-    law, reference = parts.controller, parts.reference
+    law, reference, judged = parts.controller, parts.reference, course.judged
     sight = _sight(parts, now.t_next, x)
 
     def errors() -> tuple:
@@ -280,10 +299,10 @@ def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torqu
         return law.errors(reached, target)[0], law.angle(reached, target)
 
     span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
-    status, bad_time = _watch(parts, state, now.t_next, step, x, torques.delivered[-1])
+    status, bad_time = _watch(parts, course, state, now.t_next, step, x, torques.delivered[-1])
     return _State(
         x=x,
-        d_hat=d_hat,
+        memory=memory,
         u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
         sight=sight,
         running=metrics.update(state.running, span, judged),
@@ -292,14 +311,16 @@ def _advance(parts, judged, state: _State, now: Ticks, x, d_hat, torques: _Torqu
     )
 
 
-def _finish(parts: Parts, judged, first, state: _State, k2, rows, pushed, *, held: bool) -> Result:
+def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, held: bool) -> Result:
+    judged = course.judged
     log, angle_at_t_f = None, state.running.late.angle_at_t_f
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
-        u, s = parts.controller.torque(judged.t_end, hold, state.x, target, state.d_hat, k2(judged.t_end))
+        d_hat = parts.observer.estimate(state.memory)
+        u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
         u = state.u if held else u
-        last = _row(parts, judged.t_end, state.x, state.d_hat, u, u, s, jnp.asarray(True), pushed)
+        last = _row(parts, judged.t_end, state.x, d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
@@ -312,11 +333,13 @@ def _sight(parts: Parts, t: Scalar, x: Any) -> metrics.Sight:
     return metrics.Sight(angle, parts.plant.speed(x), numerics.norm(parts.plant.momentum(x)))
 
 
-def _watch(parts: Parts, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array) -> tuple[Array, Array]:
+def _watch(
+    parts: Parts, course: _Course, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array
+) -> tuple[Array, Array]:
     """Status and first bad time after an interval; the first thing that goes wrong stays."""
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((x, u))))
     fast = parts.plant.too_fast(x, dt)
-    near = parts.controller.clearance(x, parts.reference(t)) < SINGULAR_CLEARANCE
+    near = course.side * parts.controller.clearance(x, parts.reference(t)) < SINGULAR_CLEARANCE
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (state.status == OK) & (code != OK)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)

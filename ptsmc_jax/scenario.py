@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import build, checks, clock, dispersions, metrics, observers, schema, theory
+from ptsmc_jax import build, checks, clock, controllers, dispersions, metrics, observers, schema, theory
 from ptsmc_jax import tables as t
 from ptsmc_jax.checks import MOST_STEPS
 from ptsmc_jax.requirements import Requirement
@@ -52,6 +52,7 @@ class Reach:
     delta: float  # largest [s]
     smallest_delta: float  # [s]
     gain: float  # smallest observer gain [N m s]; of no meaning without an observer
+    largest_gain: float
     k1: float  # largest [1/s]
     sign_width: float  # smallest
 
@@ -92,14 +93,15 @@ def study(scenario: Scenario, saves: object = (), reach: Reach | None = None, *,
     """The parts of a checked scenario; `saves`: times [s] at which a continuous run must have nodes.
 
     drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
-    Raises ScenarioError where the additive law cannot reach the reference from the initial attitude.
+    Raises ScenarioError where the law meets its singularity on the way from the initial state to the reference.
     """
     parts = _parts(scenario, saves, reach)
     dispersion = build.dispersion(scenario)
-    if scenario.initial is not None:
+    if isinstance(parts.controller, controllers.PrescribedTime):
         _check_reference(scenario, parts)
-        if not drawn or dispersion.attitude is None:  # a drawn trial that meets the singularity is marked and counted
-            _check_start(scenario, parts)
+    # a drawn trial that meets the singularity is marked and counted
+    if scenario.initial is not None and (not drawn or dispersion.attitude is None):
+        _check_start(scenario, parts)
     units = metrics.CATALOGUES[scenario.plant.kind]
     requirements = tuple(
         Requirement(name, value.limit if isinstance(value, t.Limit) else float(value), units[name][0])
@@ -111,11 +113,12 @@ def study(scenario: Scenario, saves: object = (), reach: Reach | None = None, *,
 def reach_of(scenario: Scenario) -> Reach:
     """The reach of a scenario's own gains: none beyond them."""
     table = scenario.controller
-    gain = min(getattr(scenario.observer, "gain", (0.0,)))
-    return Reach(table.t_f, table.delta, table.delta, gain, table.k1, table.sign_width)
+    gains = getattr(scenario.observer, "gain", (0.0,))
+    return Reach(table.t_f, table.delta, table.delta, min(gains), max(gains), table.k1, table.sign_width)
 
 
 _SINGULAR = "q4 = 0 (180 degrees from the inertial frame's identity), which the additive law cannot cross"
+_OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is singular"
 
 
 def _check_reference(scenario: Scenario, parts: Parts) -> None:
@@ -134,18 +137,20 @@ def _check_reference(scenario: Scenario, parts: Parts) -> None:
 
 
 def _check_start(scenario: Scenario, parts: Parts) -> None:
-    """Refuse an initial attitude from which the additive law meets its singularity on the way."""
+    """Refuse an initial attitude from which the law meets its singularity on the way."""
     assert scenario.initial is not None
+    additive = isinstance(parts.controller, controllers.PrescribedTime)
+    singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
     key, value = checks.attitude_key(scenario.initial)
     said = f"initial.{key} is {schema.show(value)}"
     times, _, square = (np.asarray(v) for v in _path(parts))
     if square[0] < SINGULAR_CLEARANCE**2:
-        raise ScenarioError(f"{said}, but lies at {_SINGULAR}; allowed is |q4| of at least {SINGULAR_CLEARANCE}")
+        raise ScenarioError(f"{said}, but lies at {singular}; allowed is {name} of at least {SINGULAR_CLEARANCE}")
     if square.min() < SINGULAR_CLEARANCE**2:
         when = float(times[int(np.argmin(square))])
         raise ScenarioError(
             f"{said} with initial.rate = {schema.show(scenario.initial.rate)}, but from there the path to the "
-            f"reference meets {_SINGULAR}, at t = {when:.4g} s; allowed is a start whose path keeps |q4| above "
+            f"reference meets {singular}, at t = {when:.4g} s; allowed is a start whose path keeps {name} above "
             f"{SINGULAR_CLEARANCE}"
         )
 
@@ -155,13 +160,13 @@ _path = jax.jit(theory.exact_path)
 
 def _parts(scenario: Scenario, saves: object, reach: Reach | None) -> Parts:
     reach = reach or reach_of(scenario)
-    made = build.chain(scenario) if scenario.initial is None else build.spacecraft(scenario)
-    model, controller, initial, reference = made
+    model, controller, initial, reference = build.plant(scenario)
     observer = build.observer(scenario, model)
     loop = scenario.loop
     assert loop.t_end is not None
     substeps = 1
     if loop.mode == "continuous":
+        saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
         timing: Any = _grid(scenario, reach, controller, observer, saves)
     else:
         late = loop.t_end - scenario.controller.t_f + reach.delta
@@ -248,8 +253,11 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
 @jax.jit  # one program, where each of its operations would be one
 def _boundary_layer(controller: Any, observer: Any) -> tuple:
     """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
-    bound = observer.error_bound()
-    return controller.boundary_layer(jnp.maximum(bound.floor, bound.start))
+    return controller.boundary_layer(observer.error_bound().largest)
+
+
+def _with_gain(observer: Any, gain: float) -> Any:
+    return dataclasses.replace(observer, gain=jnp.full_like(observer.gain, gain))
 
 
 def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, saves: object) -> clock.Graded:
@@ -257,13 +265,10 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
     loop = scenario.loop
     t_end = loop.t_end
     assert t_end is not None
-    if isinstance(observer, observers.NonlinearObserver):  # K2 is largest with the smallest gain
-        observer = observers.NonlinearObserver(
-            observer.model,
-            jnp.full_like(observer.gain, reach.gain),
-            observer.disturbance_rate_bound,
-            observer.initial_error,
-        )
+    resolved = 0.0
+    if not isinstance(observer, observers.NoObserver):  # K2 is largest with the smallest gain
+        resolved = _with_gain(observer, reach.largest_gain).fastest()
+        observer = _with_gain(observer, reach.gain)
     widest = dataclasses.replace(
         controller, t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
     )
@@ -271,8 +276,9 @@ def _grid(scenario: Scenario, reach: Reach, controller: Any, observer: Any, save
     if reach.sign_width > 0.0:
         before, after = _boundary_layer(widest, observer)
         layer = (float(before), float(after))
+    layer = (max(layer[0], resolved), max(layer[1], resolved))
     rate, frequency = widest.hold_rate(), _fastest(scenario)
-    order = scenario.plant.order if isinstance(scenario.plant, t.ChainPlant) else 1
+    order = 1 if isinstance(scenario.plant, t.SpacecraftPlant) else controller.order
 
     def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0)) -> float:
         taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))

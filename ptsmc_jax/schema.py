@@ -47,10 +47,13 @@ def show(value: Any) -> str:
 
 
 def load(path: str | Path) -> dict[str, Any]:
-    """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML."""
+    """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML.
+
+    A Python file that it names (plant.system) is looked for beside it.
+    """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
-        return tomllib.loads(text)
+        raw = tomllib.loads(text)
     except FileNotFoundError:
         raise ScenarioError(f"the scenario file {path} is not there") from None
     except IsADirectoryError:
@@ -61,6 +64,11 @@ def load(path: str | Path) -> dict[str, Any]:
         raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
         raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
+    plant = raw.get("plant")
+    file, _, name = str(plant.get("system", "") if isinstance(plant, dict) else "").rpartition(":")
+    if isinstance(plant, dict) and file.endswith(".py"):
+        plant["system"] = f"{(Path(path).parent / file).resolve()}:{name}"
+    return raw
 
 
 def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Scenario:
@@ -149,7 +157,11 @@ def one_attitude(name: str, table: Any) -> None:
 
 def dump(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
-    return typing.cast(dict, _without_none(msgspec.to_builtins(scenario)))
+    own = getattr(scenario.plant, "system", None)
+    if own is None or isinstance(own, str):
+        return typing.cast(dict, _without_none(msgspec.to_builtins(scenario)))
+    plain = dump(msgspec.structs.replace(scenario, plant=msgspec.structs.replace(scenario.plant, system="")))
+    return {**plain, "plant": {**plain["plant"], "system": own}}  # made in Python: stays what it is
 
 
 def _without_none(value: Any) -> Any:

@@ -118,6 +118,16 @@ class Origin:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Now:
+    """The reference of a system of one's own: the time itself, since F says how far from its target the system is."""
+
+    def __call__(self, t: Time) -> Time:
+        """T [s]."""
+        return t
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Constant:
     """A constant disturbance; zero serves as none."""
 

@@ -12,9 +12,11 @@ NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
 Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
 Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
 ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
-One = Annotated[tuple[float], Meta(description="a list of one number")]
-OneNotNegative = Annotated[tuple[NotNegative], Meta(description="a list of one number of at least 0")]
-OnePositive = Annotated[tuple[Positive], Meta(description="a list of one number greater than 0")]
+Each = Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each input")]
+EachNotNegative = Annotated[
+    tuple[NotNegative, ...], Meta(description="a list of numbers of at least 0, one for each input")
+]
+EachPositive = Annotated[tuple[Positive, ...], Meta(description="a list of numbers greater than 0, one for each input")]
 Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
 NotNegatives = Annotated[
     tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
@@ -43,6 +45,14 @@ class ChainPlant(Table, frozen=True):
     kind: Literal["chain"] = "chain"
     order: Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")] = 2
     x0: Numbers = (5.0, 3.0)
+
+
+class SystemPlant(Table, frozen=True):
+    """A system (25) of one's own: where it stands, or, from Python, itself."""
+
+    kind: Literal["system"] = "system"
+    system: Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')] = None
+    x0: Numbers = (1.0, 0.0)
 
 
 class Spacecraft(Table, frozen=True):
@@ -89,6 +99,7 @@ class SlewReference(Attitude, frozen=True):
     kind: Literal["slew"] = "slew"
     to_quat_xyzw: Four = (0.0, 0.0, 0.0, 1.0)
     duration: Positive = 30.0
+    way: Literal["short", "long"] = "short"
 
 
 class NoDisturbance(Table, frozen=True):
@@ -121,9 +132,9 @@ class RandomWalk(Table, frozen=True):
     density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
 
 
-class ChainRandomWalk(Table, frozen=True):
+class EachRandomWalk(Table, frozen=True):
     kind: Literal["random_walk"] = "random_walk"
-    density: OneNotNegative = (1e-4,)
+    density: EachNotNegative = ()  # 1e-4 each
 
 
 class SumDisturbance(Table, frozen=True):
@@ -133,17 +144,17 @@ class SumDisturbance(Table, frozen=True):
     terms: tuple[Any, ...] = ()
 
 
-class ChainConstantDisturbance(Table, frozen=True):
+class EachConstant(Table, frozen=True):
     kind: Literal["constant"] = "constant"
-    amplitude: One = (0.01,)
+    amplitude: Each = ()  # 0.01 each
 
 
-class ChainSinusoidDisturbance(Table, frozen=True):
+class EachSinusoid(Table, frozen=True):
     kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: One = (0.01,)
-    frequency: One = (1.0,)
-    phase: One = (0.0,)
-    bias: One = (0.0,)
+    amplitude: Each = ()  # 0.01 each
+    frequency: Each = ()  # 1
+    phase: Each = ()  # 0
+    bias: Each = ()  # 0
 
 
 class Controller(Table, frozen=True):
@@ -159,19 +170,23 @@ class Controller(Table, frozen=True):
     initial_estimate_error: NotNegative = 0.0
 
 
-class ChainController(Table, frozen=True):
+class SystemController(Table, frozen=True):
     kind: Literal["prescribed_time"] = "prescribed_time"
     t_f: Positive = 5.0
-    eta: Positive = 3.0
+    eta: Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")] = 3.0
     delta: Positive = 0.05
     k1: Positive = 1.0
-    a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
-        1.0,
-    )
     sign_width: NotNegative = 1e-3
     disturbance_rate_bound: NotNegative = 0.01
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
+
+
+class ChainController(SystemController, frozen=True):
+    eta: Positive = 3.0
+    a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
+        1.0,
+    )
 
 
 class NoObserver(Table, frozen=True):
@@ -183,9 +198,39 @@ class NonlinearObserver(Table, frozen=True):
     gain: ThreePositive = (10.0, 10.0, 10.0)
 
 
-class ChainNonlinearObserver(Table, frozen=True):
+class EachNonlinearObserver(Table, frozen=True):
     kind: Literal["nonlinear"] = "nonlinear"
-    gain: OnePositive = (10.0,)
+    gain: EachPositive = ()  # 10 each
+
+
+class Prescribed(Table, frozen=True):
+    """What a prescribed-time observer has besides its gain."""
+
+    mu: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
+    t_o: Positive | None = None  # a third of t_f
+    delta_o: Positive | None = None  # 0.05 s, or a period if that is longer
+
+
+class PrescribedTimeObserver(Prescribed, frozen=True):
+    kind: Literal["prescribed_time"] = "prescribed_time"
+    gain: ThreePositive = (10.0, 10.0, 10.0)
+
+
+class EachPrescribedTimeObserver(Prescribed, frozen=True):
+    kind: Literal["prescribed_time"] = "prescribed_time"
+    gain: EachPositive = ()  # 10 each
+
+
+class FiniteTimeObserver(Table, frozen=True):
+    kind: Literal["finite_time"] = "finite_time"
+    gain: ThreePositive = (0.02, 0.02, 0.02)
+    sign_width: NotNegative = 1e-5
+
+
+class EachFiniteTimeObserver(Table, frozen=True):
+    kind: Literal["finite_time"] = "finite_time"
+    gain: EachPositive = ()  # 0.2 each
+    sign_width: NotNegative = 1e-5
 
 
 class Loop(Table, frozen=True):
@@ -214,7 +259,7 @@ class Hardware(Actuators, frozen=True):
     star_tracker_every: Count | None = None
 
 
-class ChainHardware(Actuators, frozen=True):
+class StateHardware(Actuators, frozen=True):
     state_noise: NotNegatives | None = None
 
 
@@ -321,7 +366,7 @@ class Dispersion(Table, frozen=True):
     disturbance_phase: UniformPhase | None = None
 
 
-class ChainDispersion(Table, frozen=True):
+class StateDispersion(Table, frozen=True):
     x0: UniformState | NormalState | None = None
     disturbance_phase: UniformPhase | None = None
 
@@ -329,7 +374,7 @@ class ChainDispersion(Table, frozen=True):
 class Scenario(Table, frozen=True, kw_only=True):
     """A scenario as its file says it, every key resolved; tables that are None are off, or not of this plant's."""
 
-    plant: SpacecraftPlant | ChainPlant
+    plant: SpacecraftPlant | ChainPlant | SystemPlant
     spacecraft: Spacecraft | None = None
     initial: Initial | None = None
     reference: FixedReference | SpinReference | SinusoidReference | SlewReference | None = None
@@ -340,16 +385,24 @@ class Scenario(Table, frozen=True, kw_only=True):
         | GravityGradient
         | RandomWalk
         | SumDisturbance
-        | ChainConstantDisturbance
-        | ChainSinusoidDisturbance
-        | ChainRandomWalk
+        | EachConstant
+        | EachSinusoid
+        | EachRandomWalk
     )
-    controller: Controller | ChainController
-    observer: NonlinearObserver | ChainNonlinearObserver | NoObserver
+    controller: Controller | ChainController | SystemController
+    observer: (
+        NoObserver
+        | NonlinearObserver
+        | EachNonlinearObserver
+        | PrescribedTimeObserver
+        | EachPrescribedTimeObserver
+        | FiniteTimeObserver
+        | EachFiniteTimeObserver
+    )
     loop: Loop
-    hardware: Hardware | ChainHardware | None = None
+    hardware: Hardware | StateHardware | None = None
     wheels: PyramidWheels | AxesWheels | None = None
     filter: NoFilter | SteadyStateFilter | None = None
-    dispersion: Dispersion | ChainDispersion | None = None
+    dispersion: Dispersion | StateDispersion | None = None
     requirements: dict[str, float | Limit] = {}
     tune: Tune | None = None

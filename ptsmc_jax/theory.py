@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import attitude, numerics
 from ptsmc_jax.controllers import expansion
-from ptsmc_jax.plants import AttitudeState, Chain
+from ptsmc_jax.laws import SecondOrder
+from ptsmc_jax.plants import Chain
 from ptsmc_jax.rollout import Parts
 
 Scalar = Float[Array, ""]
@@ -210,7 +211,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
         error, error_rate = _start(parts)
         s0 = float(jnp.linalg.norm(law.t_f * error_rate + law.eta * error))
     bound = parts.observer.error_bound()
-    switching = float(law.switching_rate(jnp.maximum(bound.start, bound.floor)))
+    switching = float(law.switching_rate(bound.largest))
     beta = switching * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
@@ -265,29 +266,24 @@ def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
 def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     """Input (m,) [N m] along the exact motion at t [s] before the hand-over, and the law's clearance then [-].
 
-    For the spacecraft q4^2 = 1 - |v|^2 stands for the clearance; at or below 0 the path leaves the unit ball.
+    For attitudes 1 - |v|^2, the square of the scalar part, stands for the clearance; at or below 0 there is no path.
     """
     law, plant = parts.controller, parts.plant
     if isinstance(plant, Chain):
         motion = exact_chain(t, law.t_f, law.eta, parts.initial)
-        drive = motion.acceleration - parts.disturbance(t, motion.x)
-        return (drive - plant.drift(motion.x)) / plant.input_gain(motion.x), jnp.ones_like(t)
-    target = parts.reference(t)
-    motion = exact_error(t, law.t_f, law.eta, *_start(parts))
-    rate_f, acceleration_f = target.vector_rates()
-    v = target.q[:3] + motion.error
-    square = 1.0 - jnp.sum(v * v)
-    scalar = jnp.where(target.q[3] < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(square, 1e-12))
-    q = jnp.append(v, scalar)
-    w = 2.0 * attitude.t_inverse_times(q, rate_f + motion.error_rate)
-    w_dot = attitude.t_inverse_times(q, 2.0 * (acceleration_f + motion.acceleration) + 0.5 * jnp.dot(w, w) * v)
-    return plant.inertia @ w_dot + jnp.cross(w, plant.inertia @ w) - parts.disturbance(t, AttitudeState(q, w)), square
+        w_dot = jnp.reshape(motion.acceleration, 1)
+        return plant.input_for(t, motion.x, w_dot, parts.disturbance(t, motion.x)), jnp.ones_like(t)
+    assert isinstance(law, SecondOrder)
+    wanted = exact_error(t, law.t_f, law.eta, *_start(parts))
+    motion = law.motion(parts.reference(t), parts.initial, wanted.error, wanted.error_rate, wanted.acceleration)
+    d = parts.disturbance(t, motion.x)
+    return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
 
 
 def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
-    """Times before the hand-over [s], (points,), inputs (points, m) and q4^2 (points,) along the exact motion at them.
+    """Times before the hand-over [s], (points,), inputs (points, m) and clearance (points,) along the exact motion.
 
-    The additive error law works in v alone; q4^2 = 1 - |v|^2 at or below 0 means that its path leaves the unit ball.
+    See `exact_input`.
     """
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)

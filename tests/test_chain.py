@@ -81,7 +81,7 @@ def test_sliding_variable_obeys_the_equation_that_the_law_is_made_from(n, hold):
     def surface(time, state):
         return law.torque(time, phase, state, None, d_hat, k2)[1]
 
-    _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(x, u, d)))
+    _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(t, x, u, d)))
     push = 0.2 - 0.4 * np.tanh(np.asarray(s) / 0.5)
     expected = push - 1.4 * np.asarray(s) if hold else tau ** (n - 1) * push - (eta + n - 2) / tau * np.asarray(s)
     np.testing.assert_allclose(s_dot, expected, rtol=1e-11)
@@ -316,7 +316,7 @@ def test_chain_is_built_with_an_order_and_functions():
     assert found.f is stiff
     assert len(jax.tree.leaves(found)) == 1  # its parameter is a leaf: it can be traced
     x = vector([0.5, 0.0, 1.0])
-    np.testing.assert_array_equal(found.rate(x, vector([3.0]), vector([0.5])), [0.0, 1.0, 2.5])
+    np.testing.assert_array_equal(found.rate(vector(0.0), x, vector([3.0]), vector([0.5])), [0.0, 1.0, 2.5])
 
 
 def test_what_a_chain_lacks_has_no_value():

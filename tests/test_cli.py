@@ -413,7 +413,7 @@ def test_a_chain_is_simulated(command, tmp_path):
     names = {path.name for path in (folder / "figures").iterdir()}
     assert names == {"states.png", "error.png", "torque.png", "sliding.png", "convergence.png"}
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(metrics.CHAIN_CATALOGUE) <= set(summary)
+    assert set(metrics.STATE_CATALOGUE) <= set(summary)
     assert "peak_momentum" not in summary
     rows = rows_of(folder)
     assert np.all(np.abs(rows[0, 1:4] - [5.0, 3.0, 2.0]) <= [1.0, 1.0, 0.5])

@@ -29,7 +29,7 @@ def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(hold, se
     def surface(time, y):
         return law.torque(time, jnp.asarray(hold), y, SPIN(time), d_hat, k2)[1]
 
-    _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(x, u, d)))
+    _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(t, x, u, d)))
     error, error_rate = law.errors(x, SPIN(t))
     tau, tanh = 16.0, np.tanh(np.asarray(s) / 0.1)
     inverse = np.linalg.inv(np.asarray(FULL_INERTIA))

@@ -21,7 +21,8 @@ FLOORS = {
         attitude
         plants
         signals hardware
-        observers controllers clock
+        observers laws clock
+        controllers
         sensors
         metrics
         rollout
@@ -30,7 +31,7 @@ FLOORS = {
         theory linear
         requirements
         dispersions
-        tables
+        tables systems
         layouts
         schema
         checks

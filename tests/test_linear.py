@@ -22,7 +22,7 @@ def test_gains_are_the_slopes_of_the_law(t):
     def acceleration(eps, rate):
         x = AttitudeState(jnp.append(eps, jnp.sqrt(1 - jnp.dot(eps, eps))), 2 * rate)
         u, _ = law.torque(vector(t), hold, x, run.reference(vector(t)), jnp.zeros(3), k2)
-        return run.plant.rate(x, u, jnp.zeros(3)).w / 2
+        return run.plant.rate(vector(t), x, u, jnp.zeros(3)).w / 2
 
     by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))
     slope = np.sqrt(3.0) / 10.0 * 0.02 / 0.05

@@ -6,6 +6,8 @@ from scipy.linalg import expm
 from ptsmc_jax import observers, plants
 from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
+NOW = vector(0.0)
+
 
 def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
     return observers.NonlinearObserver(plants.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
@@ -47,7 +49,8 @@ def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
     d, u, h = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.3, -0.2]), 0.05
     w, w_next = held_motion(np.asarray(FULL_INERTIA), u + d, h)
     matrix = found.update_matrix(vector(h))
-    d_hat = found.update(matrix, vector(d), body(w), body(w_next), vector(u), vector(h))
+    impulse = found.model.unexplained_impulse(vector(h), body(w), body(w_next), vector(u), vector(h))
+    d_hat = found.update(matrix, vector(d), impulse, vector(h), vector(h))
     # what is right stays; the mean of both gyroscopic torques is the trapezium rule: h^2/12 (d^2/dt^2 of 0.01 N m)
     np.testing.assert_allclose(d_hat, d, atol=1e-6)
 
@@ -66,10 +69,13 @@ def test_continuous_error_obeys_its_equation():
     """(54) with the true motion: d_hat' = forcing - A d_hat must be -A (d_hat - d)."""
     found = observer()
     w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
-    x_dot = plants.spacecraft(FULL_INERTIA).rate(body(w), u, d)
+    x_dot = plants.spacecraft(FULL_INERTIA).rate(NOW, body(w), u, d)
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
-    np.testing.assert_allclose(found.decay_matrix(), a, rtol=1e-12)
-    found_rate = found.forcing(body(w), x_dot, u) - found.decay_matrix() @ d_hat
+    np.testing.assert_allclose(found.decay_matrix(NOW, NOW), a, rtol=1e-12)
+    found_rate = (
+        found.forcing(NOW, (NOW, NOW), d_hat, found.model.unexplained(NOW, body(w), x_dot, u))
+        - found.decay_matrix(NOW, NOW) @ d_hat
+    )
     np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)
 
 
@@ -90,7 +96,7 @@ def worst_error(a, sign_pattern, c, seconds, steps=20000):
 @pytest.mark.parametrize("gain", [(10.0, 10.0, 10.0), (30.0, 3.0, 10.0)])
 def test_error_stays_inside_the_bound_and_can_come_near_it(inertia, gain):
     found = observer(inertia, gain)
-    bound, a = found.error_bound(), np.asarray(found.decay_matrix())
+    bound, a = found.error_bound(), np.asarray(found.decay_matrix(NOW, NOW))
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     ratios = [
         np.linalg.norm(worst_error(a, sign, 1e-3, t)) / float(bound(vector(t)))

@@ -35,7 +35,7 @@ def test_rate_is_eulers_equation(inertia):
     for _ in range(5):
         q, w, u, d = rng.normal(size=4), *rng.normal(size=(3, 3))
         x = plants.AttitudeState(vector(q), vector(w))
-        got = body.rate(x, vector(u), vector(d))
+        got = body.rate(vector(0.0), x, vector(u), vector(d))
         momentum = inertia @ w
         gyroscopic = [
             w[1] * momentum[2] - w[2] * momentum[1],
@@ -60,7 +60,7 @@ def test_rate_is_eulers_equation(inertia):
 def coast(body, x, end, count):
     def advance(x, k):
         def rate(t, y):
-            return body.rate(y, jnp.zeros(3), jnp.zeros(3))
+            return body.rate(t, y, jnp.zeros(3), jnp.zeros(3))
 
         return numerics.rk4(rate, k * (end / count), x, end / count), None
 

@@ -202,7 +202,7 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     for j in range(halves):
         step = (20.02 - log.t[k]) / halves
         x = numerics.rk4(
-            lambda t, y: run.plant.rate(y, jnp.asarray(log.u[k]), run.disturbance(t)),
+            lambda t, y: run.plant.rate(t, y, jnp.asarray(log.u[k]), run.disturbance(t)),
             vector(log.t[k] + j * step),
             x,
             vector(step),

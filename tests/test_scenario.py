@@ -625,7 +625,9 @@ def test_kinds_of_dispersion():
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
 def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
-    parts = study(scenario, reach=Reach(35.0, delta=4.0, smallest_delta=0.05, gain=1.0, k1=1.0, sign_width=1e-3)).parts
+    parts = study(
+        scenario, reach=Reach(35.0, delta=4.0, smallest_delta=0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3)
+    ).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
         ticks = parts.clock.ticks(vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from ptsmc_jax import schema
-from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, CHAIN_CATALOGUE
+from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, STATE_CATALOGUE
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import (
@@ -156,7 +156,7 @@ COMPLETE = [
             {"dispersion": {"x0": {"kind": "uniform", "half_width": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"x0": {"kind": "normal", "std": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
-            {"requirements": dict.fromkeys(CHAIN_CATALOGUE, 0.5)},
+            {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},
         )
     ),
 ]

@@ -10,10 +10,12 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.rollout import Parts
 
-# gain: unit, for a spacecraft and for a chain
+_STATE_UNITS = {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "x1"}
+# gain: unit, by the kind of the plant
 UNITS = {
     "spacecraft": {"eta": "-", "delta": "s", "observer_gain": "N m s", "k1": "1/s", "sign_width": "-"},
-    "chain": {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "s"},
+    "chain": {**_STATE_UNITS, "sign_width": "s"},
+    "system": _STATE_UNITS,
 }
 
 

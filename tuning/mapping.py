@@ -9,7 +9,8 @@ import numpy as np
 
 from ptsmc_jax import linear, montecarlo, plotting, schema, store
 from ptsmc_jax.clock import Anchored, Flight
-from ptsmc_jax.plants import Chain
+from ptsmc_jax.observers import NonlinearObserver, NoObserver
+from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, study
 from ptsmc_jax.scenario import replace as changed
@@ -151,12 +152,14 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     parts = ready.parts
-    if ready.scenario.loop.mode == "sampled" and not isinstance(parts.plant, Chain):
+    if ready.scenario.loop.mode == "sampled" and isinstance(parts.plant, Spacecraft):
         found = linear.margins(parts)
         at, hold = found["hand_over"], found["hold"]
         known |= {"radius": at.radius, "gain_margin": at.gain, "delay_margin": at.delay}
         known |= {"hold_gain_margin": hold.gain, "hold_delay_margin": hold.delay}
-        if parts.sensors is not None and parts.sensors.filter is None and at.radius < 1.0:
+        linear_observer = isinstance(parts.observer, NoObserver | NonlinearObserver)
+        raw = parts.sensors is not None and parts.sensors.filter is None
+        if raw and linear_observer and at.radius < 1.0:
             expected = linear.noise(parts)
             known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **known)

@@ -97,7 +97,8 @@ def paper_gains(scenario: Scenario) -> dict[str, float]:
     gains = {"eta": 3.0, "delta": max(0.05, shortest), "k1": 1.0}
     if isinstance(scenario.plant, tables.ChainPlant):
         gains["eta"] = scenario.plant.order + 1.0
-    return gains if isinstance(scenario.observer, tables.NoObserver) else {**gains, "observer_gain": 10.0}
+    papers = isinstance(scenario.observer, tables.NonlinearObserver | tables.EachNonlinearObserver)
+    return {**gains, "observer_gain": 10.0} if papers else gains
 
 
 def as_flown(scenario: Scenario) -> Scenario:
@@ -229,6 +230,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
         delta=delta,
         smallest_delta=smallest_delta,
         gain=interval("observer_gain", own.gain)[0],
+        largest_gain=interval("observer_gain", own.largest_gain)[1],
         k1=interval("k1", own.k1)[1],
         sign_width=interval("sign_width", own.sign_width)[0],
     )
