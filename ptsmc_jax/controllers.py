@@ -20,6 +20,7 @@ from ptsmc_jax.signals import Target
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
+State = Float[Array, " twice"]
 
 
 @dataclass(frozen=True)
@@ -167,34 +168,34 @@ class PrescribedTimeSystem(SecondOrder):
 
     model: System  # the nominal plant
 
-    def clearance(self, x: Vector, target: Scalar) -> Scalar:
+    def clearance(self, x: State, target: Scalar) -> Scalar:
         """Det of dF/dx2 G with its rows made of length 1 [-]: at 0 the law is singular."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         return numerics.volume(slope @ gain)
 
-    def errors(self, x: Vector, target: Scalar) -> tuple[Vector, Vector]:
+    def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:
         """x_1 and F(t, x), (n,) each."""
         return self.model.position(x), self.model.position_rate(target, x)
 
-    def angle(self, x: Vector, target: Scalar) -> Scalar:
+    def angle(self, x: State, target: Scalar) -> Scalar:
         """|x_1|."""
         return numerics.norm(self.model.position(x))
 
-    def influence(self, x: Vector, target: Scalar) -> Scalar:
+    def influence(self, x: State, target: Scalar) -> Scalar:
         """2 |dF/dx2 D|."""
         return 2.0 * numerics.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
 
-    def invert(self, x: Vector, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
+    def invert(self, x: State, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
         """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
         return numerics.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
 
-    def motion(self, target: Scalar, start: Vector, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
+    def motion(self, target: Scalar, start: State, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
         """x_2 from F(t, x_1, x_2) = x_1' by Newton's method from the initial x_2: one step where F is linear in x_2."""
         n = self.model.inputs
 
-        def newton(_: Any, x: Vector) -> Vector:
+        def newton(_: Any, x: State) -> State:
             off = self.model.position_rate(target, x) - error_rate
             return jnp.concatenate([error, x[n:] - numerics.solve(self.model.slope(target, x), off)])
 

@@ -46,6 +46,7 @@ def parts(
     k1=1.0,
     saves: Any = (),
     reach: tuple[float, float] | None = None,
+    law: Any = controllers.PrescribedTime,
 ) -> Parts:
     """Parts of the paper's Case I with changes; continuous unless a period is given; reach: largest (t_f, delta)."""
     body = plants.spacecraft(inertia)
@@ -62,7 +63,7 @@ def parts(
         disturbance=disturbance
         or signals.Sinusoid(vector([0.01] * 3), vector([0.1] * 3), vector([0.0] * 3), vector([0.0] * 3)),
         reference=reference or signals.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
-        controller=controllers.PrescribedTime(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width))),
+        controller=law(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width))),
         observer=observers.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
         sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,

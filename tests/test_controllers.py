@@ -1,12 +1,19 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, plants, signals
+from ptsmc_jax import attitude, controllers, plants, rollout, signals, theory
 from ptsmc_jax.plants import AttitudeState
 from tests.helpers import FULL_INERTIA, REFERENCE, parts, vector, with_controller
 
+SWING = signals.Swing(
+    vector(0.5, -0.2, 0.4, np.sqrt(1 - 0.45)), vector(0.3, -0.5, 0.2), vector(0.2, 0.1, 0.3), vector(0.1, 0.5, 0.2)
+)
+LAWS = [controllers.PrescribedTime, controllers.PrescribedTimeMultiplicative]
 SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
 
 
@@ -17,23 +24,26 @@ def state(seed: int) -> AttitudeState:
     return AttitudeState(vector(q / np.linalg.norm(q)), vector(0.1 * rng.normal(size=3)))
 
 
+@pytest.mark.parametrize("kind", LAWS)
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(hold, seed):
+def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(kind, hold, seed):
     """s' with the true dynamics, by automatic differentiation along the motion, against (31) and (34) by hand."""
-    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1)
+    moving = SWING if kind is LAWS[1] else SPIN  # w_f' counts too
+    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=moving, k1=1.7, sign_width=0.1, law=kind)
     law, x, t = run.controller, state(seed), vector(4.0)
     d, d_hat, k2 = vector(0.3, -0.1, 0.2), vector(0.1, 0.1, -0.2), vector(0.05)
-    u, s = law.torque(t, jnp.asarray(hold), x, SPIN(t), d_hat, k2)
+    u, s = law.torque(t, jnp.asarray(hold), x, moving(t), d_hat, k2)
 
     def surface(time, y):
-        return law.torque(time, jnp.asarray(hold), y, SPIN(time), d_hat, k2)[1]
+        return law.torque(time, jnp.asarray(hold), y, moving(time), d_hat, k2)[1]
 
     _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(t, x, u, d)))
-    error, error_rate = law.errors(x, SPIN(t))
+    error, error_rate = law.errors(x, moving(t))
     tau, tanh = 16.0, np.tanh(np.asarray(s) / 0.1)
     inverse = np.linalg.inv(np.asarray(FULL_INERTIA))
-    push = np.asarray(attitude.t_matrix(x.q)) @ inverse
+    q_e = attitude.multiply(attitude.conjugate(moving(t).q), x.q)
+    push = np.asarray(attitude.t_matrix(q_e if kind is LAWS[1] else x.q)) @ inverse
     switching = np.linalg.norm(push) * 0.05  # Frobenius
     unseen = push @ np.asarray(d - d_hat)
     if hold:
@@ -102,3 +112,125 @@ def test_the_norm_in_the_switching_term_is_not_below_the_spectral_one():
     for seed in range(20):
         matrix = np.asarray(attitude.t_matrix(state(seed).q) @ body.inertia_inverse)
         assert np.linalg.norm(matrix) >= np.linalg.norm(matrix, 2)
+
+
+def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its_rate():
+    law = parts(law=LAWS[1]).controller
+    for seed in range(5):
+        x, t = state(seed), vector(3.0 + seed)
+        error, error_rate = law.errors(x, SWING(t))
+        found = Rotation.from_quat(np.asarray(SWING(t).q)).inv() * Rotation.from_quat(np.asarray(x.q))
+        q_e = found.as_quat()
+        np.testing.assert_allclose(error * np.sign(law.clearance(x, SWING(t))), q_e[:3] * np.sign(q_e[3]), atol=1e-15)
+
+        def along(time, x=x, t=t):
+            body = AttitudeState(x.q + (time - t) * attitude.derivative(x.q, x.w), x.w)
+            return law.errors(body, SWING(time))[0]
+
+        np.testing.assert_allclose(jax.jvp(along, (t,), (jnp.ones_like(t),))[1], error_rate, atol=1e-14)
+
+
+def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
+    """A finely stepped run without a disturbance, or with the default one."""
+    none = {"disturbance": signals.Constant(jnp.zeros(3)), "rate_bound": 0.0} if quiet else {}
+    run = parts(
+        20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, law=law, **none, **others
+    )
+    timing = replace(run.clock, before=2 * run.clock.before, after=2 * run.clock.after, max_step=run.clock.max_step / 2)
+    return replace(run, clock=timing)
+
+
+def fly(run):
+    return jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True))
+
+
+# through 180 degrees from the inertial identity, where q_f4 changes its sign
+CROSSING = signals.Spin(vector(Rotation.from_rotvec([2.9, 0.2, 0.1]).as_quat()), vector(0.04, 0.01, -0.02))
+AWAY = vector((Rotation.from_rotvec([2.9, 0.2, 0.1]) * Rotation.from_rotvec([0.5, -1.2, 0.8])).as_quat())
+
+
+def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_additive_laws_singularity():
+    run = flown(LAWS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
+    result = fly(run)
+    before = result.log.t < 19.89
+    assert result.status == rollout.OK
+    assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # it does cross
+    target = run.reference(vector(0.0))
+    start = run.controller.errors(run.controller.align(run.initial, target), target)
+    exact = jax.vmap(lambda t: theory.exact_error(t, vector(20.0), vector(3.5), *start))(vector(result.log.t[before]))
+    np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-10)
+    # the torque of the exact motion, from the inverse map of `theory`, is the one that was flown
+    u = jax.vmap(lambda t: theory.exact_input(run, t)[0])(vector(result.log.t[before]))
+    feedback = 2 * 14 * 3.5**2 / (20.0 - result.log.t[before]) ** 2  # what an error of 1e-10 costs in torque
+    assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
+
+
+def test_a_slew_on_which_the_additive_law_fails_and_the_multiplicative_one_does_not():
+    additive, other = (fly(flown(law, CROSSING, AWAY, quiet=False)) for law in LAWS)
+    assert additive.status == rollout.SINGULAR
+    assert 0.0 < additive.bad_time < 20.0
+    assert other.status == rollout.OK
+    assert other.metrics.terminal_angle < 1e-3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
+    turn = vector(Rotation.random(rng=np.random.default_rng(seed)).as_quat())
+    run = flown(LAWS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
+    turned = replace(
+        run,
+        initial=AttitudeState(attitude.multiply(turn, run.initial.q), run.initial.w),
+        reference=replace(run.reference, q=attitude.multiply(turn, run.reference.q)),
+    )
+    one, other = fly(run), fly(turned)
+    for name in ("w", "error", "d_hat"):
+        a, b = (getattr(r.log.x if name == "w" else r.log, name) for r in (one, other))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12, err_msg=name)
+    early = one.log.t < 19.0  # nearer to t_f the feedback gain multiplies rounding by 2 J eta^2 / tau^2, over 300
+    np.testing.assert_allclose(one.log.u[early], other.log.u[early], rtol=0, atol=1e-12)
+    expected = np.asarray(jax.vmap(lambda q: attitude.multiply(turn, q))(jnp.asarray(one.log.x.q)))
+    signs = np.sign(np.sum(expected * other.log.x.q, axis=1, keepdims=True))
+    np.testing.assert_allclose(other.log.x.q * signs, expected, rtol=0, atol=1e-12)
+    # the additive law's motion does depend on it
+    additive = (fly(replace(r, controller=LAWS[0](*leaves(r.controller)))) for r in (run, turned))
+    a, b = additive
+    assert np.abs(a.log.x.w[: len(early) // 4] - b.log.x.w[: len(early) // 4]).max() > 1e-3
+
+
+def leaves(law):
+    return (law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width)
+
+
+def test_signs_and_ways_round():
+    """Either sign of q flies the same path; the additive law's path leads past the identity, the long way round."""
+    about = np.array([0.6, 0.0, 0.8])
+    start, end = (vector(Rotation.from_rotvec(np.deg2rad(a) * about).as_quat()) for a in (150.0, 210.0))
+    turned = {}
+    for law in LAWS:
+        for sign in (1.0, -1.0):
+            result = fly(flown(law, signals.Fixed(end), sign * start))
+            assert result.status == rollout.OK
+            assert result.metrics.terminal_angle < 1e-4
+            speed = np.linalg.norm(result.log.x.w, axis=1)
+            turned[law, sign] = np.rad2deg(np.trapezoid(speed, result.log.t))
+    short, long = turned[LAWS[1], 1.0], turned[LAWS[0], 1.0]
+    assert short == pytest.approx(60.0, abs=0.1)
+    assert long == pytest.approx(300.0, abs=0.5)
+    assert turned[LAWS[1], -1.0] == pytest.approx(short, abs=1e-9)
+    assert turned[LAWS[0], -1.0] == pytest.approx(long, abs=1e-9)
+
+
+def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
+    law = parts(law=LAWS[1]).controller
+    opposite = signals.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
+    near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
+    x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
+    assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
+    # too fast a start away from the reference: |v| passes 1
+    run = flown(LAWS[1], signals.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
+    assert fly(run).status == rollout.SINGULAR
+    # |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough
+    calm = flown(LAWS[1], signals.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
+    error, error_rate = calm.controller.errors(calm.initial, calm.reference(vector(0.0)))
+    assert np.linalg.norm(error) + 20.0 * np.linalg.norm(error_rate) / (np.e * 3.5) < 1.0
+    assert fly(calm).status == rollout.OK

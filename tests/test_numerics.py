@@ -332,3 +332,51 @@ def test_gradients_of_a_step_in_the_rate_and_the_length(rate):
     decayed = (1 - x) * math.exp(x) * np.array([dt, 0.3 + rate])
     gained = 0.3 * np.array([dt * dt * phi_exact(x, 1, slope=True), phi_exact(x, 1)])
     assert np.all(np.abs(np.array(got) - [in_rate, in_dt]) <= 200 * EPS * (decayed + gained))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_solve_and_volume_are_lapacks(n):
+    rng = np.random.default_rng(n)
+    for k in range(20):
+        a, b = rng.normal(size=(n, n)), rng.normal(size=(n, 2))
+        if k % 2 and n > 1:
+            a[0, 0] = 0.0  # the first pivot must come from elsewhere
+        a *= 10.0 ** rng.uniform(-6, 6, size=(n, 1))  # rows in different units
+        b *= np.abs(a).max(axis=1, keepdims=True)
+        expected = np.linalg.solve(a, b)
+        lost = 100 * EPS * np.linalg.cond(a / np.linalg.norm(a, axis=1, keepdims=True))
+        np.testing.assert_allclose(
+            numerics.solve(vector(a), vector(b)), expected, rtol=0, atol=lost * np.abs(expected).max()
+        )
+        np.testing.assert_allclose(
+            numerics.solve(vector(a), vector(b[:, 0])), expected[:, 0], rtol=0, atol=lost * np.abs(expected).max()
+        )
+        rows = a / np.linalg.norm(a, axis=1, keepdims=True)
+        np.testing.assert_allclose(numerics.volume(vector(a)), np.linalg.det(rows), rtol=0, atol=20 * n * EPS)
+
+
+def test_volume_of_a_singular_matrix_is_zero_and_solve_says_so_with_numbers_that_are_not_finite():
+    for a in ([[0.0]], [[1.0, 2.0], [2.0, 4.0]], [[0.0, 1.0], [0.0, 2.0]], [[0.0, 0.0], [1.0, 2.0]], np.zeros((3, 3))):
+        matrix = vector(np.asarray(a))
+        assert float(numerics.volume(matrix)) == 0.0
+        assert not np.all(np.isfinite(numerics.solve(matrix, jnp.ones(len(a)))))
+
+
+def test_slope_of_solve_is_that_of_the_inverse():
+    rng = np.random.default_rng(4)
+    a, b, da = (vector(rng.normal(size=shape)) for shape in ((3, 3), (3,), (3, 3)))
+    x, slope = jax.jvp(lambda a: numerics.solve(a, b), (a,), (da,))
+    np.testing.assert_allclose(slope, -np.linalg.solve(a, da @ x), rtol=1e-10)
+
+
+@pytest.mark.parametrize("width", [0.0, 1e-3])
+def test_signed_root(width):
+    x = vector(np.array([-4.0, -1e-3, 0.0, 1e-9, 0.25]))
+    got = numerics.signed_root(x, vector(width))
+    exact = np.asarray(x) / np.where(np.asarray(x) == 0, 1.0, (np.asarray(x) ** 2 + width**2) ** 0.25)
+    np.testing.assert_allclose(got, exact, rtol=4 * EPS, atol=0)
+    if width == 0.0:
+        np.testing.assert_allclose(got, np.sign(x) * np.sqrt(np.abs(x)), rtol=4 * EPS)
+    slope = jax.vmap(jax.grad(lambda v: numerics.signed_root(v, vector(width))))(x)
+    assert np.all(np.isfinite(slope))
+    np.testing.assert_allclose(slope[2], 0.0 if width == 0.0 else width**-0.5, rtol=4 * EPS)

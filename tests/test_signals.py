@@ -192,3 +192,17 @@ def test_moving_references_are_built_as_their_tables_say():
     np.testing.assert_allclose(slew.turn, [-2 * np.arcsin(0.6), 0.0, 0.0], atol=1e-15)  # the short way
     end = slew(jnp.asarray(20.0)).q
     np.testing.assert_allclose(end * np.sign(end[3]), [0.0, 0.0, 0.0, 1.0], atol=1e-15)
+
+
+def test_a_slew_may_go_the_long_way_round():
+    table = {"kind": "slew", "quat_xyzw": [0.6, 0.0, 0.0, 0.8], "to_quat_xyzw": [0.0, 0.0, 0.0, -1.0], "duration": 20.0}
+    ways = [scenario.study(scenario.from_tables({"reference": {**table, "way": way}, **MULTIPLICATIVE})).parts.reference
+            for way in ("short", "long")]  # fmt: skip
+    short, long = (np.asarray(way.turn) for way in ways)
+    np.testing.assert_allclose(np.linalg.norm(long) + np.linalg.norm(short), 2 * np.pi, rtol=1e-14)
+    assert short @ long < 0
+    ends = [np.asarray(way(jnp.asarray(20.0)).q) for way in ways]
+    np.testing.assert_allclose(abs(ends[0] @ ends[1]), 1.0, rtol=1e-14)  # the same attitude
+
+
+MULTIPLICATIVE = {"controller": {"error": "multiplicative"}}

@@ -1,0 +1,256 @@
+"""Prescribed-time and finite-time observers: closed forms, bounds, digital forms; all observers on all plants."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+from scipy.linalg import expm
+
+from ptsmc_jax import observers, plants, rollout, scenario, signals
+from tests.helpers import FULL_INERTIA, chain_parts, parts, vector
+
+MASS = plants.chain(2)  # one input, M = 1
+GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
+
+
+def prescribed(model=MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+    values = (vector([gain] * model.inputs), *(vector(v) for v in (c, start, mu, t_o, delta_o)))
+    return observers.PrescribedTimeObserver(model, *values)
+
+
+def finite(model=MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
+    return observers.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
+
+
+def kept(t, gain=GAIN, mu=MU):
+    """Share of an initial error that is left: e^(-l t) rho^mu, then e^(-l t) on top."""
+    return np.exp(-gain * t) * (max(T_O - t, DELTA_O) / T_O) ** mu
+
+
+@pytest.mark.parametrize("h", [0.05, 0.3])
+def test_digital_prescribed_time_observer_forgets_as_its_closed_form_says(h):
+    found, d = prescribed(), 0.4
+    matrix, memory = found.update_matrix(vector(h)), found.begin()
+    for k in range(1, 30):
+        memory = found.update(matrix, memory, vector([d * h]), vector(k * h), vector(h))  # impulse of a constant d
+        np.testing.assert_allclose(found.estimate(memory) - d, [-d * kept(k * h)], rtol=1e-12, atol=1e-16)
+
+
+def test_prescribed_time_update_for_a_full_inertia_is_the_matrix_exponential():
+    found = prescribed(plants.spacecraft(FULL_INERTIA), gain=10.0)
+    t, h = 3.0, 0.5
+    a = 10.0 * np.linalg.inv(FULL_INERTIA)
+    factor = expm(-a * h) * ((T_O - t) / (T_O - t + h)) ** MU
+    d_hat, impulse = np.array([0.1, -0.2, 0.3]), np.array([0.03, 0.02, -0.01])
+    got = found.update(found.update_matrix(vector(h)), vector(d_hat), vector(impulse), vector(t), vector(h))
+    np.testing.assert_allclose(got, factor @ d_hat + (np.eye(3) - factor) @ impulse / h, rtol=1e-12)
+
+
+def test_updates_of_length_zero_change_nothing_and_have_finite_slopes():
+    for found in (prescribed(), finite()):
+
+        def moved(dt, found=found):
+            memory = found.begin() + 0.1
+            return found.update(found.update_matrix(dt), memory, vector([0.02]) * dt, vector(1.0), dt)
+
+        slope = jax.jacfwd(moved)(vector(0.0))
+        assert np.all(np.isfinite(slope))
+        if isinstance(found, observers.PrescribedTimeObserver):
+            np.testing.assert_allclose(moved(vector(0.0)), 0.1)
+
+
+def continuous(observer, disturbance, t_f=6.0, steps=400):
+    """A chain at rest under law and observer in the continuous loop, its log."""
+    run = chain_parts([0.3, 0.0], t_f, 3.0, 0.1, observer=observer, disturbance=disturbance, bound=0.0)
+    nodes = vector(observer.nodes())
+    timing = replace(run.clock, saves=nodes, before=steps, after=steps, max_step=vector(3.0 * t_f / steps))
+    return jax.tree.map(np.asarray, rollout.simulate_jit(replace(run, clock=timing), record=True).log)
+
+
+def test_continuous_prescribed_time_observer_forgets_as_its_closed_form_says():
+    d = 0.4
+    log = continuous(prescribed(), signals.Constant(vector([d])))
+    expected = np.array([-d * kept(t) for t in log.t])
+    # order 4 on nodes a tenth nearer each: 1e-7; it is what is left of d that counts
+    np.testing.assert_allclose(log.d_hat[:, 0] - d, expected, rtol=0, atol=1e-6 * d)
+
+
+@pytest.mark.parametrize("gain", [0.05, 0.7, 5.0])
+def test_prescribed_time_bound_holds_against_the_worst_disturbance_and_is_no_empty_one(gain):
+    c, start = 0.3, 0.4
+    bound = prescribed(gain=gain, c=c, start=start).error_bound()
+    for t in (0.0, 0.5, 2.0, 3.5, 3.8, 4.5, 9.0):
+        # e' = -(l + mu/(T_o - t)) e + c from the largest start: the integral of its propagator
+        gathered = quad(lambda u, t=t: kept(t, gain) / kept(u, gain), 0.0, t, points=[3.8] if t > 3.8 else None)[0]
+        worst = start * kept(t, gain) + c * gathered
+        assert worst <= float(bound(vector(t))) * (1 + 1e-9)
+        assert float(bound(vector(t))) < 2.0 * worst
+    assert float(jax.vmap(bound)(jnp.linspace(0.0, 20.0, 500)).max()) <= float(bound.largest)
+    # without l the bound is the exact one of the theory notes
+    bare = prescribed(gain=1e-9, c=c, start=start).error_bound()
+    rho = (T_O - 2.0) / T_O
+    exact = rho**MU * start + c * 2.0 * (1 - rho ** (MU - 1)) / (MU - 1)
+    np.testing.assert_allclose(bare(vector(2.0)), exact, rtol=1e-6)
+
+
+def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time():
+    """For a spacecraft with a full inertia under a sinusoid, in the whole loop, continuous and sampled."""
+    tables = {
+        "spacecraft": {"inertia": FULL_INERTIA},
+        "observer": {"kind": "prescribed_time", "t_o": 6.0, "mu": 3.0},
+        "disturbance": {"phase": [1.0, 0.5, 2.0]},
+        "controller": {"initial_estimate_error": 0.0175},
+    }
+    for mode in ("continuous", "sampled"):
+        ready = scenario.study(scenario.from_tables({**tables, "loop": {"mode": mode}}))
+        result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+        log, bound = result.log, ready.parts.observer.error_bound()
+        limit = np.asarray(jax.vmap(bound)(vector(log.t)))
+        size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
+        late = (
+            0.002 if mode == "sampled" else 1e-9
+        )  # a sampled estimate is half a period old: c sqrt(3) h / 2, and more
+        assert np.all(size <= limit + late), mode
+        assert size[np.searchsorted(log.t, 5.95)] < 0.15 * size[0]
+
+
+def super_twisting(gain, d, seconds, start=0.0):
+    """The error e = d_hat - d(t) of the exact-sign observer, by SciPy in tiny steps: (times, errors)."""
+    width = 1e-9
+
+    def rate(t, y):
+        e0, d_hat = y
+        sign = np.tanh(e0 / width)
+        return [d_hat - d(t) - 1.5 * np.sqrt(gain * abs(e0)) * sign, -1.1 * gain * sign]
+
+    found = solve_ivp(
+        rate, (0.0, seconds), [0.0, start], method="LSODA", rtol=1e-9, atol=1e-12, max_step=seconds / 2000
+    )
+    return found.t, found.y[1] - np.array([d(t) for t in found.t])
+
+
+@pytest.mark.parametrize(("share", "constant"), [(0.0, 1.2519), (0.5, 3.1), (1.0, 33.3)])
+def test_finite_time_bound_is_the_geometric_series_of_its_overshoots(share, constant):
+    bound = finite(gain=2.0, c=2.0 * share, start=0.6).error_bound()
+    np.testing.assert_allclose(bound.settled, constant * 0.6 / 2.0, rtol=0.01)
+    assert float(bound(bound.settled * 0.99)) == pytest.approx(0.6)
+    assert float(bound(bound.settled * 1.01)) == 0.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9])
+def test_no_disturbance_that_keeps_to_its_rate_beats_the_overshoots_of_the_finite_time_bound(share):
+    """Half a cycle, e0 from 0 to 0, with d' = +-share c switched on the lines e = k sqrt(e0): the worst of many."""
+    limit = np.interp(share, np.linspace(0, 1, 11), observers._OVERSHOOT)
+    worst, h = 0.0, 5e-4
+    for switch in (-9.0, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0):
+        root, error = 1e-6, 1.0  # root of e0, which moves smoothly through the start
+        while root > 0.0 and root + abs(error) > 1e-4:  # a slow enough e comes to rest without another cycle
+            rate = 1.1 - share if error > switch * root else 1.1 + share
+            # e0' = e - 1.5 root: in s with dt = 2 root ds both are smooth
+            root, error = root + h * (error - 1.5 * root), error - 2.0 * root * h * rate
+        worst = max(worst, -error)
+    assert limit - 0.01 < worst <= limit + 0.002
+
+
+@pytest.mark.parametrize("h", [0.002, 0.02])
+def test_digital_finite_time_observer_finds_a_constant_within_its_time_and_rests_there(h):
+    found, d = finite(gain=0.5, start=0.4), 0.4
+    memory, settled = found.begin(), None
+    for k in range(1, int(4.0 / h)):
+        memory = found.update(found.update_matrix(vector(h)), memory, vector([d * h]), vector(k * h), vector(h))
+        if k * h > float(found.error_bound().settled) + 3 * h:
+            np.testing.assert_allclose(found.estimate(memory), [d], atol=1e-12)  # exactly: it does not chatter
+            settled = k * h
+    assert settled is not None
+
+
+def test_digital_finite_time_observer_follows_the_equations_with_order_1():
+    found, slope = finite(gain=0.5), 0.3
+    t, expected = super_twisting(0.5, lambda t: 0.4 + slope * np.sin(t), 3.0)
+    off = []
+    for h in (0.02, 0.01, 0.005):
+        memory, errors = found.begin(), []
+        for k in range(1, round(3.0 / h) + 1):
+            gained = 0.4 * h + slope * (np.cos((k - 1) * h) - np.cos(k * h))
+            memory = found.update(found.update_matrix(vector(h)), memory, vector([gained]), vector(k * h), vector(h))
+            errors.append(float(memory[0]) - 0.4 - slope * np.sin(k * h))
+        off.append(np.abs(errors - np.interp(h * np.arange(1, len(errors) + 1), t, expected)).max())
+    assert off[0] < 0.02
+    assert off[2] < 0.5 * off[0]
+
+
+def test_continuous_finite_time_observer_finds_a_constant_within_its_time():
+    d = 0.4
+    log = continuous(finite(gain=0.5, start=d, width=1e-5), signals.Constant(vector([d])), steps=3000)
+    settled = 1.2519 * d / 0.5
+    assert np.abs(log.d_hat[log.t < 0.5 * settled, 0] - d).max() == pytest.approx(d)
+    # inside the layer e0 holds +-width at most: 1.5 sqrt(c width) is left of the error
+    assert np.abs(log.d_hat[log.t > settled + 0.05, 0] - d).max() < 1.5 * np.sqrt(0.5 * 1e-5)
+
+
+@pytest.mark.parametrize("kind", ["none", "nonlinear", "finite_time", "prescribed_time"])
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
+@pytest.mark.parametrize("plant", ["spacecraft", "chain", "system"])
+def test_every_observer_serves_every_plant_and_keeps_its_bound(kind, mode, plant):
+    """In the whole loop, where the disturbance keeps to its own bounds; the estimate is never further off."""
+    controller = {"t_f": 8.0, "delta": 0.4, "disturbance_rate_bound": 0.011, "disturbance_bound": 0.0101}
+    tables = {
+        "spacecraft": {"spacecraft": {"inertia": [1.0, 1.2, 1.4]}},
+        "chain": {"plant": {"kind": "chain", "order": 3, "x0": [0.4, 0.0, 0.0]}},
+        "system": {"plant": {"kind": "system", "system": PENDULUMS, "x0": [0.4, -0.3, 0.0, 0.1]}},
+    }[plant]
+    inputs = {"spacecraft": 3, "chain": 1, "system": 2}[plant]
+    wave = {"kind": "sinusoid", "amplitude": [0.01] * inputs, "frequency": [1.0] * inputs, "phase": [1.0] * inputs}
+    start = 0.01 * np.sin(1.0) * np.sqrt(inputs)
+    tables |= {
+        "controller": {**controller, "initial_estimate_error": float(start)},
+        "observer": {
+            "kind": kind,
+            **({} if kind == "none" else {"gain": [0.05 if kind == "finite_time" else 3.0] * inputs}),
+        },
+        "disturbance": wave,
+        "loop": {"mode": mode, "period": 0.02},
+    }
+    ready = scenario.study(scenario.from_tables(tables))
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    assert result.status == rollout.OK
+    log, bound = result.log, ready.parts.observer.error_bound()
+    limit = np.asarray(jax.vmap(bound)(vector(log.t)))
+    size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
+    # a sampled estimate is that of the period before: half of it and the hold, 1.5 h |d'|; in the smooth sign's layer
+    # of the continuous finite-time observer 1.5 sqrt(c width) is left, in each component
+    late = 1.5 * 0.02 * 0.01 if mode == "sampled" else 1.5 * np.sqrt(0.05 * 1e-5) if kind == "finite_time" else 1e-9
+    assert np.all(size <= limit + np.sqrt(inputs) * late), (size - limit).max()
+    assert size[-1] < 2.0 * limit.max()
+
+
+def _pendulums():
+    def G(t, x_1, x_2):  # noqa: N802
+        return jnp.diag(1.0 / (1.0 + 0.2 * jnp.cos(x_1)))
+
+    def F(t, x_1, x_2):  # noqa: N802
+        return x_2
+
+    def H(t, x_1, x_2):  # noqa: N802
+        return -jnp.sin(x_1) + 0.1 * (x_1[::-1] - x_1)
+
+    return plants.system(2, F, H, G, D=G)
+
+
+PENDULUMS = _pendulums()
+
+
+def test_parts_of_a_run_without_a_rate_bound_have_no_empty_gradient():
+    run = parts(6.0, 3.0, 0.3, period=0.25)
+    for found in (prescribed(run.plant, gain=10.0), finite(run.plant, gain=0.1)):
+
+        def error(gain, found=found):
+            watched = replace(run, observer=replace(found, gain=jnp.full(3, gain)))
+            return rollout.simulate(watched).metrics.window_error
+
+        slope = jax.jit(jax.jacfwd(error))(found.gain[0])
+        assert np.isfinite(slope)
+        assert slope != 0.0

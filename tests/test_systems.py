@@ -1,0 +1,282 @@
+"""Systems of one's own under law (29): the spacecraft and a two-link arm written as such, singular runs, files."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import attitude, controllers, observers, plants, rollout, scenario, signals, theory
+from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.schema import ScenarioError
+from tests.helpers import FULL_INERTIA, ROOT, parts, vector
+
+ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
+SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
+
+
+def spacecraft_as_system(reference, inertia=FULL_INERTIA):
+    """The error eps_1 and the body rate as x_1 and x_2: only the kinematics, nothing differentiated by hand."""
+    tensor = vector(inertia)
+    inverse = jnp.linalg.inv(tensor)
+
+    def F(t, x_1, x_2):  # noqa: N802
+        v_f = reference(t).q[:3]
+        v_f_dot = jax.jvp(lambda t: reference(t).q[:3], (t,), (jnp.ones_like(t),))[1]
+        v = x_1 + v_f
+        return 0.5 * attitude.t_matrix(jnp.append(v, jnp.sqrt(1.0 - v @ v))) @ x_2 - v_f_dot
+
+    def H(t, x_1, x_2):  # noqa: N802
+        return -inverse @ jnp.cross(x_2, tensor @ x_2)
+
+    def G(t, x_1, x_2):  # noqa: N802
+        return inverse
+
+    return plants.system(3, F, H, G, D=G, inertia=inertia)
+
+
+def as_system(run, reference):
+    """The same run with the spacecraft written as a system: K1 of (29) is half of (60)'s."""
+    model, law = spacecraft_as_system(reference), run.controller
+    error, _ = law.errors(run.initial, reference(vector(0.0)))
+    return replace(
+        run,
+        plant=model,
+        controller=controllers.PrescribedTimeSystem(model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width),
+        observer=replace(run.observer, model=model),
+        reference=signals.Now(),
+        initial=jnp.concatenate([error, run.initial.w]),
+    )
+
+
+@pytest.mark.parametrize("hold", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derived_by_hand(seed, hold):
+    rng = np.random.default_rng(seed)
+    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1)
+    own = as_system(run, SPIN)
+    q = rng.normal(size=4)
+    q[3] = abs(q[3]) + 0.5
+    x, t = AttitudeState(vector(q / np.linalg.norm(q)), vector(0.1 * rng.normal(size=3))), vector(4.0)
+    d_hat, k2, phase = vector(0.1, 0.1, -0.2), vector(0.05), jnp.asarray(hold)
+    u, s = run.controller.torque(t, phase, x, SPIN(t), d_hat, k2)
+    state = jnp.concatenate([x.q[:3] - SPIN(t).q[:3], x.w])
+    found, surface = own.controller.torque(t, phase, state, t, d_hat, k2)
+    np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
+    # by hand: dF/dx2 = T / 2, and what no acceleration makes of x_1'': -|w|^2 v / 4 - q_1f'' (58)
+    model = own.plant
+    np.testing.assert_allclose(model.slope(t, state), 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
+    by_hand = -0.25 * jnp.dot(x.w, x.w) * x.q[:3] - SPIN(t).vector_rates()[1]
+    np.testing.assert_allclose(model.carried(t, state), by_hand, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(model.mass(t, state), FULL_INERTIA, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(model.known(t, state, u), run.plant.known(t, x, u), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("period", [None, 0.05])
+def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(period):
+    start = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
+    others = {"inertia": FULL_INERTIA, "reference": SPIN, "q": start, "sign_width": 0.05, "delta": 0.4}
+    run = parts(8.0, 3.0, period=period, **others)
+    if period is None:  # x_1 and q are integrated as different equations: what differs is the error of the steps
+        clock = run.clock
+        fine = replace(clock, before=8 * clock.before, after=8 * clock.after, max_step=clock.max_step / 8)
+        run = replace(run, clock=fine)
+    else:
+        run = replace(run, substeps=4)
+    one, other = (jax.tree.map(np.asarray, rollout.simulate_jit(r, record=True)) for r in (run, as_system(run, SPIN)))
+    assert one.status == other.status == rollout.OK
+    np.testing.assert_allclose(other.log.x[:, :3], one.log.error, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(other.log.x[:, 3:], one.log.x.w, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(other.log.d_hat, one.log.d_hat, rtol=0, atol=1e-10)
+    gain = 2 * 14 * 9.0 / np.maximum(8.0 - one.log.t, 0.4) ** 2  # feedback gain
+    off = np.abs(other.log.u - one.log.u).max(axis=1)
+    assert np.all(off <= 1e-10 * np.maximum(gain, 1.0))
+
+
+def arm_tables(**changes):
+    tables = {
+        "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.5, 0.2]},
+        "controller": {"t_f": 3.0, "delta": 0.05, "disturbance_rate_bound": 0.6, "disturbance_bound": 0.45},
+        "observer": {"kind": "nonlinear"},
+        "disturbance": {"kind": "sinusoid", "amplitude": [0.4, 0.05], "frequency": [1.0, 3.0]},
+        "loop": {"t_end": 4.0, "window": 0.5},
+    }
+    return {name: {**table, **changes.get(name, {})} for name, table in tables.items()}
+
+
+def test_arm_follows_the_exact_solution_without_a_disturbance():
+    """A mass matrix by the book: the error moves as solution 1 says whatever M, C and g are."""
+    tables = arm_tables(controller={"disturbance_rate_bound": 0.0})
+    ready = scenario.study(scenario.from_tables({**tables, "disturbance": {"kind": "none"}}))
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    before = result.log.t < 2.949
+    start = ready.parts.controller.errors(ready.parts.initial, vector(0.0))
+    exact = jax.vmap(lambda t: theory.exact_error(t, vector(3.0), vector(3.0), *start))(vector(result.log.t[before]))
+    np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-8)  # of the default grid
+    # and the torque of the exact motion is the one flown, down to the feedback gain times that
+    u = jax.vmap(lambda t: theory.exact_input(ready.parts, t)[0])(vector(result.log.t[before]))
+    assert np.abs(u - result.log.u[before]).max() < 1e-8 * 9.0 / 0.05**2
+
+
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
+def test_arm_stays_inside_its_envelope(mode):
+    ready = scenario.study(scenario.from_tables(arm_tables(loop={"mode": mode, "period": 0.002})))
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    assert result.status == rollout.OK
+    before = result.log.t < 2.949
+    size = np.linalg.norm(result.log.error[before], axis=1)
+    limit = theory.error_bound(ready.parts, result.log.t[before])
+    slack = 0.0 if mode == "continuous" else 1e-3  # a period's hold of torques that change by some 10 N m/s
+    assert np.all(size <= limit * (1 + 1e-9) + slack)
+    assert result.metrics.window_error < 5e-3
+
+
+def test_mass_matrix_and_coriolis_of_the_arm_keep_the_books_of_energy():
+    """Lagrange: C q' = M' q' - d(q' M q' / 2)/dq, by automatic differentiation of the mass matrix."""
+    ready = scenario.study(scenario.from_tables(arm_tables()))
+    arm = ready.parts.plant
+    rng = np.random.default_rng(3)
+    mass, load = (arm.H.func.__globals__[name] for name in ("mass", "load"))  # the file's own functions
+    for _ in range(5):
+        q, rate = vector(rng.normal(size=2)), vector(rng.normal(size=2))
+
+        def lagrangian_force(q, rate=rate):
+            return 0.5 * rate @ mass(q) @ rate
+
+        # C q' = M' q' - d(q' M q'/2)/dq, the rest of `load` is gravity: what is left at rest
+        m_dot = jax.jvp(mass, (q,), (rate,))[1]
+        coriolis = m_dot @ rate - jax.grad(lagrangian_force)(q)
+        np.testing.assert_allclose(load(q, rate) - load(q, 0 * rate), coriolis, rtol=0, atol=1e-14)
+
+
+def test_jacobians_of_the_arm_are_those_derived_by_hand():
+    arm = scenario.study(scenario.from_tables(arm_tables())).parts.plant
+    t, x = vector(0.7), vector(0.3, -0.2, 0.5, 0.1)
+    np.testing.assert_array_equal(arm.slope(t, x), np.eye(2))
+    # F = q' - q_d': dF/dt = -q_d''
+    second = [0.6 * 0.64 * np.sin(0.8 * 0.7), 0.5 * np.cos(0.7)]
+    np.testing.assert_allclose(arm.carried(t, x), second, rtol=1e-14)
+
+
+def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time():
+    """The input gain is x_1 - 0.2, alone or across the diagonal of a matrix, and x_1 goes from 0.5 to 0."""
+
+    def F(t, x_1, x_2):  # noqa: N802
+        return x_2
+
+    def H(t, x_1, x_2):  # noqa: N802
+        return jnp.zeros(1)
+
+    def G(t, x_1, x_2):  # noqa: N802
+        return jnp.reshape(x_1 - 0.2, (1, 1))
+
+    def swapped(t, x_1, x_2):
+        return jnp.stack([jnp.stack([0 * x_1[0], x_1[0] - 0.2]), jnp.stack([1.0 + 0 * x_1[0], 0 * x_1[0]])])
+
+    one = plants.system(1, F, H, G)
+    two = plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, swapped)
+    for mode in ("continuous", "sampled"):
+        for model, x0 in ((one, [0.5, 0.0]), (two, [0.5, 0.3, 0.0, 0.0])):
+            tables = {
+                "plant": {"kind": "system", "system": model, "x0": x0},
+                "controller": {"disturbance_bound": 0.0},  # no switching: solution 1
+                "loop": {"mode": mode, "period": 0.05},
+            }
+            run = scenario.study(scenario.from_tables(tables)).parts
+            result = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True))
+            assert result.status == rollout.SINGULAR
+            # solution 1 says when x_1 is 0.2
+            t = np.linspace(0.0, 4.9, 4000)
+            start = (vector([x0[0]]), vector([0.0]))
+            x = jax.vmap(lambda t, start=start: theory.exact_error(t, vector(5.0), vector(3.0), *start).error[0])(t)
+            crossing = t[np.argmax(np.asarray(x) < 0.2)]
+            assert result.bad_time == pytest.approx(crossing, abs=0.06)
+
+
+def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
+    def F(t, x_1, x_2):  # noqa: N802
+        return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
+
+    model = plants.system(2, F, lambda t, a, b: -b, lambda t, a, b: jnp.eye(2) + 0.1 * jnp.outer(a, a))
+    tables = {"plant": {"kind": "system", "system": model, "x0": [0.4, -0.2, 0.3, 0.1]}, "controller": {"delta": 0.1}}
+    ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
+    quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
+    run = replace(ready.parts, observer=quiet)
+    log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True)).log
+    before = log.t < 4.8
+    u = jax.vmap(lambda t: theory.exact_input(run, t)[0])(vector(log.t[before]))
+    assert np.abs(u - log.u[before]).max() < 1e-6
+
+
+def test_what_is_no_system_is_refused_in_one_sentence():
+    def F(t, x_1, x_2):  # noqa: N802
+        return x_2
+
+    def G(t, x_1, x_2):  # noqa: N802
+        return jnp.eye(2)
+
+    with pytest.raises(ValueError, match=r"G\(t, x_1, x_2\) returns \(2, 2\), but for n = 3 must return an array"):
+        plants.system(3, F, F, G)
+    with pytest.raises(ValueError, match=r"H\(t, x_1, x_2\) fails for x_1 and x_2 of shape \(2,\)"):
+        plants.system(2, F, lambda t, x: x, G)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="n is 0"):
+        plants.system(0, F, F, G)
+    with pytest.raises(ValueError, match="inertia must be an invertible"):
+        plants.system(2, F, F, G, inertia=np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("plant", "said"),
+    [
+        ({"kind": "system"}, "plant.system is absent"),
+        ({"kind": "system", "system": 3.0}, "plant.system is 3"),
+        ({"kind": "system", "system": "nowhere.py:arm", "x0": [1, 0]}, "the file nowhere.py is not there"),
+        ({"kind": "system", "system": ARM + "s"}, "has no such name"),
+        ({"kind": "system", "system": ARM.replace(":arm", ":mass")}, "has a function of that name"),
+        ({"kind": "system", "system": "numpy:pi"}, "has a float of that name"),
+        ({"kind": "system", "system": "no_such_module:arm"}, "running no_such_module fails: ModuleNotFoundError"),
+        (
+            {"kind": "system", "system": ARM, "x0": [1, 2, 3]},
+            "plant.x0 is [1.0, 2.0, 3.0], but must be x_1 followed by x_2",
+        ),
+        ({"kind": "system", "system": ARM, "x0": [1, 2]}, "plant.x0 is [1.0, 2.0], but must be a list of 4 numbers"),
+        ({"kind": "system", "system": ARM, "order": 2}, "plant.order is not a known key"),
+    ],
+)
+def test_scenarios_that_name_no_system_are_refused(plant, said):
+    with pytest.raises(ScenarioError) as error:
+        scenario.from_tables({"plant": plant})
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"observer": {"gain": [1.0]}}, "observer.gain is [1.0], but must be a list of 2 numbers, one for each input"),
+        ({"disturbance": {"phase": [1.0]}}, "disturbance.phase is [1.0], but must be a list of 2 numbers"),
+        ({"controller": {"eta": 2.0}}, "controller.eta is 2.0, but must be a number greater than 2 (Theorem 2)"),
+        ({"controller": {"a": [1.0]}}, "controller.a is not a known key"),
+        ({"controller": {"error": "multiplicative"}}, "controller.error is not a known key"),
+    ],
+)
+def test_keys_of_a_system_are_checked_against_its_size(changes, said):
+    with pytest.raises(ScenarioError, match="^" + re.escape(said)):
+        scenario.from_tables(arm_tables(**changes))
+
+
+def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_beside_its_scenario(tmp_path: Path):
+    made = spacecraft_as_system(SPIN)
+    tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
+    changed = scenario.replace(scenario.from_tables(tables), controller__eta=4.0)
+    assert scenario.study(changed).parts.plant is made
+    assert isinstance(scenario.study(changed).parts.observer, observers.NoObserver)
+    (tmp_path / "my.py").write_text((ROOT / "scenarios" / "two_link_arm.py").read_text())
+    (tmp_path / "my.toml").write_text('[plant]\nkind = "system"\nsystem = "my.py:arm"\nx0 = [1, 1, 0, 0]\n')
+    one, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
+    assert one.parts.plant is other.parts.plant  # one program for all its runs
+    assert one.parts.plant.inputs == 2
