@@ -1,20 +1,22 @@
-"""Every part through `lanes`, strict, against `jax.vmap`: values and tangents of a batch of short runs.
+"""Every part in short runs: lanes = vmap = loop, compiled or not, shapes kept, slopes finite at the awkward points.
 
 Each row is a scenario; together they hold every part that a scenario or Python can name. A new part joins a row here.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import lanes, montecarlo, plants, scenario
-from tests.helpers import FULL_INERTIA
+from ptsmc_jax import dispersions, lanes, montecarlo, plants, rollout, scenario, signals
+from tests.helpers import FULL_INERTIA, ROOT
 from tuning.bounds import with_gains
 
-TRIALS = 4
+SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
+ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SLEW = {"t_f": 6.0, "delta": 0.3, "eta": 2.6}
 SHORT = {"t_end": 7.5, "window": 1.0}
 SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
@@ -66,11 +68,50 @@ ROWS: dict[str, dict] = {
         "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
         "dispersion": {"attitude": {"kind": "uniform"}},
     },
+    "multiplicative error, prescribed-time observer": {
+        "spacecraft": {"inertia": FULL_INERTIA},
+        "controller": {**SLEW, "error": "multiplicative"},
+        "observer": {"kind": "prescribed_time", "t_o": 3.0},
+        "reference": {"kind": "slew", "rotvec_deg": [170, 0, 0], "to_quat_xyzw": [0.0, 0.6, 0.8, 0.0], "way": "long"},
+        "loop": SHORT,
+        "dispersion": SPREAD,
+    },
+    "multiplicative error, finite-time observer, sampled": {
+        "controller": {**SLEW, "error": "multiplicative"},
+        "observer": {"kind": "finite_time"},
+        "loop": SAMPLED,
+        "hardware": NOISE,
+        "dispersion": {"attitude": {"kind": "uniform"}},
+    },
+    "system": {
+        "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
+        "controller": SLEW,
+        "observer": {"kind": "nonlinear"},
+        "disturbance": {"kind": "sinusoid"},
+        "loop": SHORT,
+        "dispersion": {"x0": {"kind": "normal", "std": [0.1, 0.1, 0.0, 0.1]}},
+    },
+    "sampled system with noise": {
+        "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
+        "controller": SLEW,
+        "observer": {"kind": "prescribed_time", "t_o": 3.0, "delta_o": 0.5},
+        "disturbance": {"kind": "random_walk"},
+        "loop": SAMPLED,
+        "hardware": {"state_noise": [1e-4, 1e-4, 1e-3, 1e-3], "torque_lag": 0.05},
+        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.2, 0.2, 0.0, 0.1]}},
+    },
     "chain of order 3": {
         "plant": {"kind": "chain", "order": 3, "x0": [1.0, 0.0, 0.0]},
         "controller": {**SLEW, "eta": 3.6, "a": [1.0, 2.0]},
         "loop": SHORT,
         "dispersion": {"x0": {"kind": "uniform", "half_width": [0.2, 0.1, 0.0]}},
+    },
+    "chain, finite-time observer": {
+        "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+        "controller": SLEW,
+        "observer": {"kind": "finite_time", "sign_width": 1e-3},
+        "loop": SHORT,
+        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.2, 0.1]}},
     },
     "sampled chain with noise": {
         "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
@@ -82,41 +123,93 @@ ROWS: dict[str, dict] = {
 }  # fmt: skip
 
 
-def compare(parts, dispersion, name):
+@partial(jax.jit, static_argnames="vmap")
+def batch(parts, dispersion, vmap):
+    """Metrics, status and bad times of some trials, and the metrics' slopes in eta and delta."""
     gains = {"eta": parts.controller.eta, "delta": parts.controller.delta}
 
-    def moved(vmap):
-        def batch(gains):
-            run = with_gains(parts, gains)
-            return vmap(lambda trial: montecarlo.one(run, dispersion, np.uint32(3), trial)[:3])(
-                jnp.arange(TRIALS, dtype=jnp.uint32)
-            )
+    def fly(gains):
+        run = with_gains(parts, gains)
+        return vmap(lambda trial: montecarlo.one(run, dispersion, SEED, trial)[:3])(NUMBERS)
 
-        (metrics, status, bad), slopes = jax.jvp(batch, (gains,), (jax.tree.map(jnp.ones_like, gains),))
-        return metrics._asdict(), status, bad, slopes[0]._asdict()
+    (metrics, status, bad), slopes = jax.jvp(fly, (gains,), (jax.tree.map(jnp.ones_like, gains),))
+    return metrics._asdict(), status, bad, slopes[0]._asdict()
 
-    def strict(function):
-        return lanes.vmap(function, strict=True)
 
-    got, expected = (jax.jit(moved, static_argnums=0)(vmap) for vmap in (strict, jax.vmap))
+def strict(function):
+    return lanes.vmap(function, strict=True)
+
+
+def agree(values, wanted, unit, name, skip=()):
+    """Metrics (trials,) by name, within `unit` of the largest of each."""
+    for metric in wanted:
+        a, b = np.asarray(values[metric]), np.asarray(wanted[metric])
+        np.testing.assert_array_equal(np.isfinite(a), np.isfinite(b), err_msg=metric)
+        scale = np.abs(b[np.isfinite(b)]).max(initial=0.0)
+        off = np.abs(a - b)[np.isfinite(b)].max(initial=0.0)
+        assert metric in skip or off <= unit * max(scale, 1e-3), (name, metric, off, scale)
+
+
+def compare(parts, dispersion, name):
+    got, expected = (batch(parts, dispersion, vmap) for vmap in (strict, jax.vmap))
     np.testing.assert_array_equal(got[1], expected[1])
     np.testing.assert_array_equal(got[2], expected[2])
     assert np.any(np.isin(expected[1], [0, 4])), "some trial must fly to the end"
-    for values, wanted, unit in ((got[0], expected[0], 1e-12), (got[3], expected[3], 1e-9)):
-        for metric in wanted:
-            if metric == "chattering" and unit > 1e-12:
-                continue  # a sum of magnitudes: where a difference is 0 but for rounding, either slope is right
-            a, b = np.asarray(values[metric]), np.asarray(wanted[metric])
-            np.testing.assert_array_equal(np.isfinite(a), np.isfinite(b), err_msg=metric)
-            scale = np.abs(b[np.isfinite(b)]).max(initial=0.0)
-            off = np.abs(a - b)[np.isfinite(b)].max(initial=0.0)
-            assert off <= unit * max(scale, 1e-3), (name, metric, off, scale)
+    agree(got[0], expected[0], 1e-12, name)
+    # chattering is a sum of magnitudes: where a difference is 0 but for rounding, either slope is right
+    agree(got[3], expected[3], 1e-9, name, skip=("chattering",))
+    return expected
+
+
+def singles(ready, fly):
+    """The same trials one by one: metrics (trials,) by name."""
+    drawn = [ready.dispersion.apply(ready.parts, SEED, trial) for trial in NUMBERS]
+    runs = [fly(run, SEED, trial).metrics for run, trial in zip(drawn, NUMBERS, strict=True)]
+    return {metric: np.array([getattr(run, metric) for run in runs]) for metric in runs[0]._fields}
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_lanes_equal_vmap_for_every_part(name):
+def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_compiled_or_not(name):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
-    compare(ready.parts, ready.dispersion, name)
+    metrics, *_ = compare(ready.parts, ready.dispersion, name)
+    loop = singles(ready, rollout.simulate_jit)
+    agree(loop, metrics, 1e-12, name)
+    plain = rollout.simulate(ready.dispersion.apply(ready.parts, SEED, NUMBERS[0]), SEED, NUMBERS[0])  # no jit
+    agree(jax.tree.map(np.asarray, plain.metrics._asdict()), {k: v[0] for k, v in loop.items()}, 1e-12, name)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_carries_keep_their_shapes_whatever_is_batched(name):
+    """A run's result has the same shapes and types, alone and in a batch of one: nothing is broadcast on the way."""
+    ready = scenario.study(scenario.from_tables(ROWS[name]))
+    one = jax.eval_shape(lambda parts: rollout.simulate(parts, SEED, NUMBERS[0], record=True), ready.parts)
+    many = jax.eval_shape(jax.vmap(lambda trial: rollout.simulate(ready.parts, SEED, trial, record=True)), NUMBERS[:1])
+    for single, batched in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        assert batched.shape == (1, *single.shape)
+        assert batched.dtype == single.dtype
+    assert all(leaf.shape == () for leaf in jax.tree.leaves((one.metrics, one.status, one.bad_time)))
+    rows = one.log.t.shape[0]
+    assert all(leaf.shape[0] == rows for leaf in jax.tree.leaves(one.log))
+    assert one.log.u.shape == (rows, ready.parts.plant.inputs)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_slopes_are_finite_at_the_awkward_points(name):
+    """On the target at rest from the start, with the exact sign: every norm, root and sign at 0."""
+    ready = scenario.study(scenario.from_tables(ROWS[name]))
+    parts = ready.parts
+    target = parts.reference(jnp.zeros(()))
+    if isinstance(target, signals.Target):
+        initial = plants.AttitudeState(target.q, target.w)
+    else:
+        initial = jnp.zeros_like(parts.initial)
+    law = replace(parts.controller, sign_width=jnp.zeros(()))
+    still = replace(parts, initial=initial, controller=law)
+    metrics, status, _, slopes = batch(still, dispersions.Dispersion(), jax.vmap)
+    assert np.all(np.isin(status, [0, 4]))
+    for metric, slope in slopes.items():
+        known = np.isfinite(metrics[metric])
+        assert np.all(np.isfinite(slope[known])), metric
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():
