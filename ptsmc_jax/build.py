@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import checks, controllers, dispersions, hardware, observers, plants, signals
+from ptsmc_jax import attitude_keys, checks, controllers, dispersions, hardware, observers, plants, signals
 from ptsmc_jax import sensors as sensing
 from ptsmc_jax import tables as t
 from ptsmc_jax.tables import Scenario
@@ -41,9 +41,9 @@ def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     assert scenario.initial is not None
     assert scenario.reference is not None
     model = plants.spacecraft(scenario.spacecraft.inertia)
-    q = jnp.asarray(checks.quaternion(scenario.initial, "initial"))
+    q = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))
     initial = plants.AttitudeState(q, vector(scenario.initial.rate))
-    q_f = jnp.asarray(checks.quaternion(scenario.reference, "reference"))
+    q_f = jnp.asarray(attitude_keys.quaternion(scenario.reference, "reference"))
     reference: Any = signals.Fixed(q_f)
     table = scenario.reference
     if isinstance(table, t.SpinReference):
@@ -51,7 +51,7 @@ def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     elif isinstance(table, t.SinusoidReference):
         reference = signals.Swing(q_f, vector(table.amplitude), vector(table.frequency), vector(table.phase))
     elif isinstance(table, t.SlewReference):
-        reference = signals.Slew(q_f, vector(checks.turn(table)), vector(table.duration))
+        reference = signals.Slew(q_f, vector(attitude_keys.turn(table)), vector(table.duration))
     assert isinstance(scenario.controller, t.Controller)
     multiplicative = scenario.controller.error == "multiplicative"
     law = controllers.PrescribedTimeMultiplicative if multiplicative else controllers.PrescribedTime
@@ -93,8 +93,8 @@ def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
             signal.append(signals.Sinusoid(*(vector(v) for v in values)))
         elif isinstance(table, t.GravityGradient):
             assert scenario.spacecraft is not None
-            turned = checks.has_attitude(table)
-            orbit = checks.quaternion(table, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
+            turned = attitude_keys.has_attitude(table)
+            orbit = attitude_keys.quaternion(table, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
             values = (orbit, table.orbit_rate, table.phase)
             signal.append(signals.GravityGradient(true_body(scenario).inertia, *(vector(v) for v in values)))
     if len(signal) > 1:

@@ -6,73 +6,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import hardware, layouts, plants, schema, systems, tables
+from ptsmc_jax import attitude_keys, hardware, layouts, plants, schema, systems, tables
 from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
 MOST_STEPS = 200_000
-
-
-def _unit(key: str, value: Any) -> np.ndarray:
-    """A quaternion of a scenario, normalised; refused where it is not a unit one already."""
-    array = np.array(value, dtype=float)
-    length = np.linalg.norm(array)
-    if abs(length - 1.0) > 1e-6:
-        raise wrong(key, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
-    return array / length
-
-
-def turn(table: tables.SlewReference) -> np.ndarray:
-    """Rotation vector of a slew from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    start, end = quaternion(table, "reference"), _unit("reference.to_quat_xyzw", table.to_quat_xyzw)
-    short = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
-    angle = np.linalg.norm(short)
-    return short * (1.0 - 2.0 * np.pi / angle) if table.way == "long" and angle > 0.0 else short
-
-
-def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
-    """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
-    key, value = attitude_key(table)
-    full = f"{name}.{key}"
-    if table.sequence is not None and key != "euler_deg":
-        raise ScenarioError(f"{name}.sequence is {schema.show(table.sequence)}, but goes with euler_deg only")
-    if key in ("quat_xyzw", "quat_wxyz"):
-        unit = _unit(full, value)
-        return unit if key == "quat_xyzw" else np.roll(unit, -1)
-    array = np.array(value, dtype=float)
-    from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
-
-    if key == "rotvec_deg":
-        return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
-    if key == "mrp":
-        return Rotation.from_mrp(array).as_quat(canonical=True)
-    if key == "dcm_body_to_inertial":
-        off = np.abs(array @ array.T - np.eye(3)).max()
-        if off > 1e-6 or np.linalg.det(array) < 0:
-            raise wrong(full, value, "a rotation matrix (orthonormal within 1e-6, determinant +1)")
-        return Rotation.from_matrix(array).as_quat(canonical=True)
-    if table.sequence is None:
-        raise ScenarioError(f'{full} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"')
-    try:
-        return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
-    except ValueError:
-        raise wrong(
-            f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
-        ) from None
-
-
-def has_attitude(table: tables.Attitude) -> bool:
-    """Whether a table gives an attitude at all."""
-    return any(getattr(table, key) is not None for key in tables.ATTITUDE_KEYS)
-
-
-def attitude_key(table: tables.Attitude) -> tuple[str, Any]:
-    """The attitude key that a table uses, and its value."""
-    key = next(key for key in tables.ATTITUDE_KEYS if getattr(table, key) is not None)
-    return key, getattr(table, key)
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -138,7 +77,7 @@ def initial_state(scenario: Scenario) -> tuple[float, ...]:
 def _each(name: str, table: Any, scenario: Scenario) -> Any:
     """A table with its lists of one number for each input, where they are absent, filled in."""
     known = layouts.EACH.get((name, table.kind), {})
-    absent = {key: (value,) * inputs(scenario) for key, value in known.items() if getattr(table, key) == ()}
+    absent = {key: (value,) * inputs(scenario) for key, value in known.items() if getattr(table, key) is None}
     return msgspec.structs.replace(table, **absent)
 
 
@@ -217,10 +156,10 @@ def _check_plant(scenario: Scenario) -> None:
             except ValueError as error:
                 value = schema.show(scenario.spacecraft.true_inertia)
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
-        quaternion(scenario.initial, "initial")
-        quaternion(scenario.reference, "reference")
+        attitude_keys.quaternion(scenario.initial, "initial")
+        attitude_keys.quaternion(scenario.reference, "reference")
         if isinstance(scenario.reference, tables.SlewReference):
-            _unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
+            attitude_keys.unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
         _check_devices(scenario)
         return
     if isinstance(plant, tables.SystemPlant):
@@ -248,7 +187,7 @@ def _check_system(plant: tables.SystemPlant) -> None:
     if plant.system is None:
         raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
     if len(plant.x0) % 2:
-        raise wrong("plant.x0", plant.x0, "x_1 followed by x_2, as many numbers each")
+        raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
     try:
         found = system(plant)
     except ValueError as error:
@@ -292,6 +231,7 @@ def _check_observer(scenario: Scenario) -> None:
         if observer.delta_o >= observer.t_o:
             raise wrong("observer.delta_o", observer.delta_o, f"less than observer.t_o, {observer.t_o}")
     if isinstance(observer, tables.FiniteTimeObserver | tables.EachFiniteTimeObserver):
+        assert observer.gain is not None  # `resolve` filled it in
         least = controller.disturbance_rate_bound
         if min(observer.gain) < least or min(observer.gain) <= 0.0:
             raise wrong("observer.gain", observer.gain, f"at least controller.disturbance_rate_bound, {least}, each")
@@ -313,8 +253,8 @@ def _check_devices(scenario: Scenario) -> None:
                 f"disturbance.terms[{k}]" if isinstance(scenario.disturbance, tables.SumDisturbance) else "disturbance"
             )
             schema.one_attitude(name, term)
-            if has_attitude(term):
-                quaternion(term, name)
+            if attitude_keys.has_attitude(term):
+                attitude_keys.quaternion(term, name)
             elif term.sequence is not None:
                 raise ScenarioError(f"{name}.sequence is {schema.show(term.sequence)}, but goes with euler_deg only")
     if table is not None:

@@ -17,6 +17,7 @@ from ptsmc_jax import theory
 from ptsmc_jax.controllers import PrescribedTime
 from ptsmc_jax.metrics import CATALOGUES
 from ptsmc_jax.plants import Spacecraft
+from ptsmc_jax.remark_2 import Measured
 from ptsmc_jax.rollout import Log, Parts
 
 # Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
@@ -184,6 +185,32 @@ def disturbance(parts: Parts, log: Log) -> Figure:
     return figure
 
 
+def observers(found: Sequence[Measured]) -> Figure:
+    """What each observer makes of the disturbance, and the chattering it leaves under both signs (Remark 2)."""
+    kinds = list(dict.fromkeys(one.observer for one in found))
+    with matplotlib.rc_context(_RC):
+        figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for kind, (colour, style) in zip(kinds, _STYLES, strict=False):
+            one = next(one for one in found if one.observer == kind and one.sign == "smooth")
+            left.semilogy(one.t, np.maximum(one.off, 1e-6), color=colour, ls=style, label=kind)
+        left.set(xlabel=_TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(3e-5, 1.0))
+        left.legend(ncols=2)
+        signs = list(dict.fromkeys(one.sign for one in found))
+        for k, sign in enumerate(signs):
+            heights = [next(o.chattering for o in found if (o.observer, o.sign) == (kind, sign)) for kind in kinds]
+            colour, hatch = _STYLES[k][0], ("", "//")[k % 2]
+            at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
+            bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
+            right.bar_label(bars, fmt="%.0e", fontsize=8)
+        right.set_yscale("log")
+        right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
+        right.set(ylabel="chattering after $t_f$ [N m/s]")
+        right.set_ylim(top=8.0 * right.get_ylim()[1])
+        right.legend(ncols=2)
+    return figure
+
+
 def _names(parts: Parts) -> tuple[str, str, str]:
     """Labels of the error and the input, and the input's unit behind a number."""
     if not isinstance(parts.plant, Spacecraft):
@@ -333,8 +360,11 @@ def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
 
 def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
     values = np.asarray(values)
-    for k, (colour, style) in zip(range(values.shape[1]), _STYLES, strict=False):
-        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=f"${symbol}_{k + 1}$", **kwargs)
+    for k in range(values.shape[1]):  # beyond as many as there are styles, the same in thin lines
+        colour, style = _STYLES[k % len(_STYLES)]
+        width = {"lw": 0.8} if k >= len(_STYLES) else {}
+        label = f"${symbol}_{{{k + 1}}}$"
+        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **kwargs)
 
 
 def _mark(axes: Axes, parts: Parts) -> None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import build, checks, clock, controllers, dispersions, metrics, observers, schema, theory
+from ptsmc_jax import attitude_keys, build, checks, clock, controllers, dispersions, metrics, observers, schema, theory
 from ptsmc_jax import tables as t
 from ptsmc_jax.checks import MOST_STEPS
 from ptsmc_jax.requirements import Requirement
@@ -141,7 +141,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
     assert scenario.initial is not None
     additive = isinstance(parts.controller, controllers.PrescribedTime)
     singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
-    key, value = checks.attitude_key(scenario.initial)
+    key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {schema.show(value)}"
     times, _, square = (np.asarray(v) for v in _path(parts))
     if square[0] < SINGULAR_CLEARANCE**2:
@@ -215,7 +215,7 @@ def _reference_frequencies(table: Any) -> dict[str, float]:
         turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
         return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
     if isinstance(table, t.SlewReference):  # largest rate of the quintic, and the motion's own time
-        turning = 1.875 * float(np.linalg.norm(checks.turn(table)))
+        turning = 1.875 * float(np.linalg.norm(attitude_keys.turn(table)))
         return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
     return {}
 

@@ -40,4 +40,3 @@ def load(where: str) -> System:
         said = "has no such name" if found is None else f"has a {type(found).__name__} of that name"
         raise ValueError(f"{place} {said}; allowed is {ALLOWED}")
     return found
-

@@ -3,36 +3,29 @@
 import typing
 from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta
 
-Number = Annotated[float, Meta(description="a number")]
-Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
-NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
-Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
-Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
-ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
-Each = Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each input")]
-EachNotNegative = Annotated[
-    tuple[NotNegative, ...], Meta(description="a list of numbers of at least 0, one for each input")
-]
-EachPositive = Annotated[tuple[Positive, ...], Meta(description="a list of numbers greater than 0, one for each input")]
-Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
-NotNegatives = Annotated[
-    tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
-]
-ThreeNotNegative = Annotated[
-    tuple[NotNegative, NotNegative, NotNegative], Meta(description="three numbers of at least 0")
-]
-Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
-Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
-Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
-Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
-Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
-
-
-class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
-    """A table of a scenario file."""
+from ptsmc_jax.device_tables import AxesWheels, Hardware, NoFilter, PyramidWheels, StateHardware, SteadyStateFilter
+from ptsmc_jax.values import (
+    Count,
+    Each,
+    EachNotNegative,
+    EachPositive,
+    Four,
+    Inertia,
+    Interval,
+    Matrix,
+    NotNegative,
+    NotNegatives,
+    Number,
+    Numbers,
+    Positive,
+    Quantile,
+    Table,
+    Three,
+    ThreeNotNegative,
+    ThreePositive,
+)
 
 
 class SpacecraftPlant(Table, frozen=True):
@@ -134,7 +127,7 @@ class RandomWalk(Table, frozen=True):
 
 class EachRandomWalk(Table, frozen=True):
     kind: Literal["random_walk"] = "random_walk"
-    density: EachNotNegative = ()  # 1e-4 each
+    density: EachNotNegative | None = None  # 1e-4 each
 
 
 class SumDisturbance(Table, frozen=True):
@@ -146,15 +139,15 @@ class SumDisturbance(Table, frozen=True):
 
 class EachConstant(Table, frozen=True):
     kind: Literal["constant"] = "constant"
-    amplitude: Each = ()  # 0.01 each
+    amplitude: Each | None = None  # 0.01 each
 
 
 class EachSinusoid(Table, frozen=True):
     kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: Each = ()  # 0.01 each
-    frequency: Each = ()  # 1
-    phase: Each = ()  # 0
-    bias: Each = ()  # 0
+    amplitude: Each | None = None  # 0.01 each
+    frequency: Each | None = None  # 1
+    phase: Each | None = None  # 0
+    bias: Each | None = None  # 0
 
 
 class Controller(Table, frozen=True):
@@ -200,7 +193,7 @@ class NonlinearObserver(Table, frozen=True):
 
 class EachNonlinearObserver(Table, frozen=True):
     kind: Literal["nonlinear"] = "nonlinear"
-    gain: EachPositive = ()  # 10 each
+    gain: EachPositive | None = None  # 10 each
 
 
 class Prescribed(Table, frozen=True):
@@ -218,7 +211,7 @@ class PrescribedTimeObserver(Prescribed, frozen=True):
 
 class EachPrescribedTimeObserver(Prescribed, frozen=True):
     kind: Literal["prescribed_time"] = "prescribed_time"
-    gain: EachPositive = ()  # 10 each
+    gain: EachPositive | None = None  # 10 each
 
 
 class FiniteTimeObserver(Table, frozen=True):
@@ -229,7 +222,7 @@ class FiniteTimeObserver(Table, frozen=True):
 
 class EachFiniteTimeObserver(Table, frozen=True):
     kind: Literal["finite_time"] = "finite_time"
-    gain: EachPositive = ()  # 0.2 each
+    gain: EachPositive | None = None  # 0.2 each
     sign_width: NotNegative = 1e-5
 
 
@@ -240,56 +233,6 @@ class Loop(Table, frozen=True):
     t_end: Positive | None = None
     window: Positive = 1.0
     settling_angle: Positive = 1e-3
-
-
-class Actuators(Table, frozen=True):
-    torque_limit: Positive | None = None
-    torque_rate_limit: Positive | None = None
-    torque_lag: Positive | None = None
-    torque_step: Positive | None = None
-    delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
-
-
-class Hardware(Actuators, frozen=True):
-    attitude_noise: NotNegative | None = None
-    rate_noise: NotNegative | None = None
-    rate_noise_density: NotNegative | None = None
-    rate_bias: NotNegative | None = None
-    rate_bias_walk: NotNegative | None = None
-    star_tracker_every: Count | None = None
-
-
-class StateHardware(Actuators, frozen=True):
-    state_noise: NotNegatives | None = None
-
-
-class NoFilter(Table, frozen=True):
-    kind: Literal["none"] = "none"
-
-
-class SteadyStateFilter(Table, frozen=True):
-    kind: Literal["steady_state"] = "steady_state"
-    bandwidth: Positive | None = None
-
-
-class WheelLimits(Table, frozen=True):
-    torque_limit: Positive | None = None
-    momentum_limit: Positive | None = None
-    momentum: Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None = None
-
-
-class PyramidWheels(WheelLimits, frozen=True):
-    kind: Literal["pyramid"] = "pyramid"
-    cant_deg: Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")] = 35.264389682754654
-
-
-class AxesWheels(WheelLimits, frozen=True):
-    kind: Literal["axes"] = "axes"
-    axes: Annotated[tuple[Three, ...], Meta(description="a list of spin axes, three numbers each")] = (
-        (1.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0),
-        (0.0, 0.0, 1.0),
-    )
 
 
 class UniformAttitude(Table, frozen=True):
@@ -351,7 +294,7 @@ FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list 
 
 class Tune(Table, frozen=True):
     free: FreeGains | None = None  # eta, delta, observer_gain
-    bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}
+    bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}  # noqa: RUF012
     objective: Literal["rms", "worst", "cvar"] = "rms"
     level: Quantile | None = None
     trials: Count = 256
@@ -404,5 +347,5 @@ class Scenario(Table, frozen=True, kw_only=True):
     wheels: PyramidWheels | AxesWheels | None = None
     filter: NoFilter | SteadyStateFilter | None = None
     dispersion: Dispersion | StateDispersion | None = None
-    requirements: dict[str, float | Limit] = {}
+    requirements: dict[str, float | Limit] = {}  # noqa: RUF012
     tune: Tune | None = None

@@ -41,7 +41,7 @@ def F(t, x_1, x_2):  # noqa: N802
 
 
 def H(t, x_1, x_2):  # noqa: N802
-    """q'' without input and disturbance."""
+    """The joints' acceleration without input and disturbance."""
     q = x_1 + desired(t)
     return -solve(mass(q), load(q, x_2))
 

@@ -124,3 +124,13 @@ def chain_parts(
 def with_controller(run: Parts, **changes: Any) -> Parts:
     """The parts with other values in the controller."""
     return dataclasses.replace(run, controller=dataclasses.replace(run.controller, **changes))
+
+
+def finer(run: Parts, times: int) -> Parts:
+    """The same run on a grid with that many times the steps."""
+    grid = run.clock
+    assert isinstance(grid, clock.Graded)
+    grid = dataclasses.replace(
+        grid, before=grid.before * times, after=grid.after * times, max_step=grid.max_step / times
+    )
+    return dataclasses.replace(run, clock=grid)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import attitude, controllers, plants, rollout, signals, theory
 from ptsmc_jax.plants import AttitudeState
-from tests.helpers import FULL_INERTIA, REFERENCE, parts, vector, with_controller
+from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, vector, with_controller
 
 SWING = signals.Swing(
     vector(0.5, -0.2, 0.4, np.sqrt(1 - 0.45)), vector(0.3, -0.5, 0.2), vector(0.2, 0.1, 0.3), vector(0.1, 0.5, 0.2)
@@ -136,8 +136,7 @@ def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
     run = parts(
         20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, law=law, **none, **others
     )
-    timing = replace(run.clock, before=2 * run.clock.before, after=2 * run.clock.after, max_step=run.clock.max_step / 2)
-    return replace(run, clock=timing)
+    return finer(run, 2)
 
 
 def fly(run):

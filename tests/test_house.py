@@ -31,14 +31,17 @@ FLOORS = {
         theory linear
         requirements
         dispersions
-        tables systems
+        values systems
+        device_tables
+        tables
         layouts
         schema
+        attitude_keys
         checks
         build
         scenario
         montecarlo runs
-        store
+        store remark_2
         plotting
         paper
         slips

@@ -12,16 +12,16 @@ from scipy.linalg import expm
 from ptsmc_jax import observers, plants, rollout, scenario, signals
 from tests.helpers import FULL_INERTIA, chain_parts, parts, vector
 
-MASS = plants.chain(2)  # one input, M = 1
+MASS: plants.Plant = plants.chain(2)  # one input, M = 1
 GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
-def prescribed(model=MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+def prescribed(model: plants.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
     values = (vector([gain] * model.inputs), *(vector(v) for v in (c, start, mu, t_o, delta_o)))
     return observers.PrescribedTimeObserver(model, *values)
 
 
-def finite(model=MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
+def finite(model: plants.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
     return observers.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 

@@ -101,8 +101,33 @@ def test_folder_holds_figures_claims_and_scenarios(made, tmp_path):
     text = (tmp_path / "claims.md").read_text()
     for line in (*made.claims, *made.slips):
         assert line.where in text
+    assert "remark_2_observers.png" in names
+    for one, said in zip(made.observers, summary["observers"], strict=True):
+        assert (one.observer, one.sign, one.chattering) == (said["observer"], said["sign"], said["chattering"])
+        assert f"| {one.observer} | {one.sign} | {one.chattering:.2e} |" in text
     for name, run in made.cases.items():
         scenario = read(tmp_path / "scenarios" / f"{name}.toml")
         assert scenario.controller.eta == float(run.parts.controller.eta)
         assert summary["cases"][name]["terminal_error"] == run.metrics["terminal_error"]
     assert slips.__doc__
+
+
+def test_remark_2_is_measured_as_theory_says(made):
+    by = {(one.observer, one.sign): one for one in made.observers}
+    assert len(by) == 8
+    k2 = {"none": 0.01 * 3**0.5, "nonlinear": 1e-3 * 3**0.5 * 14 / 10, "prescribed_time": 1e-3 * 3**0.5 * 14 / 10}
+    for kind, bound in k2.items():
+        exact, smooth = by[kind, "exact"], by[kind, "smooth"]
+        assert exact.chattering > 100 * smooth.chattering  # what Remark 2 is about
+        # the exact sign jumps by 2 |T J^-1| K2 of 2 eps'' at most, through J, in each period
+        most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * bound / 0.05
+        assert 0.05 * most < exact.chattering < most
+    assert by["finite_time", "exact"].chattering == by["finite_time", "smooth"].chattering  # K2 = 0 by then
+    # a disturbance that starts at its bound: 1.25 |d| / c by theory for a constant one, by less than 1.1 c slower here
+    assert by["finite_time", "smooth"].estimate_settled < 1.2519 * 0.01 / 0.02 + 0.1
+    assert by["prescribed_time", "smooth"].estimate_settled < 1.0
+    assert by["prescribed_time", "smooth"].estimate_settled < by["nonlinear", "smooth"].estimate_settled
+    # at rest the nonlinear observer lags by J / l: |d'| J / l, largest together
+    lag = np.linalg.norm([10.0, 12.0, 14.0]) / 10.0 * 1e-3
+    assert by["nonlinear", "smooth"].estimate_error == pytest.approx(lag, rel=0.1)
+    assert all(by[key].estimate_error < 0.1 * lag for key in by if key[0] == "finite_time")

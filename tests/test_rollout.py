@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import clock, plants, rollout, signals, theory
-from tests.helpers import FULL_INERTIA, REFERENCE, parts, vector, with_controller
+from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, vector, with_controller
 
 fly = rollout.simulate_jit
 
@@ -16,14 +16,6 @@ def perfect(run: rollout.Parts) -> rollout.Parts:
     quiet = signals.Constant(jnp.zeros(3))
     bound = replace(run.observer, disturbance_rate_bound=vector(0.0))
     return replace(run, disturbance=quiet, observer=bound)
-
-
-def finer(run: rollout.Parts, times: int) -> rollout.Parts:
-    """The same run on a grid with that many times the steps."""
-    grid = run.clock
-    assert isinstance(grid, clock.Graded)
-    grid = replace(grid, before=grid.before * times, after=grid.after * times, max_step=grid.max_step / times)
-    return replace(run, clock=grid)
 
 
 def reference_run(case: dict) -> rollout.Parts:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import clock, dispersions, schema, sensors, signals, store, tables
-from ptsmc_jax.checks import quaternion
+from ptsmc_jax.attitude_keys import quaternion
 from ptsmc_jax.scenario import Reach, from_tables, read, replace, study
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector

@@ -5,21 +5,22 @@ import re
 import pytest
 
 from ptsmc_jax import schema
+from ptsmc_jax.device_tables import Actuators, WheelLimits
 from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, STATE_CATALOGUE
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import (
-    Actuators,
     Attitude,
     AxesWheels,
     ChainPlant,
     GravityGradient,
+    Prescribed,
     PyramidWheels,
     Scenario,
     SumDisturbance,
-    Table,
-    WheelLimits,
 )
+from ptsmc_jax.values import Table
+from tests.helpers import ROOT
 
 # design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
 DEFAULTS = {
@@ -96,6 +97,8 @@ ATTITUDES = [
     {"euler_deg": [10.0, 20.0, 30.0], "sequence": "ZYX"},
 ]
 # every key of every table, one table at a time so that what is made wrong in it is all that is wrong
+ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
+SYSTEM_CONTROLLER = {key: value for key, value in CHAIN_DEFAULTS["controller"].items() if key != "a"}
 COMPLETE = [
     *({name: table} for name, table in DEFAULTS.items()),
     *({"initial": {**attitude, "rate": [0.0, 0.0, 0.1]}} for attitude in ATTITUDES),
@@ -106,7 +109,7 @@ COMPLETE = [
         for attitude in ATTITUDES
         for moving in (
             {"kind": "sinusoid", "amplitude": [0.1] * 3, "frequency": [0.2] * 3, "phase": [0.3] * 3},
-            {"kind": "slew", "to_quat_xyzw": [0.6, 0.0, 0.0, 0.8], "duration": 20.0},
+            {"kind": "slew", "to_quat_xyzw": [0.6, 0.0, 0.0, 0.8], "duration": 20.0, "way": "short"},
         )
     ),
     {"spacecraft": {"inertia": [[10.0, 1.0, 0.0], [1.0, 12.0, 0.5], [0.0, 0.5, 14.0]]}},
@@ -144,6 +147,8 @@ COMPLETE = [
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
     {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
     {"observer": {"kind": "none"}},
+    {"observer": {"kind": "finite_time", "gain": [0.1, 0.1, 0.1], "sign_width": 1e-5}},
+    {"observer": {"kind": "prescribed_time", "gain": [1.0, 1.0, 1.0], "mu": 3.0, "t_o": 6.0, "delta_o": 0.1}},
     *(
         {"plant": {"kind": "chain", "order": 3, "x0": [5.0, 3.0, 2.0]}, **tables}
         for tables in (
@@ -151,6 +156,8 @@ COMPLETE = [
             {"disturbance": {"kind": "constant", "amplitude": [0.01]}},
             {"disturbance": {"kind": "random_walk", "density": [1e-4]}},
             {"observer": {"kind": "nonlinear", "gain": [10.0]}},
+            {"observer": {"kind": "finite_time", "gain": [0.1], "sign_width": 1e-5}},
+            {"observer": {"kind": "prescribed_time", "gain": [1.0], "mu": 3.0, "t_o": 6.0, "delta_o": 0.1}},
             {"hardware": {"state_noise": [1e-5, 1e-5, 0.0], "delay": 1, "torque_limit": 0.5, "torque_lag": 0.1}},
             {"hardware": {"torque_rate_limit": 5.0, "torque_step": 1e-4}},
             {"dispersion": {"x0": {"kind": "uniform", "half_width": [1.0, 0.5, 0.0]}}},
@@ -159,6 +166,7 @@ COMPLETE = [
             {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},
         )
     ),
+    {"plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]}, "controller": SYSTEM_CONTROLLER},
 ]
 
 
@@ -249,6 +257,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
     named.pop(Attitude)  # bases of others
     named.pop(Actuators)
     named.pop(WheelLimits)
+    named.pop(Prescribed)
     named.pop(SumDisturbance)  # of tables that are looked at like any other
     named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
     for wheels in (PyramidWheels, AxesWheels):

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 from ptsmc_jax import attitude, controllers, observers, plants, rollout, scenario, signals, theory
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.schema import ScenarioError
-from tests.helpers import FULL_INERTIA, ROOT, parts, vector
+from tests.helpers import FULL_INERTIA, ROOT, finer, parts, vector
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
@@ -68,7 +69,7 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
     # by hand: dF/dx2 = T / 2, and what no acceleration makes of x_1'': -|w|^2 v / 4 - q_1f'' (58)
-    model = own.plant
+    model: Any = own.plant
     np.testing.assert_allclose(model.slope(t, state), 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
     by_hand = -0.25 * jnp.dot(x.w, x.w) * x.q[:3] - SPIN(t).vector_rates()[1]
     np.testing.assert_allclose(model.carried(t, state), by_hand, rtol=0, atol=1e-15)
@@ -81,12 +82,8 @@ def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(peri
     start = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
     others = {"inertia": FULL_INERTIA, "reference": SPIN, "q": start, "sign_width": 0.05, "delta": 0.4}
     run = parts(8.0, 3.0, period=period, **others)
-    if period is None:  # x_1 and q are integrated as different equations: what differs is the error of the steps
-        clock = run.clock
-        fine = replace(clock, before=8 * clock.before, after=8 * clock.after, max_step=clock.max_step / 8)
-        run = replace(run, clock=fine)
-    else:
-        run = replace(run, substeps=4)
+    # x_1 and q are integrated as different equations: what differs is the error of the steps
+    run = finer(run, 8) if period is None else replace(run, substeps=4)
     one, other = (jax.tree.map(np.asarray, rollout.simulate_jit(r, record=True)) for r in (run, as_system(run, SPIN)))
     assert one.status == other.status == rollout.OK
     np.testing.assert_allclose(other.log.x[:, :3], one.log.error, rtol=0, atol=1e-10)
@@ -138,7 +135,7 @@ def test_arm_stays_inside_its_envelope(mode):
 def test_mass_matrix_and_coriolis_of_the_arm_keep_the_books_of_energy():
     """Lagrange: C q' = M' q' - d(q' M q' / 2)/dq, by automatic differentiation of the mass matrix."""
     ready = scenario.study(scenario.from_tables(arm_tables()))
-    arm = ready.parts.plant
+    arm: Any = ready.parts.plant
     rng = np.random.default_rng(3)
     mass, load = (arm.H.func.__globals__[name] for name in ("mass", "load"))  # the file's own functions
     for _ in range(5):
@@ -154,7 +151,7 @@ def test_mass_matrix_and_coriolis_of_the_arm_keep_the_books_of_energy():
 
 
 def test_jacobians_of_the_arm_are_those_derived_by_hand():
-    arm = scenario.study(scenario.from_tables(arm_tables())).parts.plant
+    arm: Any = scenario.study(scenario.from_tables(arm_tables())).parts.plant
     t, x = vector(0.7), vector(0.3, -0.2, 0.5, 0.1)
     np.testing.assert_array_equal(arm.slope(t, x), np.eye(2))
     # F = q' - q_d': dF/dt = -q_d''
@@ -222,7 +219,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match=r"G\(t, x_1, x_2\) returns \(2, 2\), but for n = 3 must return an array"):
         plants.system(3, F, F, G)
     with pytest.raises(ValueError, match=r"H\(t, x_1, x_2\) fails for x_1 and x_2 of shape \(2,\)"):
-        plants.system(2, F, lambda t, x: x, G)  # pyright: ignore[reportArgumentType]
+        plants.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match="n is 0"):
         plants.system(0, F, F, G)
     with pytest.raises(ValueError, match="inertia must be an invertible"):
@@ -241,7 +238,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         ({"kind": "system", "system": "no_such_module:arm"}, "running no_such_module fails: ModuleNotFoundError"),
         (
             {"kind": "system", "system": ARM, "x0": [1, 2, 3]},
-            "plant.x0 is [1.0, 2.0, 3.0], but must be x_1 followed by x_2",
+            "plant.x0 is [1.0, 2.0, 3.0], but must be a list of x_1 followed by x_2",
         ),
         ({"kind": "system", "system": ARM, "x0": [1, 2]}, "plant.x0 is [1.0, 2.0], but must be a list of 4 numbers"),
         ({"kind": "system", "system": ARM, "order": 2}, "plant.order is not a known key"),

@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ptsmc_jax import paper, plotting, schema, slips, store
+from ptsmc_jax import paper, plotting, remark_2, schema, slips, store
 from ptsmc_jax.plants import Chain
 from ptsmc_jax.runs import Run
 from ptsmc_jax.scenario import from_tables
@@ -19,6 +19,7 @@ class Reproduction:
     cases: dict[str, Run]
     claims: list[paper.Claim]
     slips: list[slips.Slip]
+    observers: list[remark_2.Measured]
 
     @property
     def ok(self) -> bool:
@@ -29,7 +30,7 @@ class Reproduction:
 def reproduce() -> Reproduction:
     """Fly every case of the paper and measure what it claims."""
     cases = paper.fly_cases()
-    return Reproduction(cases, paper.claims(cases), slips.shown(cases))
+    return Reproduction(cases, paper.claims(cases), slips.shown(cases), remark_2.measure())
 
 
 def summary(made: Reproduction) -> dict[str, Any]:
@@ -40,6 +41,9 @@ def summary(made: Reproduction) -> dict[str, Any]:
         "verdicts": {word: verdicts.count(word) for word in paper.VERDICTS},
         "claims": [asdict(claim) for claim in made.claims],
         "slips": [asdict(slip) for slip in made.slips],
+        "observers": [
+            {key: value for key, value in asdict(one).items() if key not in ("t", "off")} for one in made.observers
+        ],
         "cases": {
             name: {"figures": paper.CASES[name][0], "status": run.status, **run.metrics}
             for name, run in made.cases.items()
@@ -73,6 +77,7 @@ def _figures(made: Reproduction) -> dict[str, Figure]:
         label = "control" if chain else "torque"
         found[f"fig_{int(last):02}{parts[1]}_{label}"] = plotting.torque(run.parts, run.log, title=heading)
         found[f"convergence_{name}"] = plotting.convergence(run.parts, run.log, f"Convergence: {title}")
+    found["remark_2_observers"] = plotting.observers(made.observers)
     return found
 
 
@@ -88,6 +93,10 @@ def _markdown(made: Reproduction) -> str:
             "# Its slips, and what shows them",
             "",
             *_rows(("where", "the paper", "what it must be", "shown by"), shown),
+            "",
+            "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
+            "",
+            *_rows(*remark_2.rows(made.observers)),
             "",
         ]
     )

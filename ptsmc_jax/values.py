@@ -1,0 +1,34 @@
+"""What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
+
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+Number = Annotated[float, Meta(description="a number")]
+Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
+NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
+Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
+Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
+ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
+Each = Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each input")]
+EachNotNegative = Annotated[
+    tuple[NotNegative, ...], Meta(description="a list of numbers of at least 0, one for each input")
+]
+EachPositive = Annotated[tuple[Positive, ...], Meta(description="a list of numbers greater than 0, one for each input")]
+Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
+NotNegatives = Annotated[
+    tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
+]
+ThreeNotNegative = Annotated[
+    tuple[NotNegative, NotNegative, NotNegative], Meta(description="three numbers of at least 0")
+]
+Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
+Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
+Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
+Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
+Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
+
+
+class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
+    """A table of a scenario file."""
