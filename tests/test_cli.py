@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import metrics, runs, scenario, store
+from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT
-from tests.test_scenario import BAD as BAD_SCENARIOS
 from tests.test_scenario import check_sentence
 from tuning import cli, single
 
