@@ -194,7 +194,7 @@ def observers(found: Sequence[Measured]) -> Figure:
         for kind, (colour, style) in zip(kinds, _STYLES, strict=False):
             one = next(one for one in found if one.observer == kind and one.sign == "smooth")
             left.semilogy(one.t, np.maximum(one.off, 1e-6), color=colour, ls=style, label=kind)
-        left.set(xlabel=_TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(3e-5, 1.0))
+        left.set(xlabel=_TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
         left.legend(ncols=2)
         signs = list(dict.fromkeys(one.sign for one in found))
         for k, sign in enumerate(signs):
@@ -204,6 +204,7 @@ def observers(found: Sequence[Measured]) -> Figure:
             bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
             right.bar_label(bars, fmt="%.0e", fontsize=8)
         right.set_yscale("log")
+        right.set_axisbelow(True)
         right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
         right.set(ylabel="chattering after $t_f$ [N m/s]")
         right.set_ylim(top=8.0 * right.get_ylim()[1])
