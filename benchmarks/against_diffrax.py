@@ -39,11 +39,12 @@ def loop(parts, x0):
     law, watch, plant = parts.controller, parts.observer, parts.plant
     ticks = parts.clock.ticks(law.t_f, law.delta)
     k2, matrix, solver = watch.error_bound(), watch.update_matrix(parts.clock.period), RK4()
-    term = diffrax.ODETerm(lambda t, y, u: plant.rate(y, u, parts.disturbance(t, y)))
+    term = diffrax.ODETerm(lambda t, y, u: plant.rate(t, y, u, parts.disturbance(t, y)))
 
     def period(carry, now: Ticks):
         x, seen, d_hat, u, dt_before, most = carry
-        updated = watch.update(matrix, d_hat, seen, x, u, dt_before)
+        impulse = watch.model.unexplained_impulse(now.t, seen, x, u, dt_before)
+        updated = watch.update(matrix, d_hat, impulse, now.t, dt_before)
         d_hat = jnp.where(dt_before > 0.0, updated, d_hat)
         u, _ = law.torque(now.t, now.hold, x, parts.reference(now.t), d_hat, k2(now.t))
         state = solver.init(term, now.t, now.t_next, x, u)

@@ -26,7 +26,7 @@ def numpy_loop(parts):
     qf = np.asarray(parts.reference(jnp.zeros(())).q)
     t_f, eta, k1, width = (float(v) for v in (law.t_f, law.eta, law.k1, law.sign_width))
     amplitude, frequency, phase = (np.asarray(v) for v in (d.amplitude, d.frequency, d.phase))
-    A = np.asarray(parts.observer.decay_matrix())
+    A = np.asarray(parts.observer.decay_matrix(jnp.zeros(()), jnp.zeros(())))
     k2 = [float(v) for v in parts.observer.error_bound()]
 
     def cross(a, b):
@@ -73,8 +73,9 @@ def main() -> None:
     def closed(t, y, hold):
         x, d_hat = y
         u, _ = law.torque(t, hold, x, parts.reference(t), d_hat, k2(t))
-        x_dot = plant.rate(x, u, parts.disturbance(t, x))
-        return x_dot, watch.forcing(x, x_dot, u) - watch.decay_matrix() @ d_hat
+        x_dot = plant.rate(t, x, u, parts.disturbance(t, x))
+        seen = watch.model.unexplained(t, x, x_dot, u)
+        return x_dot, watch.forcing(t, (t, t), d_hat, seen) - watch.decay_matrix(t, t) @ d_hat
 
     @partial(jax.jit, static_argnames="solver")
     def by_diffrax(tolerance, solver):
