@@ -72,10 +72,11 @@ def observer(scenario: Scenario, model: plants.Plant) -> observers.Observer:
     if isinstance(table, t.NoObserver):
         return observers.NoObserver(model, vector(law.disturbance_bound))
     common = (model, vector(table.gain), vector(law.disturbance_rate_bound), vector(law.initial_estimate_error))
-    if isinstance(table, t.FiniteTimeObserver | t.EachFiniteTimeObserver):
+    if isinstance(table, checks.FINITE_TIME):
         return observers.FiniteTimeObserver(*common, vector(table.sign_width))
     if isinstance(table, t.Prescribed):
-        return observers.PrescribedTimeObserver(*common, *(vector(v) for v in (table.mu, table.t_o, table.delta_o)))
+        times = (vector(v) for v in (table.mu, *checks.prescribed_times(scenario, table)))
+        return observers.PrescribedTimeObserver(*common, *times)
     return observers.NonlinearObserver(*common)
 
 

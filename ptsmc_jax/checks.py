@@ -12,17 +12,13 @@ from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
 MOST_STEPS = 200_000
+FINITE_TIME = tables.FiniteTimeObserver | tables.EachFiniteTimeObserver
 
 
 def resolve(scenario: Scenario) -> Scenario:
     """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds."""
     loop, t_f = scenario.loop, scenario.controller.t_f
     observer, disturbance = _each("observer", scenario.observer, scenario), scenario.disturbance
-    if isinstance(observer, tables.Prescribed):
-        t_o = t_f / 3 if observer.t_o is None else observer.t_o
-        delta_o = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
-        delta_o = min(delta_o, t_o / 4) if observer.delta_o is None else observer.delta_o
-        observer = msgspec.structs.replace(observer, t_o=t_o, delta_o=delta_o)
     if isinstance(disturbance, tables.SumDisturbance):
         each = tuple(_each("disturbance", term, scenario) for term in disturbance.terms)
         disturbance = msgspec.structs.replace(disturbance, terms=each)
@@ -77,15 +73,18 @@ def initial_state(scenario: Scenario) -> tuple[float, ...]:
 def _each(name: str, table: Any, scenario: Scenario) -> Any:
     """A table with its lists of one number for each input, where they are absent, filled in."""
     known = layouts.EACH.get((name, table.kind), {})
+    if isinstance(table, FINITE_TIME):
+        known = {key: value * (scenario.controller.disturbance_rate_bound or 1e-3) for key, value in known.items()}
     absent = {key: (value,) * inputs(scenario) for key, value in known.items() if getattr(table, key) is None}
     return msgspec.structs.replace(table, **absent)
 
 
 def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
     """Where an observer's gain is looked for: a finite-time one's is a bound on the disturbance's rate."""
-    if isinstance(scenario.observer, tables.FiniteTimeObserver | tables.EachFiniteTimeObserver):
-        least = max(1.1 * scenario.controller.disturbance_rate_bound, 1e-6)
-        return least, 1e3 * least
+    if isinstance(scenario.observer, FINITE_TIME):
+        assert scenario.observer.gain is not None
+        own = min(scenario.observer.gain), max(scenario.observer.gain)
+        return max(scenario.controller.disturbance_rate_bound, 0.05 * own[0]), 50.0 * own[1]
     return 0.5, 300.0
 
 
@@ -221,16 +220,23 @@ def _check_chain(plant: tables.ChainPlant, controller: Any) -> None:
         )
 
 
+def prescribed_times(scenario: Scenario, observer: tables.Prescribed) -> tuple[float, float]:
+    """T_o and delta_o of a prescribed-time observer [s]; a third of t_f, and 0.05 s or a period, if not given."""
+    loop = scenario.loop
+    t_o = scenario.controller.t_f / 3 if observer.t_o is None else observer.t_o
+    shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
+    return t_o, min(shortest, t_o / 4) if observer.delta_o is None else observer.delta_o
+
+
 def _check_observer(scenario: Scenario) -> None:
     observer, controller = scenario.observer, scenario.controller
     if isinstance(observer, tables.Prescribed):
-        assert observer.t_o is not None
-        assert observer.delta_o is not None
-        if observer.t_o > controller.t_f:
-            raise wrong("observer.t_o", observer.t_o, f"at most controller.t_f, {controller.t_f}")
-        if observer.delta_o >= observer.t_o:
-            raise wrong("observer.delta_o", observer.delta_o, f"less than observer.t_o, {observer.t_o}")
-    if isinstance(observer, tables.FiniteTimeObserver | tables.EachFiniteTimeObserver):
+        t_o, delta_o = prescribed_times(scenario, observer)
+        if t_o > controller.t_f:
+            raise wrong("observer.t_o", t_o, f"at most controller.t_f, {controller.t_f}")
+        if delta_o >= t_o:
+            raise wrong("observer.delta_o", delta_o, f"less than observer.t_o, {t_o}")
+    if isinstance(observer, FINITE_TIME):
         assert observer.gain is not None  # `resolve` filled it in
         least = controller.disturbance_rate_bound
         if min(observer.gain) < least or min(observer.gain) <= 0.0:
@@ -331,6 +337,12 @@ def _check_dispersion(scenario: Scenario) -> None:
             raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
 
 
+def _least_gain(scenario: Scenario) -> tuple[float, float, bool]:
+    """Range of a bound on the observer's gain: a finite-time one's is at least the bound on the disturbance's rate."""
+    least = scenario.controller.disturbance_rate_bound if isinstance(scenario.observer, FINITE_TIME) else 0.0
+    return least, math.inf, least > 0.0
+
+
 def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
     t_f, period = scenario.controller.t_f, scenario.loop.period
     shortest = period if scenario.loop.mode == "sampled" else 0.0
@@ -338,7 +350,7 @@ def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
     ranges = {
         "eta": (_least_eta(scenario), math.inf, False),
         "delta": (shortest, t_f, shortest > 0.0),
-        "observer_gain": (0.0, math.inf, False),
+        "observer_gain": _least_gain(scenario),
         "k1": (0.0, math.inf, False),
         "sign_width": (0.0, math.inf, False),
     }

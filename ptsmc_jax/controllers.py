@@ -37,7 +37,7 @@ class _Attitude(SecondOrder):
         """Angle between the attitude and its reference [rad]."""
         return attitude.angle(x.q, target.q)
 
-    def switching_rate(self, k2: Scalar) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
         return 0.5 * numerics.norm(self.model.inertia_inverse) * k2
 
@@ -169,9 +169,13 @@ class PrescribedTimeSystem(SecondOrder):
     model: System  # the nominal plant
 
     def clearance(self, x: State, target: Scalar) -> Scalar:
-        """Det of dF/dx2 G with its rows made of length 1 [-]: at 0 the law is singular."""
+        """Det of dF/dx2 G: at 0 the law is singular."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
-        return numerics.volume(slope @ gain)
+        return numerics.determinant(slope @ gain)
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """The determinant at the start: the ratio does not depend on units."""
+        return first
 
     def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:
         """x_1 and F(t, x), (n,) each."""
@@ -201,12 +205,12 @@ class PrescribedTimeSystem(SecondOrder):
 
         x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n:]]))
         w_dot = numerics.solve(self.model.slope(target, x), acceleration - self.model.carried(target, x))
-        return Motion(x, w_dot, jnp.abs(self.clearance(x, target)))
+        return Motion(x, w_dot, self.clearance(x, target))
 
-    def switching_rate(self, k2: Scalar) -> Scalar:
-        """|dF/dx2 D| K2 at t = 0 in x = 0, about."""
-        origin = jnp.zeros(2 * self.model.inputs)
-        return 0.5 * self.influence(origin, jnp.zeros_like(self.t_f)) * k2
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """|dF/dx2 D| K2, the largest over the states that are visited."""
+        times, states = visited
+        return 0.5 * jnp.max(jax.vmap(self.influence)(states, times)) * k2
 
 
 def expansion(eta: Scalar, order: int) -> list[Scalar]:
@@ -266,7 +270,7 @@ class PrescribedTimeChain(Law):
         u = (wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, jnp.reshape(s, 1)
 
-    def switching_rate(self, k2: Scalar) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """K2."""
         return k2
 

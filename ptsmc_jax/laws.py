@@ -55,8 +55,12 @@ class Law:
         return x
 
     def clearance(self, x: Any, target: Any) -> Scalar:
-        """How far the law is from a singularity of its own [-], its sign that of the side; 1 where it has none."""
+        """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
         return jnp.ones_like(self.t_f)
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """What clearances are counted in, from that of the initial state: its sign, so that the first is positive."""
+        return jnp.where(first < 0.0, -1.0, 1.0)
 
     def torque(
         self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
@@ -69,13 +73,16 @@ class Law:
         """Order n of the error's motion: 2, or that of a chain."""
         return 2
 
-    def switching_rate(self, k2: Scalar) -> Scalar:
-        """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2."""
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
+
+        visited: targets (points,) and states (points, ..) of a run, where it depends on them.
+        """
         raise NotImplementedError
 
-    def boundary_layer(self, k2: Scalar) -> tuple[Scalar, Scalar]:
+    def boundary_layer(self, k2: Scalar, visited: Any = None) -> tuple[Scalar, Scalar]:
         """Fastest rate of the smooth sign's boundary layer before and after the hand-over [1/s], for K2 up to k2."""
-        after = self.switching_rate(k2) / self.sign_width
+        after = self.switching_rate(k2, visited) / self.sign_width
         return self.t_f ** (self.order - 1) * after, after
 
     def hold_rate(self) -> float:

@@ -96,7 +96,7 @@ EACH: dict[tuple[str, str], dict[str, float]] = {
     ("disturbance", "sinusoid"): {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0},
     ("observer", "nonlinear"): {"gain": 10.0},
     ("observer", "prescribed_time"): {"gain": 10.0},
-    ("observer", "finite_time"): {"gain": 0.2},
+    ("observer", "finite_time"): {"gain": 20.0},  # times controller.disturbance_rate_bound
 }
 
 

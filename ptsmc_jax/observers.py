@@ -254,7 +254,7 @@ class PrescribedTimeObserver(_Linear):
         """Nodes that close in on T_o, each a tenth nearer, and T_o - delta_o."""
         t_o, delta_o = float(self.t_o), float(self.delta_o)
         left, times = t_o, [t_o - delta_o]
-        while left > delta_o:
+        while left > max(delta_o, 1e-9 * t_o):
             times.append(t_o - left)
             left *= 0.9
         return tuple(sorted(times))
@@ -266,19 +266,20 @@ _OVERSHOOT = (0.159, 0.185, 0.212, 0.240, 0.270, 0.301, 0.336, 0.374, 0.417, 0.4
 
 
 class FiniteTimeBound(NamedTuple):
-    """K2(t) of `FiniteTimeObserver`: |e(0)| until it has settled, then 0 (in continuous time, without noise)."""
+    """K2(t) of `FiniteTimeObserver`: |e(0)| until it has settled, then what its smooth sign leaves (without noise)."""
 
     start: Array  # bound on |e(0)|_2 [N m]
     settled: Array  # [s]
+    floor: Array  # [N m]
 
     @property
     def largest(self) -> Scalar:
         """Its largest value [N m]."""
-        return self.start
+        return jnp.maximum(self.start, self.floor)
 
     def __call__(self, t: Scalar) -> Scalar:
         """K2 at t [s], in N m."""
-        return jnp.where(t < self.settled, self.start, 0.0)
+        return jnp.where(t < self.settled, self.largest, self.floor)
 
 
 @jax.tree_util.register_dataclass
@@ -304,12 +305,17 @@ class FiniteTimeObserver(Observer):
         """No component of the error grows, and each is gone after (1 + q)/((1 - q)(1.1 - k)) |e(0)|/c, k = |d'|/c.
 
         e0 grows and falls while e goes from e(0) to -q e(0) at a rate of at least (1.1 - k) c, and so on with q^2 e(0):
-        a geometric series. For a constant d: 1.25 |d|/c.
+        a geometric series. For a constant d: 1.25 |d|/c. Afterwards the smooth sign holds e0 = w artanh(k/1.1) against
+        d', where the root in e0' = 0 is what is left of e.
         """
         c = jnp.min(self.gain)
         k = jnp.clip(self.disturbance_rate_bound / c, 0.0, 1.0)
         q = jnp.interp(k, jnp.linspace(0.0, 1.0, len(_OVERSHOOT)), jnp.asarray(_OVERSHOOT))  # convex: from above
-        return FiniteTimeBound(self.initial_error, (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c)
+        settled = (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c
+        shares = jnp.clip(self.disturbance_rate_bound / self.gain, 0.0, 1.0)
+        off = self.sign_width * jnp.arctanh(shares / 1.1)
+        left = 1.5 * jnp.sqrt(self.gain) * numerics.signed_root(off, self.sign_width)
+        return FiniteTimeBound(self.initial_error, settled, numerics.norm(left))
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """Zero: nothing is linear."""

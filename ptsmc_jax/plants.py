@@ -299,6 +299,10 @@ class System(Plant):
         """|x_2|."""
         return numerics.norm(self.velocity(x))
 
+    def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
+        """D(x')/dx at an input that is held: its eigenvalues are what integration steps must follow [1/s]."""
+        return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
+
     def columns(self, x: Any) -> dict[str, Any]:
         """The states x_1 and x_2, one after the other."""
         return {"x": x}
@@ -314,12 +318,13 @@ def system(
 ) -> System:
     """Second-order system (25) with n inputs from JAX functions of (t, x_1, x_2); see `System`.
 
-    F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None. inertia: (n, n)
-    that observers read their gains against (A = l inertia^-1), the identity if None: gains are then in 1/s.
-    Raises ValueError where a function does not take such arguments or returns another shape.
+    F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None, and must be
+    invertible for any observer. inertia: (n, n), symmetric and positive definite, that observers read their gains
+    against (A = l inertia^-1), the identity if None: gains are then in 1/s. Raises ValueError where a function does not
+    take such arguments or returns another shape.
     """
-    if n < 1:
-        raise ValueError(f"n is {n}, but must be at least 1")
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(f"n is {n}, but must be a whole number of at least 1")
     one = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), one.dtype)
     for name, function, shape in (("F", F, (n,)), ("H", H, (n,)), ("G", G, (n, n)), ("D", D, (n, n))):
@@ -328,15 +333,17 @@ def system(
         try:
             returned = jax.eval_shape(function, one, vector, vector)
         except Exception as error:
-            raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {error}") from error
+            said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {said}") from error
         if getattr(returned, "shape", None) != shape:
             raise ValueError(
                 f"{name}(t, x_1, x_2) returns {getattr(returned, 'shape', type(returned).__name__)}, but for n = {n} "
                 f"must return an array of shape {shape}"
             )
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
-    if scale.shape != (n, n) or not np.all(np.isfinite(scale)) or np.linalg.matrix_rank(scale) < n:
-        raise ValueError(f"inertia must be an invertible ({n}, {n}) matrix")
+    definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
+    if not definite:
+        raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
     return System(_called(F), _called(H), _called(G), _called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale)))
 
 

@@ -99,7 +99,7 @@ class _Course(NamedTuple):
 
     judged: metrics.Judged
     x0: Any
-    side: Array  # of the law's singularity on which it starts, +-1
+    whole: Array  # what clearances from the law's singularity are counted in
 
 
 class _Flight(NamedTuple):
@@ -122,8 +122,8 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
-    side = jnp.where(parts.controller.clearance(x0, target) < 0.0, -1.0, 1.0)
-    course = _Course(judged, x0, jax.lax.stop_gradient(side))
+    whole = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
+    course = _Course(judged, x0, jax.lax.stop_gradient(whole))
     loop = _continuous if isinstance(parts.clock, Graded) else _sampled
     return loop(parts, ticks, course, seed, trial, record)
 
@@ -339,7 +339,7 @@ def _watch(
     """Status and first bad time after an interval; the first thing that goes wrong stays."""
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((x, u))))
     fast = parts.plant.too_fast(x, dt)
-    near = course.side * parts.controller.clearance(x, parts.reference(t)) < SINGULAR_CLEARANCE
+    near = ~(parts.controller.clearance(x, parts.reference(t)) / course.whole >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (state.status == OK) & (code != OK)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)

@@ -65,7 +65,8 @@ def load(path: str | Path) -> dict[str, Any]:
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
         raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
     plant = raw.get("plant")
-    file, _, name = str(plant.get("system", "") if isinstance(plant, dict) else "").rpartition(":")
+    where = plant.get("system") if isinstance(plant, dict) else None
+    file, _, name = where.rpartition(":") if isinstance(where, str) else ("", "", "")
     if isinstance(plant, dict) and file.endswith(".py"):
         plant["system"] = f"{(Path(path).parent / file).resolve()}:{name}"
     return raw

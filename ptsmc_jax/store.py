@@ -36,12 +36,15 @@ def versions(command: str, seed: int, **others: Any) -> dict[str, Any]:
     }
 
 
-def previous(folder: Path, command: str, scenario: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
-    """The summary of the same scenario, seed and command in this folder; None if there is none."""
+def previous(
+    folder: Path, command: str, scenario: Mapping[str, Any], seed: int, **others: Any
+) -> dict[str, Any] | None:
+    """The summary of the same scenario, seed, command and what else `versions` was told; None if there is none."""
     try:
         made = json.loads((folder / "versions.json").read_text())
-        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(scenario))
-        if same and made.get("command") == command and made.get("seed") == seed:
+        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(_plain(scenario)))
+        wanted = {"command": command, "seed": seed, **others}
+        if same and all(made.get(key) == value for key, value in wanted.items()):
             return json.loads((folder / "summary.json").read_text())
     except (OSError, ValueError):
         pass
@@ -82,7 +85,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
 
 def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
     """A TOML file, arrays on one line."""
-    text, before = tomli_w.dumps(dict(tables)), ""
+    text, before = tomli_w.dumps(_plain(tables)), ""
     while text != before:  # innermost arrays first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
     path.write_text(text, encoding="utf-8")
@@ -114,4 +117,6 @@ def _plain(value: Any) -> Any:
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return f"<{type(value).__name__} made in Python>"  # which no file can hold, and which reading refuses

@@ -216,13 +216,13 @@ class EachPrescribedTimeObserver(Prescribed, frozen=True):
 
 class FiniteTimeObserver(Table, frozen=True):
     kind: Literal["finite_time"] = "finite_time"
-    gain: ThreePositive = (0.02, 0.02, 0.02)
+    gain: ThreePositive | None = None  # 20 times controller.disturbance_rate_bound
     sign_width: NotNegative = 1e-5
 
 
 class EachFiniteTimeObserver(Table, frozen=True):
     kind: Literal["finite_time"] = "finite_time"
-    gain: EachPositive | None = None  # 0.2 each
+    gain: EachPositive | None = None  # 20 times controller.disturbance_rate_bound
     sign_width: NotNegative = 1e-5
 
 

@@ -5,7 +5,8 @@ K2 = 0. The paper writes ln(t_f - t) in (20)-(22) and (47)-(50) where its absolu
 """
 
 import math
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import attitude, numerics
 from ptsmc_jax.controllers import expansion
 from ptsmc_jax.laws import SecondOrder
-from ptsmc_jax.plants import Chain
+from ptsmc_jax.plants import Chain, System
 from ptsmc_jax.rollout import Parts
 
 Scalar = Float[Array, ""]
@@ -211,7 +212,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
         error, error_rate = _start(parts)
         s0 = float(jnp.linalg.norm(law.t_f * error_rate + law.eta * error))
     bound = parts.observer.error_bound()
-    switching = float(law.switching_rate(bound.largest))
+    switching = float(law.switching_rate(bound.largest, visited(parts) if isinstance(parts.plant, System) else None))
     beta = switching * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
@@ -278,6 +279,24 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     motion = law.motion(parts.reference(t), parts.initial, wanted.error, wanted.error_rate, wanted.acceleration)
     d = parts.disturbance(t, motion.x)
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
+
+
+@partial(jax.jit, static_argnames="points")
+def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
+    """Targets (2 points,) and states of a second-order law's run: along the exact motion, then on the target itself."""
+    law = parts.controller
+    assert isinstance(law, SecondOrder)
+    share = jnp.linspace(0.0, 1.0, points)
+
+    def at(t: Scalar, moving: bool) -> tuple[Any, Any]:
+        target = parts.reference(t)
+        wanted = exact_error(t, law.t_f, law.eta, *_start(parts))
+        errors = (wanted.error, wanted.error_rate, wanted.acceleration)
+        return target, law.motion(target, parts.initial, *(e if moving else jnp.zeros_like(e) for e in errors)).x
+
+    early = jax.vmap(lambda t: at(t, True))(law.t_f - law.t_f * (law.delta / law.t_f) ** share)
+    late = jax.vmap(lambda t: at(t, False))(parts.t_end * share)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
 def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:

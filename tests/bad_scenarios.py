@@ -333,6 +333,11 @@ BAD = [
     (FINITE + "observer.gain = [1e-4, 1, 1]", "observer.gain is [0.0001", "controller.disturbance_rate_bound, 0.001"),
     (FINITE + "observer.gain = [1, 1]", "observer.gain is [1, 1]", "three numbers greater than 0"),
     (FINITE + "observer.sign_width = -1", "observer.sign_width is -1", "at least 0"),
+    (
+        FINITE + "tune = { free = ['observer_gain'], bounds = { observer_gain = [1e-4, 0.005] } }",
+        "tune.bounds.observer_gain is [0.0001, 0.005]",
+        "two numbers from 0.001",
+    ),
     (FINITE + "observer.mu = 2", "observer.mu is not a known key", "nearest"),
     (PRESCRIBED + "observer.t_o = 31", "observer.t_o is 31.0", "at most controller.t_f, 30.0"),
     (PRESCRIBED + "observer.delta_o = 11", "observer.delta_o is 11.0", "less than observer.t_o, 10.0"),

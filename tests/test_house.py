@@ -39,6 +39,7 @@ FLOORS = {
         attitude_keys
         checks
         build
+        pace
         scenario
         montecarlo runs
         store remark_2
@@ -84,6 +85,8 @@ def imported(source, package):
             base = [part for part in base if part]
             # `from package import module` names the module; `from package import name` the package itself
             names = [[*base, alias.name] if len(base) == 1 else base for alias in node.names]
+        elif ast.unparse(node) == "importlib.import_module(place)":
+            continue  # `systems`, what a user names
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
             assert isinstance(node.args[0], ast.Constant), "an import that cannot be read"
             names = [str(node.args[0].value).split(".")]

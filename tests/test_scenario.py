@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import clock, dispersions, schema, sensors, signals, store, tables
 from ptsmc_jax.attitude_keys import quaternion
-from ptsmc_jax.scenario import Reach, from_tables, read, replace, study
+from ptsmc_jax.pace import Reach
+from ptsmc_jax.scenario import from_tables, read, replace, study
 from ptsmc_jax.schema import ScenarioError
 from tests.bad_scenarios import BAD, ONE_KEY, SAMPLED
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector

@@ -1,6 +1,7 @@
 """Systems of one's own under law (29): the spacecraft and a two-link arm written as such, singular runs, files."""
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import attitude, controllers, observers, plants, rollout, scenario, signals, theory
+from ptsmc_jax import (
+    attitude,
+    controllers,
+    observers,
+    plants,
+    rollout,
+    scenario,
+    schema,
+    signals,
+    store,
+    systems,
+    theory,
+)
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FULL_INERTIA, ROOT, finer, parts, vector
@@ -222,8 +235,12 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         plants.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match="n is 0"):
         plants.system(0, F, F, G)
-    with pytest.raises(ValueError, match="inertia must be an invertible"):
-        plants.system(2, F, F, G, inertia=np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
+        plants.system(2, F, F, G, inertia=np.array([[1.0, 5.0], [0.0, 1.0]]))
+    with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
+        plants.system(2, F, F, G, inertia=-np.eye(2))
+    with pytest.raises(ValueError, match=r"^F\(t, x_1, x_2\) fails .*TracerBoolConversionError: [^\n]*$"):
+        plants.system(2, lambda t, a, b: b if a[0] > 0 else -b, F, G)
 
 
 @pytest.mark.parametrize(
@@ -277,3 +294,107 @@ def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_be
     one, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
     assert one.parts.plant is other.parts.plant  # one program for all its runs
     assert one.parts.plant.inputs == 2
+
+
+def study(system, x0, **tables):
+    return scenario.study(scenario.from_tables({"plant": {"kind": "system", "system": system, "x0": x0}, **tables}))
+
+
+def one(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(1), D=None):
+    return plants.system(1, F, H, G, D)
+
+
+def final(run):
+    return jax.tree.map(np.asarray, rollout.simulate_jit(run))
+
+
+@pytest.mark.parametrize("system", [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)])
+def test_steps_follow_the_modes_of_a_fast_plant(system):
+    loop = {"loop": {"mode": "sampled", "period": 0.05}, "controller": {"delta": 0.3, "disturbance_bound": 0.0}}
+    run = study(system, [1.0, 0.0], **loop).parts
+    ours, finer_steps = final(run), final(replace(run, substeps=8 * run.substeps))
+    for name in ("window_error", "peak_torque"):
+        np.testing.assert_allclose(getattr(ours.metrics, name), getattr(finer_steps.metrics, name), rtol=1e-3)
+    with pytest.raises(ScenarioError, match=r"^plant\.system is too fast.*would take more than 50 integration"):
+        study(one(H=lambda t, a, b: -1e4 * b), [1.0, 0.0], **loop)
+
+
+@pytest.mark.parametrize("w", [10.0, 20.0])
+def test_steps_follow_what_time_does_to_a_system(w):
+    system = one(F=lambda t, a, b: b - jnp.cos(w * t))
+    tables = {"controller": {"t_f": 30.0, "disturbance_bound": 0.0}}
+    run = study(system, [1.0, 0.0], **tables).parts
+    np.testing.assert_allclose(final(run).metrics.window_error, final(finer(run, 4)).metrics.window_error, rtol=0.02)
+
+
+def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
+    steep = {"controller": {"disturbance_bound": 1.0, "sign_width": 1e-2}}
+    with pytest.raises(ScenarioError, match=r"^controller\.sign_width is 0\.01, but must be larger"):
+        study(one(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)
+
+
+@pytest.mark.parametrize(
+    ("system", "x0", "singular"),
+    [
+        (plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5)),
+         [1.0, 0.2, 0.0, 0.0], True),
+        (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], True),
+        # the same plant, its first input in another unit
+        (plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]])),
+         [1.0, 0.2, 0.0, 0.0], False),
+    ],
+)  # fmt: skip
+def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, singular):
+    for mode in ("continuous", "sampled"):
+        run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
+        result = final(run)
+        assert (result.status == rollout.SINGULAR) == singular, mode
+
+
+def test_a_singular_matrix_at_the_start_is_refused_by_name():
+    with pytest.raises(ScenarioError, match=r"^plant\.system has a singular dF/dx2 G at t = 0 in plant\.x0"):
+        study(one(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
+    half = plants.system(
+        2,
+        lambda t, a, b: b,
+        lambda t, a, b: 0 * a,
+        lambda t, a, b: jnp.eye(2),
+        lambda t, a, b: jnp.diag(jnp.array([1.0, 0])),
+    )
+    with pytest.raises(ScenarioError, match=r'singular D .*observer\.kind = "nonlinear" must invert; .*"none"$'):
+        study(half, [1.0, 0.0, 0.0, 0.0], observer={"kind": "nonlinear"})
+    assert final(study(half, [1.0, 0.0, 0.0, 0.0]).parts).status == rollout.OK
+
+
+FILES = {
+    "future.py": "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+    "from pieces import F, H, G\nfrom ptsmc_jax.plants import system\n\n"
+    "@dataclass\nclass Numbers:\n    mass: float = 1.0\n\nmine = system(1, F, H, G)\n",
+    "pieces.py": "import jax.numpy as jnp\n\ndef F(t, a, b):\n    return b\n\ndef H(t, a, b):\n    return -a\n\n"
+    "def G(t, a, b):\n    return jnp.eye(1)\n",
+    "leaves.py": "import sys\nsys.exit(0)\n",
+    "broken.py": "def (\n",
+}
+
+
+def test_files_of_users_may_import_their_own_and_cannot_end_the_command(tmp_path):
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    assert systems.load(f"{tmp_path}/future.py:mine").inputs == 1
+    assert str(tmp_path) not in sys.path
+    for name, said in (("leaves.py", "SystemExit: 0"), ("broken.py", "SyntaxError: ")):
+        with pytest.raises(ValueError, match=rf"^running .*{name} fails: {said}[^\n]*$"):
+            systems.load(f"{tmp_path}/{name}:mine")
+    before = systems.source(f"{tmp_path}/future.py:mine")
+    (tmp_path / "future.py").write_text(FILES["future.py"] + "# changed\n")
+    assert systems.source(f"{tmp_path}/future.py:mine") != before
+    assert systems.source(spacecraft_as_system(SPIN)) == {}
+
+
+def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_read(tmp_path):
+    tables = {"plant": {"kind": "system", "system": spacecraft_as_system(SPIN), "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
+    made = scenario.from_tables(tables)
+    store.write_toml(tmp_path / "s.toml", schema.dump(made))
+    with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names no system'):
+        scenario.read(tmp_path / "s.toml")
+    assert store.previous(tmp_path, "tune", schema.dump(made), 0) is None

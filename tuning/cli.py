@@ -148,12 +148,13 @@ def tune(
     """
     key = _whole("--seed", seed)
     loaded, folder = _prepare(scenario, "tune", out)
-    from ptsmc_jax import schema, store
+    from ptsmc_jax import schema, store, systems
     from ptsmc_jax.scenario import replace, study
 
     if loaded.tune is None:
         loaded = replace(loaded, tune={})
-    done = None if force else store.previous(folder, "tune", schema.dump(loaded), key)
+    own = getattr(loaded.plant, "system", None)
+    done = None if force else store.previous(folder, "tune", schema.dump(loaded), key, **systems.source(own))
     if done is not None:
         if not quiet:
             _show_tuning(done, folder, "already done")

@@ -51,7 +51,7 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
         return float(_predicted(ready.parts, *starts, t_f))
 
     own = float(ready.parts.controller.t_f)
-    lowest = 1.05 * float(ready.parts.controller.delta)
+    lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
     rule = _smallest(predicted, limit, own, lowest, FARTHEST * own, CLOSE, 60)
     if rule is None:
         return ShortestTime(limit, None, None, len(trials))

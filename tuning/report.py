@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
-from ptsmc_jax import draws, metrics, montecarlo, plotting, schema, store, tables
+from ptsmc_jax import draws, metrics, montecarlo, plotting, schema, store, systems, tables
 from ptsmc_jax.montecarlo import Trials
+from ptsmc_jax.pace import Reach, reach_of
 from ptsmc_jax.requirements import Verdict
-from ptsmc_jax.scenario import Reach, Study, reach_of, replace, study
+from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
 from tuning.bounds import Bounds
@@ -172,10 +173,10 @@ def summary(tuning: Tuning, seed: int) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, seed: int, figures: bool) -> None:
     """Fill a result folder."""
-    names = _free(scenario)
+    names, source = _free(scenario), systems.source(getattr(scenario.plant, "system", None))
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
     store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
-    store.write_json(folder / "versions.json", store.versions("tune", seed))
+    store.write_json(folder / "versions.json", store.versions("tune", seed, **source))
     store.write_json(folder / "summary.json", summary(tuning, seed))
     over = [f"{m}_over_limit" for m in scenario.requirements]
     rows = [

@@ -1,0 +1,201 @@
+"""How fast things happen in a scenario, and the clock and steps that follow it."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import attitude_keys, build, checks, clock, observers, theory
+from ptsmc_jax import tables as t
+from ptsmc_jax.checks import MOST_STEPS
+from ptsmc_jax.laws import SecondOrder
+from ptsmc_jax.plants import System
+from ptsmc_jax.rollout import Parts
+from ptsmc_jax.schema import ScenarioError, wrong
+from ptsmc_jax.tables import Scenario
+
+MOST_SUBSTEPS = 50
+MOVING = 4  # steps a period at least where the torque changes within it
+_SMOOTHED = ("disturbance.frequency", "plant.system")
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far gains may move without another compilation: the clock's sizes are chosen for it."""
+
+    t_f: float  # largest [s]
+    delta: float  # largest [s]
+    smallest_delta: float  # [s]
+    gain: float  # smallest observer gain [N m s]; of no meaning without an observer
+    largest_gain: float
+    k1: float  # largest [1/s]
+    sign_width: float  # smallest
+
+
+def reach_of(scenario: Scenario) -> Reach:
+    """The reach of a scenario's own gains: none beyond them."""
+    table = scenario.controller
+    gains = getattr(scenario.observer, "gain", (0.0,))
+    return Reach(table.t_f, table.delta, table.delta, min(gains), max(gains), table.k1, table.sign_width)
+
+
+def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
+    """Clock for gains within `reach`, and integration steps a control period; saves: times that are nodes [s].
+
+    Raises ScenarioError where too many steps would be needed, naming what asks for them.
+    """
+    loop, frequencies, visited = scenario.loop, _frequencies(scenario), None
+    if isinstance(parts.plant, System):
+        visited = theory.visited(parts)
+        frequencies["plant.system"] = _fastest_of_system(parts, visited)
+    if loop.mode == "continuous":
+        if "plant.system" in frequencies:
+            frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
+        return _grid(scenario, reach, parts, saves, frequencies, visited), 1
+    assert loop.t_end is not None
+    substeps = _substeps(scenario, frequencies)
+    if loop.clock == "flight":
+        return clock.flight(loop.period, loop.t_end), substeps
+    late = loop.t_end - scenario.controller.t_f + reach.delta
+    return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
+
+
+def _frequencies(scenario: Scenario) -> dict[str, float]:
+    """How fast things happen [rad/s], by the key that says so."""
+    waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
+    found = {"disturbance.frequency": float(max(waves))}
+    if scenario.initial is not None:
+        found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate))
+        found |= _reference_frequencies(scenario.reference)
+        found["controller.eta"] = 2.0 * scenario.controller.eta / scenario.controller.t_f  # of the slew
+    return found
+
+
+def _reference_frequencies(table: Any) -> dict[str, float]:
+    """How fast the reference turns and changes [rad/s], by the key that says so."""
+    if isinstance(table, t.SpinReference):
+        return {"reference.rate": float(np.linalg.norm(table.rate))}
+    if isinstance(table, t.SinusoidReference):
+        turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
+        return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
+    if isinstance(table, t.SlewReference):  # largest rate of the quintic, and the motion's own time
+        turning = 1.875 * float(np.linalg.norm(attitude_keys.turn(table)))
+        return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
+    return {}
+
+
+def _fastest(frequencies: Mapping[str, float]) -> float:
+    """Highest angular frequency of the motion [rad/s]."""
+    others = sum(value for key, value in frequencies.items() if key != "disturbance.frequency")
+    return max(frequencies["disturbance.frequency"], others)
+
+
+def _substeps(scenario: Scenario, frequencies: Mapping[str, float]) -> int:
+    """Integration steps a control period: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
+
+    At 0.1 rad of a disturbance, or of a system of one's own, 1e-7 of what it does.
+    """
+    frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
+    needed = scenario.loop.period * _fastest(frequencies) / 0.025
+    if needed > MOST_SUBSTEPS:
+        asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
+        raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
+    moving = any(getattr(scenario.hardware, key, None) is not None for key in ("torque_rate_limit", "torque_lag"))
+    return max(MOVING if moving else 1, math.ceil(needed))
+
+
+def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
+    if key == "plant.system":
+        return ScenarioError(f"plant.system is too fast, in its own modes or in time: {asks}")
+    table, _, name = key.partition(".")
+    if key == "controller.eta":  # over a short t_f
+        asks += f" at controller.t_f = {scenario.controller.t_f}"
+    value = getattr(getattr(scenario, table), name, None)
+    if value is None:  # of a term in a sum
+        value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
+    return wrong(key, value, f"{'longer' if key == 'reference.duration' else 'lower'}: {asks}")
+
+
+@jax.jit  # one program, where each of its operations would be one
+def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
+    """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
+    return controller.boundary_layer(observer.error_bound().largest, visited)
+
+
+@jax.jit
+def _rates_of_system(parts: Parts, visited: tuple) -> tuple:
+    """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
+    plant, law = parts.plant, parts.controller
+    assert isinstance(plant, System)
+    assert isinstance(law, SecondOrder)
+    none = jnp.zeros(plant.inputs)
+
+    def jacobian(t: Any, x: Any) -> Any:
+        u = law.invert(x, t, none, none)
+        return plant.jacobian(t, x, u)
+
+    def along(t: Any) -> Any:
+        return law.motion(t, parts.initial, none, none, none).w_dot
+
+    times = parts.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
+    steady = jax.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
+    return jax.vmap(jacobian)(*visited), steady
+
+
+def _fastest_of_system(parts: Parts, visited: tuple) -> float:
+    """Fastest rate of a system of one's own along its run [rad/s]: of its modes, and of what time does to it."""
+    jacobians, (acceleration, change) = _rates_of_system(parts, visited)
+    matrices = np.asarray(jacobians)
+    modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
+    size, quick = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, change))
+    return float(max(modes, quick / size if size > 1e-12 else 0.0))
+
+
+def _with_gain(observer: Any, gain: float) -> Any:
+    return dataclasses.replace(observer, gain=jnp.full_like(observer.gain, gain))
+
+
+def _grid(
+    scenario: Scenario, reach: Reach, parts: Parts, saves: object, frequencies: Mapping[str, float], visited: Any
+) -> clock.Graded:
+    """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
+    loop = scenario.loop
+    t_end = loop.t_end
+    assert t_end is not None
+    controller, observer, resolved = parts.controller, parts.observer, 0.0
+    saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
+    if not isinstance(observer, observers.NoObserver):  # K2 is largest with the smallest gain
+        resolved = _with_gain(observer, reach.largest_gain).fastest()
+        observer = _with_gain(observer, reach.gain)
+    widest = dataclasses.replace(
+        controller, t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
+    )
+    layer = (0.0, 0.0)
+    if reach.sign_width > 0.0:
+        before, after = _boundary_layer(widest, observer, visited)
+        layer = (float(before), float(after))
+    layer = (max(layer[0], resolved), max(layer[1], resolved))
+    rate, frequency = widest.hold_rate(), _fastest(frequencies)
+    order = 1 if isinstance(scenario.plant, t.SpacecraftPlant) else controller.order
+
+    def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0)) -> float:
+        taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
+        return taken if taken == taken else math.inf
+
+    needed = steps(frequency, layer)
+    if not needed <= MOST_STEPS:
+        asks = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
+        by_key = {key: steps(value) for key, value in frequencies.items()}
+        by_key["controller.sign_width"] = steps(layer=layer)
+        worst = max(by_key, key=lambda key: by_key[key])
+        if by_key[worst] <= steps() * 1.5:
+            raise wrong("loop.t_end", t_end, f"earlier: {asks}")
+        if worst == "controller.sign_width":
+            raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
+        raise _lower(scenario, worst, asks)
+    return clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
