@@ -37,6 +37,12 @@ _EXPORTS = {
     "Requirement": "requirements",
     "Scenario": "tables",
     "ScenarioError": "schema",
+    "PrescribedTimeMultiplicative": "controllers",
+    "PrescribedTimeSystem": "controllers",
+    "FiniteTimeObserver": "observers",
+    "PrescribedTimeObserver": "observers",
+    "System": "plants",
+    "system": "plants",
     "Study": "scenario",
     "study": "scenario",
 }
@@ -44,15 +50,21 @@ _EXPORTS = {
 if TYPE_CHECKING:
     from ptsmc_jax.controllers import PrescribedTime as PrescribedTime
     from ptsmc_jax.controllers import PrescribedTimeChain as PrescribedTimeChain
+    from ptsmc_jax.controllers import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
+    from ptsmc_jax.controllers import PrescribedTimeSystem as PrescribedTimeSystem
     from ptsmc_jax.dispersions import Dispersion as Dispersion
     from ptsmc_jax.metrics import Metrics as Metrics
+    from ptsmc_jax.observers import FiniteTimeObserver as FiniteTimeObserver
     from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
     from ptsmc_jax.observers import NoObserver as NoObserver
+    from ptsmc_jax.observers import PrescribedTimeObserver as PrescribedTimeObserver
     from ptsmc_jax.plants import AttitudeState as AttitudeState
     from ptsmc_jax.plants import Chain as Chain
     from ptsmc_jax.plants import Spacecraft as Spacecraft
+    from ptsmc_jax.plants import System as System
     from ptsmc_jax.plants import chain as chain
     from ptsmc_jax.plants import spacecraft as spacecraft
+    from ptsmc_jax.plants import system as system
     from ptsmc_jax.requirements import Requirement as Requirement
     from ptsmc_jax.rollout import STATUS as STATUS
     from ptsmc_jax.rollout import Parts as Parts

@@ -139,7 +139,8 @@ def _check_reference(scenario: Scenario, parts: Parts) -> None:
         when = float(grid[int(np.argmax(np.sign(held) != np.sign(held[0])))]) if crosses else float(grid[worst])
         raise ScenarioError(
             f"reference.kind is {schema.show(scenario.reference.kind)}, but its attitude reaches {_SINGULAR}, "
-            f"at t = {when:.4g} s; allowed is a reference that stays away from it until t_end"
+            f"at t = {when:.4g} s; allowed is a reference that stays away from it until t_end, "
+            'or controller.error = "multiplicative"'
         )
 
 
