@@ -1,5 +1,8 @@
 """Strictness for the tests alone: 64 bit, two host devices, no silent rank promotion, shapes checked at run time."""
 
+from pathlib import Path
+
+import pytest
 from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
@@ -10,3 +13,14 @@ import jax  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 hook = install_import_hook(["ptsmc_jax", "tuning"], "beartype.beartype")
+
+MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _room_for_compiled_programs():
+    """A process that keeps every program it ever compiled is ended by the kernel after some 500 of them."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
+        jax.clear_caches()
