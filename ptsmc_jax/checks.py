@@ -43,7 +43,8 @@ def resolve(scenario: Scenario) -> Scenario:
         if free is None:
             free = ("eta", "delta", "observer_gain") if _has_gain(scenario) else ("eta", "delta")
         bounds = {**{key: default[key] for key in free if key in default}, **tune.bounds}
-        tune = msgspec.structs.replace(tune, free=free, bounds=bounds)
+        level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
+        tune = msgspec.structs.replace(tune, free=free, bounds=bounds, level=level)
     dispersion = scenario.dispersion
     if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
         key = _spread(dispersion.x0)
@@ -126,14 +127,11 @@ def _check_available(scenario: Scenario) -> None:
                 other = "x0" if isinstance(scenario.dispersion, tables.StateDispersion) else "attitude"
                 refuse(f"dispersion.{key}", msgspec.to_builtins(value), other)
     for key, value in scenario.requirements.items():
-        if isinstance(value, tables.Limit) and (value.quantile is not None or value.confidence is not None):
-            given = {k: v for k, v in msgspec.to_builtins(value).items() if v is not None}
-            refuse(f"requirements.{key}", given, "a number, which holds for every trial")
+        if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
+            raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
     tune = scenario.tune
     if tune is not None:
-        if tune.objective != "rms":
-            refuse("tune.objective", tune.objective, '"rms"')
-        if tune.level is not None:
+        if tune.level is not None and tune.objective != "cvar":
             raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
         if any(gain not in tables.TUNED for gain in tune.free or ()):
             refuse("tune.free", tune.free, ", ".join(tables.TUNED))

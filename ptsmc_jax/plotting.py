@@ -221,9 +221,14 @@ def _names(parts: Parts) -> tuple[str, str, str]:
 
 
 def tuning_history(
-    names: Sequence[str], units: Sequence[str], gains: np.ndarray, rms: np.ndarray, admissible: np.ndarray
+    names: Sequence[str],
+    units: Sequence[str],
+    gains: np.ndarray,
+    rms: np.ndarray,
+    admissible: np.ndarray,
+    objective: str = "RMS",
 ) -> Figure:
-    """Search of all starts: RMS window error and gains over the steps.
+    """Search of all starts: window error and gains over the steps.
 
     gains (steps, starts, gains), rms (steps, starts), admissible (steps, starts) bool: every requirement met.
     """
@@ -237,7 +242,7 @@ def tuning_history(
             axes[0].semilogy(steps, met, color=_STYLES[0][0])
         axes[0].plot([], [], color=_STYLES[0][0], label="requirements met")
         axes[0].plot([], [], color="0.75", label="beyond a limit")
-        axes[0].set(ylabel="RMS window\nerror [-]", title="Tuning, all starts")
+        axes[0].set(ylabel=f"{objective} window\nerror [-]", title="Tuning, all starts")
         axes[0].legend(ncols=2)
         for k, (name, unit) in enumerate(zip(names, units, strict=True)):
             for start in range(rms.shape[1]):

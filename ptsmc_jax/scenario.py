@@ -103,7 +103,9 @@ def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = Non
         _check_start(scenario, parts)
     units = metrics.CATALOGUES[scenario.plant.kind]
     requirements = tuple(
-        Requirement(name, value.limit if isinstance(value, t.Limit) else float(value), units[name][0])
+        Requirement(name, value.limit, units[name][0], value.quantile, value.confidence)
+        if isinstance(value, t.Limit)
+        else Requirement(name, float(value), units[name][0])
         for name, value in scenario.requirements.items()
     )
     return Study(scenario, parts, dispersion, requirements)

@@ -368,7 +368,6 @@ BAD = [
         "requirements.effort = { limit = 9.0, confidence = 0.9 }",
         NOT_YET + "a number",
     ),
-    ("tune.objective = 'worst'", 'tune.objective = "worst"', NOT_YET + '"rms"'),
-    ("tune = { objective = 'cvar', level = 0.9 }", 'tune.objective = "cvar"', NOT_YET + '"rms"'),
+    ("tune = { objective = 'worst', level = 0.9 }", "tune.level is 0.9", 'tune.objective = "cvar" only'),
     ("tune.free = ['t_f']", 'tune.free = ["t_f"]', NOT_YET + "eta, delta, observer_gain, k1, sign_width"),
 ]

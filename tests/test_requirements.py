@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binom
 
 from ptsmc_jax.metrics import CATALOGUE
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.requirements import Requirement, fewest_trials, least_within
 
 LIMIT = 0.5
 BEYOND = np.nextafter(LIMIT, 1.0)
@@ -66,3 +67,74 @@ def test_a_verdict_in_words():
     lost = str(verdict([0.1, 0.2], [False, True]))
     assert lost == "peak_torque at most 0.5 N m: no worst value: NOT met in 1 of 2 trials"
     assert str(verdict([0.1], metric="saturated")) == "saturated at most 0.5: 0.1: met"
+
+
+@pytest.mark.parametrize("quantile", [0.5, 0.9, 0.99, 0.9973])
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("trials", [10, 100, 1000, 5000])
+def test_a_share_is_shown_when_chance_alone_would_seldom_show_it(quantile, confidence, trials):
+    """The definition by the binomial distribution: were the true share no better, at most 1 - confidence of campaigns
+    would see as many trials within the limit; one trial fewer would not be enough."""
+    least = least_within(trials, quantile, confidence)
+    if least is None:
+        assert trials < fewest_trials(quantile, confidence)
+        assert quantile**trials > 1 - confidence  # not even all of them would do
+        return
+    assert binom.sf(least - 1, trials, quantile) <= (1 - confidence) * (1 + 1e-9)
+    assert binom.sf(least - 2, trials, quantile) > 1 - confidence
+    assert trials >= fewest_trials(quantile, confidence)
+
+
+def test_the_usual_three_sigma_requirement_takes_852_trials():
+    assert fewest_trials(0.9973, 0.9) == 852
+    assert least_within(852, 0.9973, 0.9) == 852
+    assert least_within(851, 0.9973, 0.9) is None
+    assert least_within(1000, 0.9973, None) == 998  # what is seen, with no confidence
+    assert least_within(1000, None, None) == 1000
+
+
+@pytest.mark.parametrize(("beyond", "quantile", "confidence", "met"), [
+    (0, None, None, True), (1, None, None, False),
+    (10, 0.99, None, True), (11, 0.99, None, False),
+    (5, 0.99, 0.9, True), (6, 0.99, 0.9, False),
+    (0, 0.9999, 0.9, False),
+])  # fmt: skip
+def test_a_requirement_on_a_share_of_the_trials(beyond, quantile, confidence, met):
+    values = np.linspace(0.1, LIMIT, 1000)
+    values[:beyond] = BEYOND + np.arange(beyond) * 0.01
+    told = Requirement("peak_torque", LIMIT, None, quantile, confidence).verdict(values, np.ones(1000, bool))
+    assert (told.met, told.failures) == (met, beyond)
+    if np.isfinite(told.margin):  # the margin is the factor on the limit that would just do
+        for factor, does in ((1.0, True), (1.0 - 1e-9, False)):
+            moved = Requirement("peak_torque", LIMIT * told.margin * factor, None, quantile, confidence)
+            assert moved.verdict(values, np.ones(1000, bool)).met == does
+        assert (told.margin <= 1.0) == met
+    else:
+        assert least_within(1000, quantile, confidence) is None
+
+
+def test_trials_that_failed_use_up_what_a_share_allows():
+    values, ok = np.full(100, 0.1), np.ones(100, bool)
+    ok[:11] = False
+    told = Requirement("peak_torque", LIMIT, None, 0.9).verdict(values, ok)
+    assert (told.met, told.failures, told.margin) == (False, 11, np.inf)
+
+
+def test_a_single_run_is_judged_by_the_limit_alone():
+    told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.asarray(0.4), np.asarray(True))
+    assert told.met
+    assert str(told) == "peak_torque at most 0.5 N m: 0.4: met"
+
+
+def test_a_share_in_words():
+    values = np.linspace(0.1, 0.4, 1000)
+    share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)
+    said = "peak_torque at most 0.5 N m in 99 % of trials with 90 % confidence: worst"
+    ok = np.ones(1000, bool)
+    assert str(share.verdict(values, ok)) == f"{said} 0.4: met"
+    values[:3] = 0.6
+    assert str(share.verdict(values, ok)) == f"{said} 0.6: met, beyond it 3 of 1000 trials"
+    values[:9] = 0.6
+    assert str(share.verdict(values, ok)) == f"{said} 0.6: NOT met in 9 of 1000 trials, at most 5 allowed"
+    few = str(share.verdict(values[:50], ok[:50]))
+    assert few == f"{said} 0.6: NOT shown, which takes at least 230 trials"

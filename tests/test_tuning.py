@@ -114,6 +114,68 @@ def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
     np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
 
 
+@pytest.mark.parametrize("tail", [1, 3, 8])
+def test_the_tail_is_the_mean_of_the_worst(tail):
+    some = replace(problem(), tail=tail)
+    f, _ = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
+    worst = np.sort(flown.metrics.window_error)[-tail:]
+    np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
+
+
+@pytest.mark.parametrize("least", [1, 5, 8])
+def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
+    """The largest c is that order statistic of the averaged trials; harder trials that were added do not count."""
+    some = problem(peak_torque=0.7, effort=5.0)
+    some = replace(some, trials=jnp.arange(11, dtype=jnp.uint32), least=(least, None))
+    _, c = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
+    expected = np.sort(flown.metrics.peak_torque[:8])[least - 1] / 0.7 - 1
+    np.testing.assert_allclose(c[0].max(), expected, rtol=1e-10)
+    np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
+
+
+def test_slopes_of_tail_and_share_agree_with_central_differences():
+    some = replace(problem(peak_torque=0.7), tail=2, least=(6,))
+
+    @jax.jit
+    def value(gains):
+        f, c = objective.measure(some, gains)
+        return jnp.stack([f, c.max()])
+
+    at = np.array([3.1, 0.73])
+    exact = np.asarray(jax.jit(jax.jacfwd(value))(jnp.asarray(at)))
+    for k in range(2):
+        for row in range(2):
+            numeric = central(lambda g, row=row: value(g)[row], at, k, 1e-4)
+            np.testing.assert_allclose(exact[row, k], numeric, rtol=1e-4, atol=1e-6)
+
+
+def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
+    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    largest = {}
+    for tail in (None, 1):
+        some = replace(problem(), tail=tail)
+        found = optimise.search(some, limits, (), np.array([3.0, 0.5]), 2, 25, 1)
+        f, _ = objective.measure(replace(some, tail=1), jnp.asarray(found.gains))
+        largest[tail] = float(np.exp(f))
+    assert largest[1] <= largest[None] * (1 + 1e-6)
+
+
+def test_requirements_and_objective_of_a_scenario_reach_the_problem():
+    share = Requirement("peak_torque", 0.5, None, 0.9, None)
+    sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
+    assert [report._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
+    assert report._fresh_trials([share]) == report.FRESH
+    assert report._fresh_trials([share, sure]) == 2 * 852
+    tables = {"rms": None, "worst": 1, "cvar": 6}
+    for kind, tail in tables.items():
+        table = scenario.from_tables({"tune": {"objective": kind}}).tune
+        assert table is not None
+        assert report._tail(table, 64) == tail
+
+
 def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
     some = problem(peak_torque=0.7)
     near = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))

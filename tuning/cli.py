@@ -123,7 +123,7 @@ def map_(
         raise UsageError(str(error)) from None
     if across.key == up.key:
         raise UsageError(f"--y is {y}, but must be another key than --x")
-    with _Progress(quiet) as told:
+    with _Progress(quiet, "RMS") as told:
         cells = mapping.fly(loaded, across, up, key, count, lambda done, total: told(done, total, float("nan"), True))
     store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, key, figures))
     if not quiet:
@@ -163,7 +163,7 @@ def tune(
     study(loaded)  # what it refuses, it refuses before the search
     from tuning import report
 
-    with _Progress(quiet) as told:
+    with _Progress(quiet, report.OBJECTIVES[loaded.tune.objective]) as told:  # pyright: ignore[reportOptionalMemberAccess]
         result: Tuning = report.tune(loaded, key, told)
     store.write(folder, lambda making: report.write(making, loaded, result, key, figures))
     if not quiet:
@@ -225,10 +225,11 @@ def _prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Sc
 class _Progress:
     """A progress bar on the error stream with the best error so far; silent where told to be."""
 
-    def __init__(self, quiet: bool):
+    def __init__(self, quiet: bool, objective: str):
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+        self._objective = objective
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(30),
@@ -249,7 +250,7 @@ class _Progress:
 
     def _tell(self, done: int, total: int, rms: float, admissible: bool) -> None:
         met = "limits met" if admissible else "limits not yet met"
-        best = f"RMS error {rms:.3e}, {met}" if rms == rms else "flying"
+        best = f"{self._objective} error {rms:.3e}, {met}" if rms == rms else "flying"
         self._bar.update(self._task, completed=done, total=total, description=best)
 
 
@@ -332,15 +333,26 @@ def _show_tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
         cells = (group[metric][statistic] if group[metric] else None for group in groups.values())
         table.add_row(label, *("-" if cell is None else f"{cell:.4g}" for cell in cells), CATALOGUES[kind][metric][0])
     table.add_row("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), "")
-    console.print(f"tuning {how}; judged on {trials} fresh trials, flight clock, exact sign:", soft_wrap=True)
+    console.print(
+        f"tuning {how}; judged on {trials} fresh trials, {summary.get('judged_on', 'flight clock, exact sign')}:",
+        soft_wrap=True,
+    )
     console.print(table)
     if summary["accuracy_gain_over_paper"] is not None:
         console.print(f"accuracy: {summary['accuracy_gain_over_paper']:.1f} times the paper's gains'")
     for gain, side in summary["at_bound"].items():
         console.print(f"{gain} ended on its {side} bound", soft_wrap=True)
+    for metric, ratio in summary["search"].get("largest_over_limit", {}).items():
+        if ratio > 1.0:
+            said = f"no gains found within the bounds keep {metric}: at best {ratio:.3g} times its limit in training"
+            console.print(said, soft_wrap=True)
     for verdict in summary["verdicts"]:
-        fields = ("metric", "limit", "unit", "worst", "failures", "trials")
-        console.print(verdict_text(*(verdict[field] for field in fields)), soft_wrap=True)
+        fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
+        console.print(verdict_text(*(verdict.get(field) for field in fields)), soft_wrap=True)
+    off = summary["search"].get("slopes_off_central_differences")
+    if off is not None:
+        shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items() if value is not None)
+        console.print(f"slopes by automatic differentiation agree with differences to {shown}", soft_wrap=True)
     shortest = summary.get("shortest_t_f")
     if shortest is not None:
         console.print(design.text(shortest["limit"], shortest["theory"], shortest["simulated"]), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""What is minimised: log of the RMS window error over the training trials, requirements as constraints per trial."""
+"""What is minimised: the window error over the training trials, with requirements as constraints per trial."""
 
 from dataclasses import dataclass, field
 
@@ -28,12 +28,17 @@ class Problem:
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
+    # of the averaged trials, how many must keep each limit; None: every trial must
+    least: tuple[int | None, ...] = field(default=(), metadata={"static": True})
+    tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array]:
     """F = ln RMS window error [-] and c = metric / limit - 1, (requirements, trials): met where c <= 0.
 
-    A trial that fails counts with a window error of `FAILED`, and as that many times over its limits.
+    The RMS is over the averaged trials, or the `tail` worst of them: CVaR, or with one the worst case. Where only some
+    must keep a limit, c of the others is cut down to that of the last one that must. A trial that fails counts with a
+    window error of `FAILED`, and as that many times over its limits.
     """
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
 
@@ -48,4 +53,19 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
         return error, jnp.stack(over) if over else jnp.zeros(0)
 
     errors, over = montecarlo.blocks(fly, problem.trials)
-    return 0.5 * jnp.log(jnp.mean(errors[: problem.averaged] ** 2)), over.T
+    squares = errors[: problem.averaged] ** 2
+    if problem.tail is not None:
+        squares = jax.lax.top_k(squares, problem.tail)[0]
+    rows = [
+        row if least is None else _cut(row, least, problem.averaged)
+        for row, least in zip(over.T, problem.least or (None,) * len(problem.metrics), strict=True)
+    ]
+    constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
+    return 0.5 * jnp.log(jnp.mean(squares)), constraints
+
+
+def _cut(over: Float[Array, " trials"], least: int, averaged: int) -> Float[Array, " trials"]:
+    """Cut off above the `least`-th smallest of the averaged trials; the trials added to them say nothing of a share."""
+    first = over[:averaged]
+    allowed = -jax.lax.top_k(-first, least)[0][-1]
+    return jnp.concatenate([jnp.minimum(first, allowed), jnp.full(over.shape[0] - averaged, -1.0)])

@@ -33,6 +33,8 @@ CHARGE, APART = 3.0, 0.15
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
 SCREENED = 4096  # trials looked through for those that a limit depends on
 HARDEST = 8  # of them that join the constraints
+DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
+FLAT = 1e-6  # slopes of the log error below this are none
 ROUNDS = 2  # searches again with hardest trials added, at most
 
 
@@ -55,6 +57,7 @@ class Search:
     history: list[Step]
     dropped: list[int]  # starts that met a number that is not finite
     rounds: int  # searches again with harder trials
+    slope_error: tuple[float, float]  # of the objective's slopes at the first start and at the end, see `slope_error`
     trials: np.ndarray  # training trials and the hardest ones
 
 
@@ -92,23 +95,41 @@ def search(
     seed: int,
     report: Callable[[int, int, float, bool], None] = lambda done, total, rms, admissible: None,
 ) -> Search:
-    """Minimise the RMS window error with every requirement met on every training trial.
+    """Minimise the window error with every requirement met on the training trials.
 
     A limit on the worst case hangs on the few hardest trials, which a training set need not hold: the hardest of
     `SCREENED` further ones join the constraints first, and again after a search whose gains some of them still break.
     own: (gains,) the scenario's gains, the first start. report(steps done, in all, best RMS, admissible) is called
     after every step.
     """
+    requirements = tuple(r for r in requirements if r.quantile is None)  # those that hang on the hardest trials
     problem = _add_hardest(problem, requirements, np.asarray(bounds.gains(jnp.zeros(len(bounds.names)))))
     z = starting_points(problem, bounds, own, starts, seed)
     found = _descend(problem, bounds, z, steps, report)
-    rounds = 0
+    rounds, checked = 0, slope_error(problem, bounds, z[0], len(z))
     while requirements and rounds < ROUNDS and not _holds(problem, requirements, found.gains):
         rounds += 1
         problem = _add_hardest(problem, requirements, found.gains)
         again = _descend(problem, bounds, bounds.free(found.gains, edge=1e-6)[None], max(20, steps // 3), report)
         found = replace(again, history=[*found.history, *again.history], dropped=found.dropped, rounds=rounds)
-    return found
+    end = bounds.free(found.gains, edge=1e-6)
+    return replace(found, slope_error=(checked, slope_error(problem, bounds, end, len(z))))
+
+
+def slope_error(problem: Problem, bounds: Bounds, z: np.ndarray, batch: int) -> float:
+    """Largest difference of the objective's slopes, by automatic differentiation, from central differences.
+
+    Over the largest slope, in the free reals; differences of order 4 over +-`DIFFERENCE`. batch: points flown at once.
+    """
+    count = z.size
+    offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
+    points = np.concatenate([z[None], z + offsets])
+    points = np.resize(points, (-(-len(points) // batch) * batch, count))
+    flown = [_evaluate(problem, bounds, points[k : k + batch]) for k in range(0, len(points), batch)]
+    f = np.concatenate([f for _, f, *_ in flown])[1 : 1 + 4 * count].reshape(4, count)
+    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
+    exact = flown[0][3][0]
+    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), FLAT))
 
 
 def _screen(problem: Problem, requirements, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,7 +207,8 @@ def _descend(problem: Problem, bounds: Bounds, z: np.ndarray, steps: int, report
     gains, f, c, _, _ = _evaluate(tightened, bounds, best.z[chosen : chosen + 1])
     worst = (c[0].max(axis=1, initial=-1.0) + 1.0) * (1.0 - MARGIN)
     dropped = np.flatnonzero(~alive).tolist()
-    return Search(gains[0], float(np.exp(f[0])), worst, history, dropped, 0, np.asarray(problem.trials))
+    unchecked = (np.nan, np.nan)
+    return Search(gains[0], float(np.exp(f[0])), worst, history, dropped, 0, unchecked, np.asarray(problem.trials))
 
 
 def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:

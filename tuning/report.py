@@ -1,6 +1,6 @@
 """What a tuning run hands its user: gains judged on fresh trials beside the paper's and the scenario's own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from ptsmc_jax import draws, metrics, montecarlo, plotting, schema, store, systems, tables
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
-from ptsmc_jax.requirements import Verdict
+from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_within
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
@@ -22,6 +22,7 @@ from tuning.objective import Problem
 from tuning.optimise import Search, search
 
 FRESH = 1000  # trials on which gains are judged
+OBJECTIVES = {"rms": "RMS", "worst": "largest", "cvar": "CVaR of"}  # window error, in words
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
 
 
@@ -37,12 +38,13 @@ class Tuning:
     fresh: dict[str, Trials]  # by whose gains: "tuned", "paper" and, where they differ from it, "before"
     fresh_seed: int
     judged_gains: dict[str, dict[str, float]]  # the gains of each of them
+    limits: tuple[str, ...]  # metrics with a requirement, in the order of the search's
     verdicts: list[Verdict]  # of the tuned gains on the fresh trials
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
 
     @property
     def met(self) -> bool:
-        """Every requirement met on every fresh trial, and no fresh trial failed."""
+        """Every requirement met on the fresh trials, and no fresh trial failed."""
         return all(v.met for v in self.verdicts) and bool(np.all(self.fresh["tuned"].ok))
 
 
@@ -54,15 +56,18 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
     limits = Bounds(table.free, *(tuple(table.bounds[name][k] for name in table.free) for k in (0, 1)))
     ready = study(scenario, reach=_reach(scenario, table))
     own = gain_bounds.gains_of(ready.parts)
+    trained = _trials(ready, table.trials)
     problem = Problem(
         parts=ready.parts,
         dispersion=ready.dispersion,
         seed=jnp.uint32(seed),
-        trials=jnp.arange(_trials(ready, table.trials), dtype=jnp.uint32),
+        trials=jnp.arange(trained, dtype=jnp.uint32),
         limits=jnp.asarray([r.limit for r in ready.requirements]),
-        averaged=_trials(ready, table.trials),
+        averaged=trained,
         names=table.free,
         metrics=tuple(r.metric for r in ready.requirements),
+        least=tuple(_least(r, trained) for r in ready.requirements),
+        tail=_tail(table, trained),
     )
     start = np.asarray([own[name] for name in table.free])
     found = search(problem, limits, ready.requirements, start, table.starts, table.steps, seed, report)
@@ -80,7 +85,7 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
     fresh, judged_gains = {}, {}
     for name, candidate in candidates.items():
         flown = study(as_flown(candidate))
-        trials = np.arange(_trials(flown, FRESH))
+        trials = np.arange(_trials(flown, _fresh_trials(ready.requirements)))
         fresh[name] = montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
         judged_gains[name] = gain_bounds.gains_of(study(candidate).parts)
     verdicts = [
@@ -89,7 +94,8 @@ def tune(scenario: Scenario, seed: int, report: Callable[[int, int, float, bool]
     at_bound = limits.at_bound(found.gains)
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None if limit is None else shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
-    return Tuning(tuned, gains, found, at_bound, training, fresh, fresh_seed, judged_gains, verdicts, shortest)
+    limited = problem.metrics
+    return Tuning(tuned, gains, found, at_bound, training, fresh, fresh_seed, judged_gains, limited, verdicts, shortest)
 
 
 def paper_gains(scenario: Scenario) -> dict[str, float]:
@@ -161,11 +167,15 @@ def summary(tuning: Tuning, seed: int) -> dict[str, Any]:
         **({"before": {"seed": tuning.fresh_seed, **groups["before"]}} if "before" in groups else {}),
         "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
+        "judged_on": "flight clock, exact sign" if tuning.tuned.loop.mode == "sampled" else "the continuous loop",
         "search": {
+            "objective": _objective(tuning.tuned),
             "starts": int(tuning.search.history[0].rms.size),
             "steps": len(tuning.search.history) - 1,
             "rounds_with_harder_trials": tuning.search.rounds,
             "dropped_starts": tuning.search.dropped,
+            "largest_over_limit": dict(zip(tuning.limits, tuning.search.worst.tolist(), strict=True)),
+            "slopes_off_central_differences": dict(zip(("start", "end"), tuning.search.slope_error, strict=True)),
             "trials": tuning.search.trials.tolist(),
         },
     }
@@ -184,7 +194,9 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, seed: int, figures: 
         for step, row in enumerate(tuning.search.history)
         for start in range(row.rms.size)
     ]
-    store.write_csv(folder / "history.csv", ["step", "start", "rms_window_error", *names, *over], rows)
+    store.write_csv(
+        folder / "history.csv", ["step", "start", f"{_objective(scenario)}_window_error", *names, *over], rows
+    )
     if figures:
         plotting.save(_figures(scenario, tuning), folder / "figures")
 
@@ -200,6 +212,7 @@ def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
             np.stack([step.gains for step in history]),
             np.stack([step.rms for step in history]),
             np.stack([np.all(step.worst <= 1.0, axis=1) for step in history]),
+            OBJECTIVES[_objective(scenario)],
         ),
         "tradeoff": plotting.tradeoff(
             {
@@ -216,6 +229,11 @@ def _free(scenario: Scenario) -> tuple[str, ...]:
     assert scenario.tune is not None
     assert scenario.tune.free is not None  # a checked scenario names them
     return scenario.tune.free
+
+
+def _objective(scenario: Scenario) -> str:
+    assert scenario.tune is not None
+    return scenario.tune.objective
 
 
 def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
@@ -235,6 +253,27 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
         k1=interval("k1", own.k1)[1],
         sign_width=interval("sign_width", own.sign_width)[0],
     )
+
+
+def _least(requirement: Requirement, trials: int) -> int | None:
+    """How many training trials must keep a limit: too few to show a quantile, all of them."""
+    if requirement.quantile is None:
+        return None
+    return least_within(trials, requirement.quantile, requirement.confidence) or trials
+
+
+def _tail(table: tables.Tune, trials: int) -> int | None:
+    """How many of the worst training trials are averaged."""
+    if table.objective == "rms":
+        return None
+    assert table.level is not None or table.objective == "worst"
+    return 1 if table.level is None else max(1, round((1.0 - table.level) * trials))
+
+
+def _fresh_trials(requirements: Sequence[Requirement]) -> int:
+    """Fresh trials: enough to show every quantile that is asked for, with some beyond the limit."""
+    needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
+    return max([FRESH, *(2 * count for count in needed)])
 
 
 def _trials(ready: Study, wanted: int) -> int:
