@@ -42,7 +42,7 @@ def previous(
     """The summary of the same scenario, seed, command and what else `versions` was told; None if there is none."""
     try:
         made = json.loads((folder / "versions.json").read_text())
-        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(_plain(scenario)))
+        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(_named(scenario)))
         wanted = {"command": command, "seed": seed, **others}
         if same and all(made.get(key) == value for key, value in wanted.items()):
             return json.loads((folder / "summary.json").read_text())
@@ -85,7 +85,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
 
 def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
     """A TOML file, arrays on one line."""
-    text, before = tomli_w.dumps(_plain(tables)), ""
+    text, before = tomli_w.dumps(_named(tables)), ""
     while text != before:  # innermost arrays first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
     path.write_text(text, encoding="utf-8")
@@ -117,6 +117,13 @@ def _plain(value: Any) -> Any:
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return f"<{type(value).__name__} made in Python>"  # which no file can hold, and which reading refuses
+    return value
+
+
+def _named(value: Any) -> Any:
+    """Tables whose objects made in Python, which no file can hold, are named; reading refuses such a name."""
+    if isinstance(value, Mapping):
+        return {k: _named(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_named(v) for v in value]
+    return value if isinstance(value, bool | int | float | str) else f"<{type(value).__name__} made in Python>"

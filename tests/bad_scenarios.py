@@ -359,14 +359,9 @@ BAD = [
         for key in ("rate", "inertia", "disturbance_phase")
     ),
     (
-        "requirements.effort = { limit = 9.0, quantile = 0.9 }",
-        "requirements.effort = { limit = 9.0",
-        NOT_YET + "a number",
-    ),
-    (
         "requirements.effort = { limit = 9.0, confidence = 0.9 }",
-        "requirements.effort = { limit = 9.0, confidence = 0.9 }",
-        NOT_YET + "a number",
+        "requirements.effort.confidence is 0.9",
+        "goes with a quantile only",
     ),
     ("tune = { objective = 'worst', level = 0.9 }", "tune.level is 0.9", 'tune.objective = "cvar" only'),
     ("tune.free = ['t_f']", 'tune.free = ["t_f"]', NOT_YET + "eta, delta, observer_gain, k1, sign_width"),

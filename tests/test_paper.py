@@ -122,7 +122,10 @@ def test_remark_2_is_measured_as_theory_says(made):
         # the exact sign jumps by 2 |T J^-1| K2 of 2 eps'' at most, through J, in each period
         most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * bound / 0.05
         assert 0.05 * most < exact.chattering < most
-    assert by["finite_time", "exact"].chattering == by["finite_time", "smooth"].chattering  # K2 = 0 by then
+    # all that is left of the finite-time observer's K2 is what its own smooth sign costs
+    left = 3**0.5 * 1.5 * 0.02**0.5 * 1e-5**0.5 * np.arctanh(0.05 / 1.1)
+    most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * left / 0.05
+    assert by["finite_time", "exact"].chattering < by["finite_time", "smooth"].chattering + most
     # a disturbance that starts at its bound: 1.25 |d| / c by theory for a constant one, by less than 1.1 c slower here
     assert by["finite_time", "smooth"].estimate_settled < 1.2519 * 0.01 / 0.02 + 0.1
     assert by["prescribed_time", "smooth"].estimate_settled < 1.0
