@@ -155,18 +155,35 @@ def actuators(scenario: Scenario) -> hardware.Actuators | None:
 def dispersion(scenario: Scenario) -> dispersions.Dispersion:
     """What is drawn for each trial."""
     table = scenario.dispersion
-    if isinstance(table, t.StateDispersion):
-        if isinstance(table.x0, t.UniformState):
-            return dispersions.Dispersion(state=dispersions.UniformState(vector(table.x0.half_width)))
-        if isinstance(table.x0, t.NormalState):
-            return dispersions.Dispersion(state=dispersions.NormalState(vector(table.x0.std)))
+    if table is None:
         return dispersions.Dispersion()
-    attitude = table.attitude if table is not None else None
-    if isinstance(attitude, t.UniformAttitude):
-        return dispersions.Dispersion(dispersions.UniformAttitude())
-    if isinstance(attitude, t.NormalAttitude):
-        return dispersions.Dispersion(dispersions.NormalAttitude(vector(np.deg2rad(attitude.std_deg))))
-    if isinstance(attitude, t.AxisAngle):
-        angles = (vector(np.deg2rad(a)) for a in (attitude.min_deg, attitude.max_deg))
-        return dispersions.Dispersion(dispersions.AxisAngle(*angles))
-    return dispersions.Dispersion()
+    phase = None if table.disturbance_phase is None else dispersions.UniformPhase()
+    if isinstance(table, t.StateDispersion):
+        return dispersions.Dispersion(state=_states(table.x0), phase=phase)
+    inertia = None
+    if table.inertia is not None:
+        moments, axes = np.linalg.eigh(np.asarray(true_body(scenario).inertia))
+        spread = (vector(table.inertia.std), vector(np.deg2rad(table.inertia.axes_deg)))
+        inertia = dispersions.RelativeInertia(vector(moments), vector(axes), *spread)
+    return dispersions.Dispersion(
+        attitude=_attitudes(table.attitude), rate=_states(table.rate, 3), inertia=inertia, phase=phase
+    )
+
+
+def _attitudes(table: Any) -> Any:
+    if isinstance(table, t.UniformAttitude):
+        return dispersions.UniformAttitude()
+    if isinstance(table, t.NormalAttitude):
+        return dispersions.NormalAttitude(vector(np.deg2rad(table.std_deg)))
+    if isinstance(table, t.AxisAngle):
+        return dispersions.AxisAngle(*(vector(np.deg2rad(a)) for a in (table.min_deg, table.max_deg)))
+    return None
+
+
+def _states(table: Any, count: int = 1) -> Any:
+    """How states are drawn; count: how many a single number stands for."""
+    if isinstance(table, t.UniformState | t.UniformRate):
+        return dispersions.UniformState(vector(np.ones(count) * table.half_width))
+    if isinstance(table, t.NormalState | t.NormalRate):
+        return dispersions.NormalState(vector(np.ones(count) * table.std))
+    return None

@@ -120,12 +120,6 @@ def _check_available(scenario: Scenario) -> None:
     def refuse(key: str, value: Any, allowed: str) -> None:
         raise ScenarioError(f"{key} = {schema.show(value)} {NOT_YET}; allowed is {allowed}")
 
-    if scenario.dispersion is not None:
-        for key in scenario.dispersion.__struct_fields__:
-            value = getattr(scenario.dispersion, key)
-            if value is not None and key not in ("attitude", "x0"):
-                other = "x0" if isinstance(scenario.dispersion, tables.StateDispersion) else "attitude"
-                refuse(f"dispersion.{key}", msgspec.to_builtins(value), other)
     for key, value in scenario.requirements.items():
         if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
             raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
@@ -324,6 +318,13 @@ def _check_loop(scenario: Scenario) -> None:
 
 def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
+    if getattr(dispersion, "disturbance_phase", None) is not None and not any(
+        hasattr(term, "phase") for term in terms(scenario)
+    ):
+        raise ScenarioError(
+            f"dispersion.disturbance_phase needs a disturbance that has a phase, but disturbance.kind is "
+            f"{schema.show(scenario.disturbance.kind)}; allowed is a sinusoid, or gravity_gradient"
+        )
     if isinstance(dispersion, tables.Dispersion) and isinstance(dispersion.attitude, tables.AxisAngle):
         angles = dispersion.attitude
         if angles.min_deg > angles.max_deg:

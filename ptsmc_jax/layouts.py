@@ -77,7 +77,7 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
 DISPERSIONS: dict[str, Kinds] = {
     "attitude": {"axis_angle": t.AxisAngle, "uniform": t.UniformAttitude, "normal": t.NormalAttitude},
-    "rate": {"normal": t.NormalRate},
+    "rate": {"normal": t.NormalRate, "uniform": t.UniformRate},
     "inertia": {"relative_normal": t.RelativeInertia},
     "disturbance_phase": {"uniform": t.UniformPhase},
     "x0": {"uniform": t.UniformState, "normal": t.NormalState},

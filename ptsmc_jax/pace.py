@@ -70,10 +70,18 @@ def _frequencies(scenario: Scenario) -> dict[str, float]:
     waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
     found = {"disturbance.frequency": float(max(waves))}
     if scenario.initial is not None:
-        found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate))
+        found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
         found["controller.eta"] = 2.0 * scenario.controller.eta / scenario.controller.t_f  # of the slew
     return found
+
+
+def _spread(scenario: Scenario) -> float:
+    """How much faster than initial.rate a drawn body may turn [rad/s]; a normal rate: all but one in 10 000."""
+    table = getattr(scenario.dispersion, "rate", None)
+    if table is None:
+        return 0.0
+    return 4.6 * table.std if isinstance(table, t.NormalRate) else np.sqrt(3.0) * table.half_width
 
 
 def _reference_frequencies(table: Any) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """What the loop is given: reference attitudes with their derivatives, and disturbance torques."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -187,6 +187,35 @@ class Sum:
         for term in self.terms[1:]:
             total = total + term(t, x)
         return total
+
+
+def phases(disturbance: Any) -> int:
+    """How many phases a disturbance has: one for each component of a sinusoid and for an orbit, in order."""
+    if isinstance(disturbance, Sum):
+        return sum(phases(term) for term in disturbance.terms)
+    return int(jnp.size(disturbance.phase)) if isinstance(disturbance, Sinusoid | GravityGradient) else 0
+
+
+def later(disturbance: Any, angles: Float[Array, " phases"]) -> Any:
+    """The disturbance with these angles [rad] added to its phases; what has none stays as it is."""
+    if isinstance(disturbance, Sum):
+        terms, used = [], 0
+        for term in disturbance.terms:
+            terms.append(later(term, angles[used : used + phases(term)]))
+            used += phases(term)
+        return Sum(tuple(terms))
+    if isinstance(disturbance, Sinusoid):
+        return replace(disturbance, phase=disturbance.phase + angles)
+    if isinstance(disturbance, GravityGradient):
+        return replace(disturbance, phase=disturbance.phase + angles[0])
+    return disturbance
+
+
+def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:
+    """The disturbance as it acts on a body of this inertia [kg m^2]."""
+    if isinstance(disturbance, Sum):
+        return Sum(tuple(on_body(term, inertia) for term in disturbance.terms))
+    return replace(disturbance, inertia=inertia) if isinstance(disturbance, GravityGradient) else disturbance
 
 
 def time_derivative(signal: Callable, t: Time) -> Array:

@@ -255,9 +255,19 @@ class NormalRate(Table, frozen=True):
     std: NotNegative = 0.01
 
 
+class UniformRate(Table, frozen=True):
+    """Each axis uniform within half_width of initial.rate."""
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: NotNegative = 0.01
+
+
 class RelativeInertia(Table, frozen=True):
+    """Principal moments off by a normal share, truncated at three standard deviations, their axes turned."""
+
     kind: Literal["relative_normal"] = "relative_normal"
-    std: NotNegative = 0.05
+    std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
+    axes_deg: NotNegative = 0.0
 
 
 class UniformPhase(Table, frozen=True):
@@ -304,7 +314,7 @@ class Tune(Table, frozen=True):
 
 class Dispersion(Table, frozen=True):
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
-    rate: NormalRate | None = None
+    rate: NormalRate | UniformRate | None = None
     inertia: RelativeInertia | None = None
     disturbance_phase: UniformPhase | None = None
 

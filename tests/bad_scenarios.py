@@ -286,7 +286,7 @@ BAD = [
     ("dispersion.attitude = { kind = 'normal', std_deg = -1 }", "dispersion.attitude.std_deg is -1", "at least 0"),
     ("dispersion.attitude = { kind = 'uniform', min_deg = 9 }", "dispersion.attitude.min_deg is not", "attitude.kind"),
     ("dispersion.atitude = {}", "dispersion.atitude is not a known key", "nearest known one is dispersion.attitude"),
-    ("dispersion.rate.kind = 'uniform'", 'dispersion.rate.kind is "uniform"', '"normal"'),
+    ("dispersion.rate.kind = 'gauss'", 'dispersion.rate.kind is "gauss"', '"normal" or "uniform"'),
     ("requirements.window_eror = 1e-4", "requirements.window_eror is not a known metric", "one is window_error"),
     ("requirements.window_error = 0.0", "requirements.window_error is 0.0", "greater than 0"),
     ("requirements.window_error = inf", "requirements.window_error is inf", "a number greater than 0, and inf"),
@@ -354,9 +354,14 @@ BAD = [
         "but from there the path to the reference meets q_e4 = 0",
         "a start whose path keeps |q_e4| above 0.001",
     ),
-    *(
-        (f"dispersion.{key} = {{}}", f"dispersion.{key} = {{ kind = ", NOT_YET + "attitude")
-        for key in ("rate", "inertia", "disturbance_phase")
+    ("dispersion.rate = { std = -1.0 }", "dispersion.rate.std is -1.0", "at least 0"),
+    ("dispersion.rate = { kind = 'uniform', std = 1.0 }", "dispersion.rate.std is not", "rate.kind"),
+    ("dispersion.inertia = { std = 0.4 }", "dispersion.inertia.std is 0.4", "from 0 to 0.3"),
+    ("dispersion.inertia = { axes_deg = -1 }", "dispersion.inertia.axes_deg is -1", "at least 0"),
+    (
+        "disturbance.kind = 'constant'\ndispersion.disturbance_phase = {}",
+        "dispersion.disturbance_phase needs a disturbance that has a phase",
+        'disturbance.kind is "constant"; allowed is a sinusoid',
     ),
     (
         "requirements.effort = { limit = 9.0, confidence = 0.9 }",

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -156,3 +157,126 @@ def test_initial_states_of_a_chain_are_drawn_about_the_nominal_one():
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
     assert abs(np.corrcoef(uniform.T)[0, 1]) < limit
     assert not dispersions.Dispersion().varies
+
+
+def many_drawn(whole, run=PARTS, count=TRIALS, seed=4):
+    """(trials, ...) parts of many trials."""
+    return jax.jit(jax.vmap(lambda k: whole.apply(run, seed, k)))(jnp.arange(count, dtype=jnp.uint32))
+
+
+def test_initial_rates_are_drawn_about_the_nominal_one():
+    nominal, laws = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
+    for name, spread in {
+        "uniform": dispersions.UniformState(vector([0.02, 0.02, 0.02])),
+        "normal": dispersions.NormalState(vector([0.02, 0.02, 0.02])),
+    }.items():
+        got = many_drawn(dispersions.Dispersion(rate=spread))
+        np.testing.assert_array_equal(got.initial.q, np.broadcast_to(PARTS.initial.q, (TRIALS, 4)))
+        shares = (np.asarray(got.initial.w) - nominal) / 0.02
+        for axis in shares.T:
+            assert stats.kstest(axis, laws[name][0], laws[name][1]).pvalue > ALARM
+        limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+        assert np.abs(np.corrcoef(shares.T) - np.eye(3)).max() < limit
+
+
+def bodies(moments, std, turn=0.0, axes=None):
+    axes = np.eye(3) if axes is None else axes
+    kind = dispersions.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
+    plant = many_drawn(dispersions.Dispersion(inertia=kind)).plant
+    return np.asarray(plant.inertia), np.asarray(plant.inertia_inverse)
+
+
+def test_principal_moments_are_truncated_normal():
+    """Where every draw within three sigma is a body, each moment alone follows the truncated normal law."""
+    inertia, inverse = bodies([10.0, 12.0, 14.0], 0.05)
+    assert np.abs(inertia - inertia * np.eye(3)).max() == 0.0
+    np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-14)
+    shares = (np.diagonal(inertia, axis1=1, axis2=2) / [10.0, 12.0, 14.0] - 1.0) / 0.05
+    for axis in shares.T:
+        assert stats.kstest(axis, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert np.abs(np.corrcoef(shares.T) - np.eye(3)).max() < limit
+
+
+@pytest.mark.parametrize("moments", [[1.0, 1.0, 2.0], [5.0, 9.0, 13.9], [10.0, 12.0, 14.0]])
+def test_every_drawn_body_is_physical(moments):
+    """The flat body (1, 1, 2) is on the edge: half of what is drawn for it is none, and is drawn again, not clipped."""
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    inertia, inverse = bodies(moments, 0.2, turn=0.1, axes=rotation)
+    np.testing.assert_allclose(inertia, inertia.swapaxes(1, 2), atol=1e-14 * max(moments))
+    np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-13)
+    found = np.linalg.eigvalsh(inertia)
+    assert found.min() > 0.0
+    assert np.all(found[:, 2] <= (found[:, 0] + found[:, 1]) * (1 + 1e-12))
+    on_the_edge = np.mean(found[:, 2] > (found[:, 0] + found[:, 1]) * (1 - 1e-9))
+    assert on_the_edge < 1e-3  # the nominal body once in 2^16 draws; clipping would put half of them here
+
+
+def test_principal_axes_are_turned_by_a_normal_rotation_vector():
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    inertia, _ = bodies([5.0, 10.0, 14.0], 0.0, turn=0.01, axes=rotation.as_matrix())
+    # to first order J' = A (D + [r]x D - D [r]x) A': off-diagonal (i, j) of A' J' A is r_k (D_i - D_j), up to sign
+    inner = rotation.as_matrix().T @ inertia @ rotation.as_matrix()
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        turn = inner[:, i, j] / ([5.0, 10.0, 14.0][j] - [5.0, 10.0, 14.0][i]) / 0.01
+        assert abs(np.std(turn) - 1.0) < 0.04  # a sampling error of 0.006 and 0.01 of second order
+    np.testing.assert_allclose(np.linalg.eigvalsh(inertia), [[5.0, 10.0, 14.0]] * TRIALS, rtol=1e-12)
+
+
+SINE = signals.Sinusoid(*(vector(v) for v in ([0.1] * 3, [0.2] * 3, [0.0, 0.5, 1.0], [0.0] * 3)))
+ORBIT = signals.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.25))
+
+
+def test_every_phase_is_drawn_uniformly_and_on_its_own():
+    still = signals.Constant(vector([0.1, 0.2, 0.3]))
+    run = replace(PARTS, disturbance=signals.Sum((SINE, still, ORBIT, SINE)))
+    got = many_drawn(dispersions.Dispersion(phase=dispersions.UniformPhase()), run).disturbance.terms
+    np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
+    turns = np.column_stack(
+        [
+            np.asarray(got[0].phase) - np.asarray(SINE.phase),
+            np.asarray(got[2].phase) - 0.25,
+            np.asarray(got[3].phase) - np.asarray(SINE.phase),
+        ]
+    )
+    assert turns.shape == (TRIALS, 7)
+    for axis in turns.T:
+        assert is_uniform(axis, 0.0, 2 * math.pi)
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert np.abs(np.corrcoef(turns.T) - np.eye(7)).max() < limit
+
+
+def test_a_drawn_body_meets_its_own_gravity_gradient():
+    kind = dispersions.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0))
+    got = dispersions.Dispersion(inertia=kind).apply(replace(PARTS, disturbance=signals.Sum((ORBIT, SINE))), 1, 2)
+    np.testing.assert_array_equal(got.disturbance.terms[0].inertia, got.plant.inertia)
+    assert np.abs(got.plant.inertia - PARTS.plant.inertia).max() > 0.01
+    np.testing.assert_array_equal(got.controller.model.inertia, PARTS.controller.model.inertia)  # the law's is nominal
+
+
+def test_one_more_thing_drawn_changes_no_other_draw():
+    run = replace(PARTS, disturbance=SINE)
+    inertia = dispersions.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
+    kinds = {
+        "attitude": KINDS["axis_angle"],
+        "rate": dispersions.NormalState(vector([0.01, 0.01, 0.01])),
+        "inertia": inertia,
+        "phase": dispersions.UniformPhase(),
+    }
+    whole = dispersions.Dispersion(**kinds).apply(run, 7, 8)
+    for name, kind in kinds.items():
+        alone = dispersions.Dispersion(**{name: kind}).apply(run, 7, 8)
+        seen = {"attitude": lambda p: p.initial.q, "rate": lambda p: p.initial.w, "inertia": lambda p: p.plant.inertia,
+                "phase": lambda p: p.disturbance.phase}[name]  # fmt: skip
+        np.testing.assert_array_equal(seen(whole), seen(alone))
+
+
+def test_the_parts_of_coordinates_are_those_of_the_trial_that_has_them():
+    whole = dispersions.Dispersion(KINDS["axis_angle"], rate=dispersions.NormalState(vector([0.01, 0.01, 0.01])))
+    at = whole.at(PARTS, whole.coordinates(PARTS, 3, 9))
+    drawn_parts = whole.apply(PARTS, 3, 9)
+    jax.tree.map(np.testing.assert_array_equal, at.initial, drawn_parts.initial)
+    middle = whole.at(PARTS, {"initial_attitude": vector([0.5, 0.0, 1.0]), "initial_rate": vector([0.0, 1.0, 0.0])})
+    turn = (REFERENCE.inv() * Rotation.from_quat(np.asarray(middle.initial.q))).as_rotvec()
+    np.testing.assert_allclose(turn, [math.radians(140.0), 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(middle.initial.w, PARTS.initial.w + np.array([0.0, 0.01, 0.0]), rtol=1e-15)
