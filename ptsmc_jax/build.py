@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import attitude_keys, checks, controllers, dispersions, hardware, observers, plants, signals
+from ptsmc_jax import attitude_keys, checks, controllers, dispersions, free_gains, hardware, observers, plants, signals
 from ptsmc_jax import sensors as sensing
 from ptsmc_jax import tables as t
 from ptsmc_jax.tables import Scenario
@@ -125,8 +125,8 @@ def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     walk = table.rate_bias_walk
     estimator = None
     if isinstance(scenario.filter, t.SteadyStateFilter):
-        bandwidth = scenario.filter.bandwidth or sensing.best_bandwidth(star, gyro, period, period * every)
-        estimator = sensing.attitude_filter(bandwidth, star, gyro, walk or 0.0, period, every)
+        bandwidth = vector(free_gains.filter_bandwidth(scenario))
+        estimator = sensing.attitude_filter(bandwidth, *(vector(v) for v in (star, gyro, walk or 0.0, period)), every)
     return sensing.Sensors(
         vector(star),
         vector(gyro),

@@ -1,18 +1,15 @@
 """What single keys of a scenario cannot tell: defaults that depend on other keys, keys against each other."""
 
-import math
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from ptsmc_jax import attitude_keys, hardware, layouts, plants, schema, systems, tables
+from ptsmc_jax import attitude_keys, free_gains, hardware, layouts, plants, schema, systems, tables
 from ptsmc_jax.controllers import hurwitz
-from ptsmc_jax.schema import NOT_YET, ScenarioError, wrong
+from ptsmc_jax.free_gains import FINITE_TIME, MOST_STEPS
+from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
-
-MOST_STEPS = 200_000
-FINITE_TIME = tables.FiniteTimeObserver | tables.EachFiniteTimeObserver
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -27,30 +24,14 @@ def resolve(scenario: Scenario) -> Scenario:
     scenario = msgspec.structs.replace(scenario, observer=observer, disturbance=disturbance)
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
-    tune = scenario.tune
-    if tune is not None:
-        shortest = loop.period if loop.mode == "sampled" else 0.0
-        lower = max(shortest, min(0.05, t_f / 4))
-        least = _least_eta(scenario)
-        default = {
-            "eta": (least + 0.05, least + 6.0),
-            "delta": (lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)),
-            "observer_gain": _gain_bounds(scenario),
-            "k1": (0.1, 10.0),
-            "sign_width": (1e-5, 1e-1),
-        }
-        free = tune.free
-        if free is None:
-            free = ("eta", "delta", "observer_gain") if _has_gain(scenario) else ("eta", "delta")
-        bounds = {**{key: default[key] for key in free if key in default}, **tune.bounds}
-        level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
-        tune = msgspec.structs.replace(tune, free=free, bounds=bounds, level=level)
     dispersion = scenario.dispersion
     if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
         key = _spread(dispersion.x0)
         width = getattr(dispersion.x0, key) or (1.0,) * len(initial_state(scenario))
         dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
-    return msgspec.structs.replace(scenario, loop=loop, tune=tune, dispersion=dispersion)
+    scenario = msgspec.structs.replace(scenario, loop=loop, dispersion=dispersion)
+    tune = None if scenario.tune is None else free_gains.resolve(scenario, scenario.tune)
+    return msgspec.structs.replace(scenario, tune=tune)
 
 
 def inputs(scenario: Scenario) -> int:
@@ -80,24 +61,15 @@ def _each(name: str, table: Any, scenario: Scenario) -> Any:
     return msgspec.structs.replace(table, **absent)
 
 
-def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
-    """Where an observer's gain is looked for: a finite-time one's is a bound on the disturbance's rate."""
-    if isinstance(scenario.observer, FINITE_TIME):
-        assert scenario.observer.gain is not None
-        own = min(scenario.observer.gain), max(scenario.observer.gain)
-        return max(scenario.controller.disturbance_rate_bound, 0.05 * own[0]), 50.0 * own[1]
-    return 0.5, 300.0
-
-
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
     _check_plant(scenario)
-    _check_available(scenario)
+    _check_requirements(scenario)
     _check_observer(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
     if scenario.tune is not None:
-        _check_tune(scenario, scenario.tune)
+        free_gains.check(scenario, scenario.tune)
 
 
 def _spread(x0: tables.UniformState | tables.NormalState) -> str:
@@ -105,30 +77,10 @@ def _spread(x0: tables.UniformState | tables.NormalState) -> str:
     return "half_width" if isinstance(x0, tables.UniformState) else "std"
 
 
-def _least_eta(scenario: Scenario) -> float:
-    """What eta must exceed: 2 by Theorems 1 and 2, the order of a chain by Theorem 3."""
-    return float(scenario.plant.order) if isinstance(scenario.plant, tables.ChainPlant) else 2.0
-
-
-def _has_gain(scenario: Scenario) -> bool:
-    return not isinstance(scenario.observer, tables.NoObserver)
-
-
-def _check_available(scenario: Scenario) -> None:
-    """Refuse what files may say but the project cannot do yet."""
-
-    def refuse(key: str, value: Any, allowed: str) -> None:
-        raise ScenarioError(f"{key} = {schema.show(value)} {NOT_YET}; allowed is {allowed}")
-
+def _check_requirements(scenario: Scenario) -> None:
     for key, value in scenario.requirements.items():
         if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
             raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
-    tune = scenario.tune
-    if tune is not None:
-        if tune.level is not None and tune.objective != "cvar":
-            raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
-        if any(gain not in tables.TUNED for gain in tune.free or ()):
-            refuse("tune.free", tune.free, ", ".join(tables.TUNED))
 
 
 def _check_plant(scenario: Scenario) -> None:
@@ -334,43 +286,3 @@ def _check_dispersion(scenario: Scenario) -> None:
         value = getattr(dispersion.x0, key)
         if len(value) != states:
             raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
-
-
-def _least_gain(scenario: Scenario) -> tuple[float, float, bool]:
-    """Range of a bound on the observer's gain: a finite-time one's is at least the bound on the disturbance's rate."""
-    least = scenario.controller.disturbance_rate_bound if isinstance(scenario.observer, FINITE_TIME) else 0.0
-    return least, math.inf, least > 0.0
-
-
-def _check_tune(scenario: Scenario, tune: tables.Tune) -> None:
-    t_f, period = scenario.controller.t_f, scenario.loop.period
-    shortest = period if scenario.loop.mode == "sampled" else 0.0
-    # gain: lowest and highest that a bound may be, and whether the lowest itself may be
-    ranges = {
-        "eta": (_least_eta(scenario), math.inf, False),
-        "delta": (shortest, t_f, shortest > 0.0),
-        "observer_gain": _least_gain(scenario),
-        "k1": (0.0, math.inf, False),
-        "sign_width": (0.0, math.inf, False),
-    }
-    assert tune.free is not None  # `resolve` filled it in
-    if len(set(tune.free)) < len(tune.free):
-        raise wrong("tune.free", tune.free, "a list that names each gain once")
-    if "observer_gain" in tune.free and not _has_gain(scenario):
-        raise ScenarioError(
-            f'tune.free is {schema.show(tune.free)}, but observer.kind = "none" has no gain; '
-            "allowed is observer_gain with an observer of another kind"
-        )
-    for name, (lower, upper) in tune.bounds.items():
-        key = f"tune.bounds.{name}"
-        if name not in tables.FREE:
-            closest = schema.nearest(name, tables.FREE)
-            raise ScenarioError(f"{key} is not a known gain; the nearest known one is {closest}")
-        if name not in tune.free:
-            raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.show(tune.free)}")
-        least, most, closed = ranges[name]
-        if not (least <= lower if closed else least < lower) or not upper < most:
-            allowed = f"two numbers {'from' if closed else 'above'} {least}"
-            raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
-        if lower >= upper:
-            raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")

@@ -11,10 +11,12 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from ptsmc_jax import lanes, rollout
-from ptsmc_jax.dispersions import Dispersion
+from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.rollout import Parts
 
+FEW = 64  # trials; fewer are flown at once, by a program for their number
+CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
 
 
@@ -45,9 +47,14 @@ class Trials:
                 for name in names}  # fmt: skip
 
 
-def one(parts: Parts, dispersion: Dispersion, seed, trial) -> tuple:
-    """Metrics, status, bad time and initial state of one trial: pure, for any transformation."""
-    drawn = dispersion.apply(parts, seed, trial)
+def one(parts: Parts, dispersion: Dispersion, seed, trial, coordinates: Coordinates | None = None) -> tuple:
+    """Metrics, status, bad time and initial state of one trial: pure, for any transformation.
+
+    coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
+    """
+    if coordinates is None:
+        coordinates = dispersion.coordinates(parts, seed, trial)
+    drawn = dispersion.at(parts, coordinates)
     result = rollout.simulate(drawn, seed, trial)
     return result.metrics, result.status, result.bad_time, drawn.initial
 
@@ -55,32 +62,66 @@ def one(parts: Parts, dispersion: Dispersion, seed, trial) -> tuple:
 def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, block: int = BLOCK) -> Trials:
     """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
 
-    block: trials that a device flies at a time. A trial that fails is marked by its status and kept.
+    block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
+    any number of trials from `FEW` on.
     """
     trials = np.asarray(trials, dtype=np.uint32)
     devices = len(jax.local_devices())
-    padded = np.resize(trials, -(-trials.size // devices) * devices)
-    results = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded), devices, block)
-    return Trials(trials, *jax.tree.map(lambda v: np.asarray(v)[: trials.size], results))
+    block = block if trials.size >= FEW else -(-trials.size // devices)
+    rows = max(1, CAPACITY // (devices * block)) if trials.size >= FEW else 1
+    calls = []
+    for k in range(0, trials.size, devices * rows * block):
+        part = trials[k : k + devices * rows * block]
+        share = -(-part.size // devices)  # of each device
+        padded = np.zeros((devices, rows * block), dtype=np.uint32)
+        padded[:, :share] = np.resize(part, (devices, share))
+        needed = jnp.int32(-(-share // block))
+        shape = (devices, rows, block)
+        found = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices)
+        calls.append(jax.tree.map(lambda v, share=share, n=part.size: _joined(np.asarray(v), share)[:n], found))
+    return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
-@partial(jax.jit, static_argnames=("devices", "block"))
-def _fly(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, devices: int, block: int) -> tuple:
+def _joined(v: np.ndarray, share: int) -> np.ndarray:
+    """The trials that count of (devices, rows, block, ...)."""
+    flat = v.reshape(v.shape[0], -1, *v.shape[3:])[:, :share]
+    return flat.reshape(-1, *flat.shape[2:])
+
+
+@partial(jax.jit, static_argnames="devices")
+def _fly(
+    parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, needed: jax.Array, devices: int
+) -> tuple:
+    """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
+    flown = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial))
+
     def mine(trials: jax.Array) -> tuple:
-        return blocks(lambda trial: one(parts, dispersion, seed, trial), trials, block)
+        row, rows = trials[0], jax.eval_shape(flown, trials[0, 0])
+        empty = jax.tree.map(lambda v: jnp.zeros((row.shape[0], *v.shape), v.dtype), rows)
+
+        def fly(k: jax.Array, found: tuple) -> tuple:
+            return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))
+
+        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, fly, empty))
 
     return spread(mine, trials, devices)
 
 
-def blocks(fly: Callable, trials: jax.Array, block: int = BLOCK) -> Any:
-    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block` trials each."""
-    count = trials.shape[0]
+def blocks(fly: Callable, trials: Any, block: int = BLOCK) -> Any:
+    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block` trials each.
+
+    trials: what `fly` takes, a number or a tree of arrays, with a leading axis over the trials.
+    """
+    count = jax.tree.leaves(trials)[0].shape[0]
     rows = max(1, -(-count // block))
     size = -(-count // rows)
     if rows == 1:
         return lanes.vmap(fly)(trials)
-    padded = jnp.concatenate([trials, trials[: rows * size - count]])
-    results = jax.lax.map(lanes.vmap(fly), padded.reshape(rows, size))
+
+    def split(v: jax.Array) -> jax.Array:
+        return jnp.concatenate([v, v[: rows * size - count]]).reshape(rows, size, *v.shape[1:])
+
+    results = jax.lax.map(lanes.vmap(fly), jax.tree.map(split, trials))
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 

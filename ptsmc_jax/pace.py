@@ -12,7 +12,7 @@ import numpy as np
 
 from ptsmc_jax import attitude_keys, build, checks, clock, observers, theory
 from ptsmc_jax import tables as t
-from ptsmc_jax.checks import MOST_STEPS
+from ptsmc_jax.free_gains import MOST_STEPS
 from ptsmc_jax.laws import SecondOrder
 from ptsmc_jax.plants import System
 from ptsmc_jax.rollout import Parts
@@ -28,6 +28,7 @@ _SMOOTHED = ("disturbance.frequency", "plant.system")
 class Reach:
     """How far gains may move without another compilation: the clock's sizes are chosen for it."""
 
+    smallest_t_f: float  # [s]
     t_f: float  # largest [s]
     delta: float  # largest [s]
     smallest_delta: float  # [s]
@@ -41,7 +42,7 @@ def reach_of(scenario: Scenario) -> Reach:
     """The reach of a scenario's own gains: none beyond them."""
     table = scenario.controller
     gains = getattr(scenario.observer, "gain", (0.0,))
-    return Reach(table.t_f, table.delta, table.delta, min(gains), max(gains), table.k1, table.sign_width)
+    return Reach(table.t_f, table.t_f, table.delta, table.delta, min(gains), max(gains), table.k1, table.sign_width)
 
 
 def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
@@ -49,10 +50,10 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
 
     Raises ScenarioError where too many steps would be needed, naming what asks for them.
     """
-    loop, frequencies, visited = scenario.loop, _frequencies(scenario), None
+    loop, frequencies, visited = scenario.loop, _frequencies(scenario, reach), None
     if isinstance(parts.plant, System):
-        visited = theory.visited(parts)
-        frequencies["plant.system"] = _fastest_of_system(parts, visited)
+        visited = theory.visited(_hurried(parts, reach))
+        frequencies["plant.system"] = _fastest_of_system(_hurried(parts, reach), visited)
     if loop.mode == "continuous":
         if "plant.system" in frequencies:
             frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
@@ -60,19 +61,27 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
     assert loop.t_end is not None
     substeps = _substeps(scenario, frequencies)
     if loop.clock == "flight":
-        return clock.flight(loop.period, loop.t_end), substeps
+        last = loop.t_end + reach.t_f - scenario.controller.t_f
+        return dataclasses.replace(clock.flight(loop.period, last), t_end=build.vector(loop.t_end)), substeps
     late = loop.t_end - scenario.controller.t_f + reach.delta
     return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
 
 
-def _frequencies(scenario: Scenario) -> dict[str, float]:
+def _hurried(parts: Parts, reach: Reach) -> Parts:
+    """The parts with the shortest t_f."""
+    shorter = build.vector(reach.smallest_t_f)
+    t_end = shorter + (parts.t_end - parts.controller.t_f)
+    return dataclasses.replace(parts, t_end=t_end, controller=dataclasses.replace(parts.controller, t_f=shorter))
+
+
+def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
     """How fast things happen [rad/s], by the key that says so."""
     waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
     found = {"disturbance.frequency": float(max(waves))}
     if scenario.initial is not None:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
-        found["controller.eta"] = 2.0 * scenario.controller.eta / scenario.controller.t_f  # of the slew
+        found["controller.eta"] = 2.0 * scenario.controller.eta / reach.smallest_t_f  # of the slew
     return found
 
 
@@ -173,8 +182,8 @@ def _grid(
 ) -> clock.Graded:
     """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
     loop = scenario.loop
-    t_end = loop.t_end
-    assert t_end is not None
+    assert loop.t_end is not None
+    t_end = loop.t_end + reach.t_f - scenario.controller.t_f
     controller, observer, resolved = parts.controller, parts.observer, 0.0
     saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
     if not isinstance(observer, observers.NoObserver):  # K2 is largest with the smallest gain
@@ -185,8 +194,10 @@ def _grid(
     )
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:
-        before, after = _boundary_layer(widest, observer, visited)
-        layer = (float(before), float(after))
+        for t_f in (reach.smallest_t_f, reach.t_f):
+            law = dataclasses.replace(widest, t_f=build.vector(t_f))
+            before, after = (float(v) for v in _boundary_layer(law, observer, visited))
+            layer = (max(layer[0], before), max(layer[1], after))
     layer = (max(layer[0], resolved), max(layer[1], resolved))
     rate, frequency = widest.hold_rate(), _fastest(frequencies)
     order = 1 if isinstance(scenario.plant, t.SpacecraftPlant) else controller.order
@@ -206,4 +217,5 @@ def _grid(
         if worst == "controller.sign_width":
             raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
         raise _lower(scenario, worst, asks)
-    return clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
+    grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
+    return dataclasses.replace(grid, t_end=build.vector(loop.t_end))

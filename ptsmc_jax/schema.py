@@ -17,7 +17,7 @@ import msgspec
 
 from ptsmc_jax import layouts, tables
 from ptsmc_jax.layouts import TABLES, Kinds
-from ptsmc_jax.tables import ATTITUDE_KEYS, Limit, Positive, Scenario, Table
+from ptsmc_jax.tables import ATTITUDE_KEYS, Limit, Positive, Scenario, Table, Truth
 
 NOT_YET = "is not available yet"
 
@@ -245,7 +245,7 @@ def _value(key: str, value: Any, kind: Any) -> Any:
     bad = _not_finite(value)
     if bad is not None:
         raise wrong(key, value, f"{_description(kind)}, and {bad!r} is no finite number")
-    if _holds_truth(value):  # numpy, which reads the inertia, takes true for 1
+    if _holds_truth(value) and kind is not Truth:  # numpy, which reads the inertia, takes true for 1
         raise wrong(key, value, _description(kind))
     try:
         return msgspec.convert(value, kind, strict=True)

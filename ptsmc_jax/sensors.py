@@ -5,7 +5,8 @@ trial, sample). In the partial first period of the anchored clock everything a s
 share, so that nothing jumps where that period vanishes.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -85,7 +86,7 @@ class AttitudeFilter:
         return Estimate(q, old.bias - self.bias_gain * weight * residual)
 
 
-def filter_gains(bandwidth: Any, interval: float) -> tuple[Any, Any]:
+def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
     """Gains (attitude [-], bias [1/s]) that put both poles of the estimation error at e^(-bandwidth interval).
 
     bandwidth [rad/s]; interval between star tracker samples [s]. With p that pole: 1 - p^2 and (1 - p)^2 / interval.
@@ -103,8 +104,9 @@ def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, inte
     return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))
 
 
+@partial(jax.jit, static_argnames="every")  # one program, where each of its operations would be one
 def attitude_filter(
-    bandwidth: float, attitude_noise: float, rate_noise: float, bias_walk: float, period: float, every: int
+    bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, every: int
 ) -> AttitudeFilter:
     """Filter of this bandwidth [rad/s], its errors at t = 0 those of its steady state under these noises.
 
@@ -112,18 +114,19 @@ def attitude_filter(
     every: control periods between star tracker samples.
     """
     interval = period * every
-    k1, k2 = (float(v) for v in filter_gains(bandwidth, interval))
+    k1, k2 = filter_gains(bandwidth, interval)
     # errors (attitude, bias) from one correction to the next: e+ = K F e + K g + (k1, -k2) noise
-    step = np.array([[1.0, -interval], [0.0, 1.0]])
-    keep = np.array([[1.0 - k1, 0.0], [k2, 1.0]])
+    zero, one = jnp.zeros_like(k1), jnp.ones_like(k1)
+    step = jnp.array([[one, -interval * one], [zero, one]])
+    keep = jnp.array([[1.0 - k1, zero], [k2, one]])
     walk = interval * bias_walk**2
-    gyro = np.array([[rate_noise**2 * period * interval + walk * interval**2 / 3, -walk * interval / 2],
-                     [-walk * interval / 2, walk]])  # fmt: skip
-    star = np.outer([k1, -k2], [k1, -k2]) * attitude_noise**2
+    gyro = jnp.array([[rate_noise**2 * period * interval + walk * interval**2 / 3, -walk * interval / 2],
+                      [-walk * interval / 2, walk * one]])  # fmt: skip
+    star = jnp.outer(jnp.stack([k1, -k2]), jnp.stack([k1, -k2])) * attitude_noise**2
     move, drive = keep @ step, keep @ gyro @ keep.T + star
-    spread = np.linalg.solve(np.eye(4) - np.kron(move, move), drive.reshape(4)).reshape(2, 2)
-    sizes = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    return AttitudeFilter(*(jnp.asarray(float(v)) for v in (k1, k2, *sizes)))
+    spread = numerics.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4))
+    sizes = numerics.sqrt(jnp.maximum(spread[::3], 0.0))  # the diagonal
+    return AttitudeFilter(k1, k2, sizes[0], sizes[1])
 
 
 class Memory(NamedTuple):
@@ -150,6 +153,17 @@ class Sensors:
     bias_rate: Leaf | None = None  # 1 sigma of the bias's change per second of a period: walk / sqrt(period) [rad/s^2]
     filter: AttitudeFilter | None = None
     every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
+
+    def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
+        """The same with a filter of another bandwidth [rad/s]; period: of control [s]."""
+        walk = 0.0 if self.bias_rate is None else self.bias_rate * numerics.sqrt(period)
+        noises = self.attitude_noise, self.rate_noise, walk
+        return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
+
+    def bandwidth(self, period: Any) -> Any:
+        """Bandwidth of the filter [rad/s]."""
+        assert self.filter is not None
+        return -0.5 * jnp.log1p(-self.filter.attitude_gain) / (period * self.every)
 
     def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key, draws.Key]:
         """Streams of a trial's noise: attitude, rate, change of the bias."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import tomli_w
 
+JOURNAL = "journal.bin"  # of a run that is not finished
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
 
 
@@ -36,19 +37,45 @@ def versions(command: str, seed: int, **others: Any) -> dict[str, Any]:
     }
 
 
-def previous(
-    folder: Path, command: str, scenario: Mapping[str, Any], seed: int, **others: Any
-) -> dict[str, Any] | None:
-    """The summary of the same scenario, seed, command and what else `versions` was told; None if there is none."""
+def previous(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The summary of the same scenario with the same command, seed and what else `versions` was told; None: none."""
+    try:
+        return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, told) else None
+    except (OSError, ValueError):
+        return None
+
+
+def begun(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+    """Whether the folder holds the beginning of the same run, by the same versions: see `begin`."""
+    return (folder / JOURNAL).exists() and _same(folder, scenario, versions(**told))
+
+
+def begin(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any], *, fresh: bool) -> Path:
+    """Make the folder of a run that can go on where it was interrupted; returns the path of its journal.
+
+    fresh: forget what the folder's journal holds.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fresh:
+        end(folder)
+    write_toml(folder / "scenario.toml", scenario)
+    write_json(folder / "versions.json", versions(**told))
+    (folder / JOURNAL).touch()
+    return folder / JOURNAL
+
+
+def end(folder: Path) -> None:
+    """Forget the journal of a run that is done."""
+    (folder / JOURNAL).unlink(missing_ok=True)
+
+
+def _same(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
     try:
         made = json.loads((folder / "versions.json").read_text())
-        same = tomllib.loads((folder / "scenario.toml").read_text()) == json.loads(json.dumps(_named(scenario)))
-        wanted = {"command": command, "seed": seed, **others}
-        if same and all(made.get(key) == value for key, value in wanted.items()):
-            return json.loads((folder / "summary.json").read_text())
+        known = tomllib.loads((folder / "scenario.toml").read_text())
     except (OSError, ValueError):
-        pass
-    return None
+        return False
+    return known == json.loads(json.dumps(_named(scenario))) and all(made.get(k) == v for k, v in told.items())
 
 
 def check(folder: Path, force: bool) -> None:

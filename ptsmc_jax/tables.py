@@ -25,6 +25,7 @@ from ptsmc_jax.values import (
     Three,
     ThreeNotNegative,
     ThreePositive,
+    Truth,
 )
 
 
@@ -296,17 +297,19 @@ class Limit(Table, frozen=True):
     confidence: Quantile | None = None
 
 
-Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f"]
+Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth"]
 FREE: tuple[str, ...] = typing.get_args(Free)
-TUNED = tuple(gain for gain in FREE if gain != "t_f")  # what tuning can free today
-FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(TUNED)}")]
+FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")]
 
 
 class Tune(Table, frozen=True):
     free: FreeGains | None = None  # eta, delta, observer_gain
     bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}  # noqa: RUF012
-    objective: Literal["rms", "worst", "cvar"] = "rms"
+    per_axis: Truth = False
+    objective: Literal["rms", "worst", "cvar", "t_f"] = "rms"
     level: Quantile | None = None
+    torque_weight: NotNegative = 0.0
+    worst_case: Truth = False
     trials: Count = 256
     starts: Count = 8
     steps: Count = 150

@@ -8,6 +8,7 @@ from msgspec import Meta
 Number = Annotated[float, Meta(description="a number")]
 Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
 NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
+Truth = Annotated[bool, Meta(description="true or false")]
 Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
 Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
 ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]

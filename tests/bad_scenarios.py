@@ -369,5 +369,37 @@ BAD = [
         "goes with a quantile only",
     ),
     ("tune = { objective = 'worst', level = 0.9 }", "tune.level is 0.9", 'tune.objective = "cvar" only'),
-    ("tune.free = ['t_f']", 'tune.free = ["t_f"]', NOT_YET + "eta, delta, observer_gain, k1, sign_width"),
+    ("tune.free = ['filter_bandwidth']", 'tune.free is ["filter_bandwidth"]', '[filter] of kind "steady_state"'),
+    (
+        "observer.kind = 'prescribed_time'\ntune.free = ['t_f']",
+        'tune.free is ["t_f"], but observer.t_o then follows t_f',
+        "observer.t_o given",
+    ),
+    (
+        "observer = { kind = 'prescribed_time', t_o = 9.0 }\ntune = { free = ['t_f'], bounds = { t_f = [9.0, 20.0] } }",
+        "tune.bounds.t_f is [9.0, 20.0]",
+        "above 9.0",
+    ),
+    ("tune = { free = ['t_f'], bounds = { t_f = [0.05, 20.0] } }", "tune.bounds.t_f is [0.05, 20.0]", "above 0.05"),
+    (
+        SAMPLED + "tune = { free = ['t_f'], bounds = { t_f = [9.0, 20000.0] } }",
+        "tune.bounds.t_f is [9.0, 20000.0]",
+        "below 9990.0",
+    ),
+    (
+        "tune = { free = ['t_f', 'delta'], bounds = { t_f = [9.0, 20.0], delta = [0.1, 9.5] } }",
+        "tune.bounds.delta is [0.1, 9.5]",
+        "below 9.0",
+    ),
+    ("tune.objective = 't_f'", 'tune.objective = "t_f" needs t_f to be free', 'tune.free is ["eta",'),
+    ("tune = { objective = 't_f', free = ['t_f'] }", 'tune.objective is "t_f"', "there is no requirement"),
+    (
+        "requirements.effort = 9.0\ntune = { objective = 't_f', free = ['t_f'], torque_weight = 0.5 }",
+        "tune.torque_weight is 0.5",
+        'absent where tune.objective is "t_f"',
+    ),
+    ("tune.torque_weight = -0.5", "tune.torque_weight is -0.5", "at least 0"),
+    ("tune = { free = ['eta'], per_axis = true }", "tune.per_axis is true", "without observer_gain"),
+    ("tune.per_axis = 1", "tune.per_axis is 1", "true or false"),
+    ("tune.worst_case = 'yes'", 'tune.worst_case is "yes"', "true or false"),
 ]

@@ -1,8 +1,10 @@
 """The command: files, exit statuses, sentences."""
 
 import json
+import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -135,9 +137,9 @@ def test_bad_input_is_one_sentence_and_exit_status_two(command, tmp_path, args, 
 
 
 def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
-    from tuning import optimise, report
+    from tuning import optimise, report, worst
 
-    for module, name, value in ((optimise, "SCREENED", 32), (optimise, "CANDIDATES", 8), (report, "FRESH", 40)):
+    for module, name, value in ((worst, "SCREENED", 32), (optimise, "CANDIDATES", 8), (report, "FRESH", 40)):
         monkeypatch.setattr(module, name, value)
     status, _, _ = command("tune", "s.toml", "--out", "t")
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
@@ -146,7 +148,8 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert summary["fresh"]["trials"] == 40
     assert summary["fresh"]["seed"] != summary["training"]["seed"]
     files = {"tuned.toml", "history.csv", "summary.json", "scenario.toml", "versions.json"}
-    assert set(tree(tmp_path / "t")) == files | {"figures/history.png", "figures/tradeoff.png"}
+    drawn = {f"figures/{name}.png" for name in ("history", "tradeoff", "sensitivities", "profiles")}
+    assert set(tree(tmp_path / "t")) == files | drawn
     tuned = scenario.read(tmp_path / "t" / "tuned.toml")
     assert tuned.controller.eta == summary["gains"]["eta"]
     assert tuned.controller.delta == summary["gains"]["delta"]
@@ -320,6 +323,126 @@ def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
     assert command(*run, "--seed", 6)[0] == 2
     assert command("simulate", *run[1:], "--seed", 5)[0] == 2
     assert tree(folder) == before
+
+
+def stop_at(monkeypatch, call):
+    """Ctrl-C at this evaluation of the search; returns how many were computed, not read back."""
+    from tuning.evaluate import Evaluator
+    from tuning.journal import Journal
+
+    calls, computed = [], []
+    slopes, get = Evaluator.slopes, Journal.get
+
+    def interrupted(self, problem, z):
+        calls.append(1)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+        return slopes(self, problem, z)
+
+    def counted(self, question, compute):
+        def one():
+            computed.append(1)
+            return compute()
+
+        return get(self, question, one)
+
+    monkeypatch.setattr(Evaluator, "slopes", interrupted)
+    monkeypatch.setattr(Journal, "get", counted)
+    return computed
+
+
+def small_search(monkeypatch):
+    from tuning import optimise, report, worst
+
+    for module, name, value in (
+        (worst, "SCREENED", 64),
+        (optimise, "CANDIDATES", 8),
+        (optimise, "CROSSED", 16),
+        (report, "FRESH", 40),
+    ):
+        monkeypatch.setattr(module, name, value)
+
+
+@pytest.mark.parametrize("call", [1, 4, 30])
+def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, monkeypatch, call):
+    """At the first evaluation there is nothing yet, at the 4th it descends, at the 30th it polishes."""
+    small_search(monkeypatch)
+    with monkeypatch.context() as patch:
+        computed = stop_at(patch, 0)
+        whole = command("tune", "s.toml", "--out", "whole", "--quiet", "--no-figures")[0]
+        needed = len(computed)
+    assert "journal.bin" not in tree(tmp_path / "whole")
+
+    run = ("tune", "s.toml", "--out", "cut", "--no-figures")
+    with monkeypatch.context() as patch:
+        computed = stop_at(patch, call)
+        status, told, err = command(*run)
+        done = len(computed)
+    assert status == 130
+    assert {"journal.bin", "scenario.toml", "versions.json"} <= set(tree(tmp_path / "cut"))
+    if call == 1:
+        assert "ptsmc: interrupted before there were gains; the same command goes on from here" in err
+        assert not (tmp_path / "cut" / "tuned.toml").exists()
+    else:
+        assert "interrupted: these are the best gains so far; the same command goes on from here" in told
+        best = json.loads((tmp_path / "cut" / "summary.json").read_text())
+        assert best["status"] == "interrupted"
+        assert scenario.read(tmp_path / "cut" / "tuned.toml").controller.eta == best["gains"]["eta"]
+        assert best["fresh"]["trials"] == 40
+    assert command("simulate", "s.toml", "--out", "cut")[0] == 2  # another command has no business here
+
+    with monkeypatch.context() as patch:
+        computed = stop_at(patch, 0)
+        assert command(*run)[0] == whole
+        assert len(computed) == needed - done  # what was evaluated before is read back
+    assert "journal.bin" not in tree(tmp_path / "cut")
+    one, other = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "cut"))
+    for summary in (one, other):
+        summary["search"].pop("seconds")
+    assert one == other
+
+
+def test_a_killed_search_goes_on(tmp_path):
+    """kill -9 while it searches, in a process of its own; then the same command to the end."""
+    (tmp_path / "s.toml").write_text(SHORT)
+    code = (
+        "import sys; from tuning import cli, optimise, report, worst; optimise.CANDIDATES = 8; optimise.CROSSED = 16; "
+        "worst.SCREENED = 64; report.FRESH = 40; cli.main()"
+    )
+    run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
+    journal, size = tmp_path / "t" / "journal.bin", 0
+    for _ in range(2):  # twice, and each time it has got further
+        process = subprocess.Popen(run, cwd=tmp_path)
+        while process.poll() is None and (not journal.exists() or journal.stat().st_size <= size):
+            time.sleep(0.02)
+        assert process.poll() is None, "it was done before it could be killed"
+        process.kill()
+        process.wait()
+        assert not (tmp_path / "t" / "summary.json").exists()
+        size = journal.stat().st_size
+        assert size > 0
+    done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    assert not journal.exists()
+    whole = subprocess.run([*run[:-3], "w", *run[-2:]], cwd=tmp_path, check=False)
+    assert whole.returncode == done.returncode
+    assert (tmp_path / "t" / "tuned.toml").read_text() == (tmp_path / "w" / "tuned.toml").read_text()
+    assert (tmp_path / "t" / "history.csv").read_text() == (tmp_path / "w" / "history.csv").read_text()
+
+
+def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
+    small_search(monkeypatch)
+    text = re.sub(r"peak_torque = .*", "peak_torque = 0.01", SHORT)
+    (tmp_path / "s.toml").write_text(text)
+    status, told, _ = command("tune", "s.toml", "--out", "t", "--no-figures")
+    summary = json.loads((tmp_path / "t" / "summary.json").read_text())
+    assert (status, summary["status"]) == (1, "not met")
+    ratio = summary["search"]["largest_over_limit"]["peak_torque"]
+    assert ratio > 1.0
+    assert "no gains found within the bounds keep peak_torque: at best" in told
+    assert "peak_torque at most 0.01 N m: worst" in told
+    # the best compromise: the smallest torque within the bounds is that of the smallest eta
+    assert 2.1 < summary["gains"]["eta"] < 2.9  # of 2.1 to 6
 
 
 def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ import pytest
 
 from ptsmc_jax import dispersions, lanes, montecarlo, plants, rollout, scenario, signals
 from tests.helpers import FULL_INERTIA, ROOT
-from tuning.bounds import with_gains
+from tuning.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"

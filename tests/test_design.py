@@ -8,6 +8,7 @@ import pytest
 from ptsmc_jax import montecarlo, scenario
 from tests.helpers import vector
 from tuning import design
+from tuning.gains import with_gains
 
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 120.0}}
 FLOWN = {
@@ -85,9 +86,9 @@ def test_search_finds_the_last_crossing(power):
 
 def test_only_t_f_and_what_follows_it_is_changed():
     parts = scenario.study(scenario.from_tables(FLOWN)).parts
-    moved = design._at(parts, 15.0)
+    moved = with_gains(parts, {"t_f": 15.0})
     assert (float(moved.controller.t_f), float(moved.t_end), float(moved.clock.t_end)) == (15.0, 17.0, 17.0)
-    back = replace(design._at(moved, 20.0), initial=parts.initial)
+    back = replace(with_gains(moved, {"t_f": 20.0}), initial=parts.initial)
     assert float(back.t_end) == float(parts.t_end)
     np.testing.assert_array_equal(
         back.clock.ticks(vector(20.0), vector(1.0)).t, parts.clock.ticks(vector(20.0), vector(1.0)).t

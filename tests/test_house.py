@@ -37,21 +37,28 @@ FLOORS = {
         layouts
         schema
         attitude_keys
+        free_gains
         checks
         build
         pace
         scenario
         montecarlo runs
-        store remark_2
-        plotting
+        store remark_2 drawing
+        plotting study_plots
         paper
         slips
     """,
     "tuning": """
-        bounds design
+        gains
+        bounds design journal
         objective
+        evaluate
+        worst trust
         optimise
+        evolution
         report single reproduction mapping
+        results
+        show
         cli table
     """,
 }

@@ -285,7 +285,8 @@ def test_kinds_of_dispersion():
 def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
     parts = study(
-        scenario, reach=Reach(35.0, delta=4.0, smallest_delta=0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3)
+        scenario,
+        reach=Reach(30.0, 35.0, delta=4.0, smallest_delta=0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3),
     ).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
         ticks = parts.clock.ticks(vector(t_f), vector(delta))

@@ -82,7 +82,10 @@ CHAIN_DEFAULTS = {
 TUNE_DEFAULTS = {
     "free": ["eta", "delta", "observer_gain"],
     "bounds": {"eta": [2.05, 8.0], "delta": [0.05, 5.0], "observer_gain": [0.5, 300.0]},
+    "per_axis": False,
     "objective": "rms",
+    "torque_weight": 0.0,
+    "worst_case": False,
     "trials": 256,
     "starts": 8,
     "steps": 150,

@@ -67,16 +67,19 @@ def test_json_has_null_for_what_is_not_finite_and_csv_reads_back_exactly(tmp_pat
     assert [[float(v) for v in row] for row in body] == rows
 
 
+TOLD = {"command": "tune", "seed": 5}
+
+
 def test_only_the_same_scenario_seed_and_command_is_known_again(tmp_path):
     tables = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}
     store.write_toml(tmp_path / "scenario.toml", tables)
     store.write_json(tmp_path / "versions.json", store.versions("tune", 5))
     store.write_json(tmp_path / "summary.json", {"status": "met"})
-    assert store.previous(tmp_path, "tune", tables, 5) == {"status": "met"}
-    assert store.previous(tmp_path, "tune", tables, 6) is None
-    assert store.previous(tmp_path, "simulate", tables, 5) is None
-    assert store.previous(tmp_path, "tune", {"controller": {"eta": 3.1, "gain": [1.0, 2.0]}}, 5) is None
-    assert store.previous(tmp_path / "none", "tune", tables, 5) is None
+    assert store.previous(tmp_path, tables, TOLD) == {"status": "met"}
+    assert store.previous(tmp_path, tables, {**TOLD, "seed": 6}) is None
+    assert store.previous(tmp_path, tables, {**TOLD, "command": "simulate"}) is None
+    assert store.previous(tmp_path, {"controller": {"eta": 3.1, "gain": [1.0, 2.0]}}, TOLD) is None
+    assert store.previous(tmp_path / "none", tables, TOLD) is None
 
 
 def test_verdicts_count_failures_and_missing_values():
@@ -216,9 +219,9 @@ def finished(folder, tables):
 def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, content):
     tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
     finished(tmp_path / "out", tables)
-    assert store.previous(tmp_path / "out", "tune", tables, 5) == {"status": "met"}
+    assert store.previous(tmp_path / "out", tables, TOLD) == {"status": "met"}
     (tmp_path / "out" / name).unlink() if content is None else (tmp_path / "out" / name).write_text(content)
-    assert store.previous(tmp_path / "out", "tune", tables, 5) is None
+    assert store.previous(tmp_path / "out", tables, TOLD) is None
 
 
 @pytest.mark.parametrize(
@@ -235,8 +238,8 @@ def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, con
 def test_any_other_scenario_is_not_known(tmp_path, other):
     tables = {"controller": {"eta": 3.0}}
     finished(tmp_path / "out", tables)
-    assert store.previous(tmp_path / "out", "tune", tables, 5) is not None
-    assert store.previous(tmp_path / "out", "tune", other, 5) is None
+    assert store.previous(tmp_path / "out", tables, TOLD) is not None
+    assert store.previous(tmp_path / "out", other, TOLD) is None
 
 
 def test_versions_name_what_made_a_result():

@@ -397,4 +397,4 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
     store.write_toml(tmp_path / "s.toml", schema.dump(made))
     with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names no system'):
         scenario.read(tmp_path / "s.toml")
-    assert store.previous(tmp_path, "tune", schema.dump(made), 0) is None
+    assert store.previous(tmp_path, schema.dump(made), {"command": "tune", "seed": 0}) is None

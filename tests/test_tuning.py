@@ -10,7 +10,8 @@ import pytest
 from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario
 from ptsmc_jax.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, objective, optimise, report
+from tuning import bounds, gains, objective, optimise, report, results, worst
+from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 
@@ -20,10 +21,9 @@ def loss():
     """ln RMS window error of 6 noisy trials over (eta, delta, l, t_f), and its derivative, compiled once."""
     run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=23.0, reach=(23.0, 3.0))
 
-    def value(gains):
-        eta, delta, gain, t_f = gains
-        moved = bounds.with_gains(run, {"eta": eta, "delta": delta, "observer_gain": gain})
-        moved = replace(moved, controller=replace(moved.controller, t_f=t_f))
+    def value(at):
+        eta, delta, gain, t_f = at
+        moved = gains.with_gains(run, {"eta": eta, "delta": delta, "observer_gain": gain, "t_f": t_f})
 
         def fly(trial):
             return montecarlo.one(moved, SPREAD, np.uint32(2), trial)[0].window_error
@@ -67,8 +67,8 @@ def test_loss_and_gradient_are_finite_and_continuous_where_delta_is_a_multiple_o
 def test_forward_and_reverse_mode_agree():
     run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.5)
 
-    def value(gains):
-        moved = bounds.with_gains(run, {"eta": gains[0], "delta": gains[1], "observer_gain": gains[2]})
+    def value(at):
+        moved = gains.with_gains(run, {"eta": at[0], "delta": at[1], "observer_gain": at[2]})
         metrics = rollout.simulate(moved, np.uint32(0), np.uint32(1)).metrics
         return jnp.log(metrics.window_error) + metrics.peak_torque
 
@@ -90,25 +90,17 @@ def test_bounds_map_reals_into_the_interval_and_back():
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
 
 
-def problem(**limits):
+def problem(count=8, dispersion=SPREAD, **limits):
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
-    return objective.Problem(
-        parts=run,
-        dispersion=SPREAD,
-        seed=jnp.uint32(3),
-        trials=jnp.arange(8, dtype=jnp.uint32),
-        limits=vector(list(limits.values())),
-        averaged=8,
-        names=("eta", "delta"),
-        metrics=tuple(limits),
-    )
+    wanted = [Requirement(metric, limit) for metric, limit in limits.items()]
+    return objective.problem(run, dispersion, 3, np.arange(count), ("eta", "delta"), wanted)
 
 
 def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
     some = problem(peak_torque=0.7, effort=5.0)
-    f, c = objective.measure(some, vector([3.0, 0.7]))
-    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
+    f, c, _ = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(flown.metrics.window_error**2)), rtol=1e-10)
     np.testing.assert_allclose(c[0] + 1, flown.metrics.peak_torque / 0.7, rtol=1e-10)
     np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
@@ -117,8 +109,8 @@ def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
 @pytest.mark.parametrize("tail", [1, 3, 8])
 def test_the_tail_is_the_mean_of_the_worst(tail):
     some = replace(problem(), tail=tail)
-    f, _ = objective.measure(some, vector([3.0, 0.7]))
-    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
+    f, _, _ = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
     worst = np.sort(flown.metrics.window_error)[-tail:]
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
 
@@ -127,9 +119,9 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
 def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
     """The largest c is that order statistic of the averaged trials; harder trials that were added do not count."""
     some = problem(peak_torque=0.7, effort=5.0)
-    some = replace(some, trials=jnp.arange(11, dtype=jnp.uint32), least=(least, None))
-    _, c = objective.measure(some, vector([3.0, 0.7]))
-    flown = montecarlo.run(bounds.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
+    some = replace(objective.with_trials(some, np.arange(8, 11)), least=(least, None))
+    _, c, _ = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
     expected = np.sort(flown.metrics.peak_torque[:8])[least - 1] / 0.7 - 1
     np.testing.assert_allclose(c[0].max(), expected, rtol=1e-10)
     np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
@@ -140,7 +132,7 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
 
     @jax.jit
     def value(gains):
-        f, c = objective.measure(some, gains)
+        f, c, _ = objective.measure(some, gains)
         return jnp.stack([f, c.max()])
 
     at = np.array([3.1, 0.73])
@@ -157,8 +149,8 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
     largest = {}
     for tail in (None, 1):
         some = replace(problem(), tail=tail)
-        found = optimise.search(some, limits, (), np.array([3.0, 0.5]), 2, 25, 1)
-        f, _ = objective.measure(replace(some, tail=1), jnp.asarray(found.gains))
+        found = optimise.search(Evaluator(limits), some, (), np.array([3.0, 0.5]), 2, 25, 1)
+        f, _, _ = objective.measure(replace(some, tail=1), jnp.asarray(found.gains))
         largest[tail] = float(np.exp(f))
     assert largest[1] <= largest[None] * (1 + 1e-6)
 
@@ -177,11 +169,12 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
 
 
 def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
-    some = problem(peak_torque=0.7)
     near = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))
 
-    def f(gains):
-        return objective.measure(replace(some, dispersion=near), gains)
+    some = problem(dispersion=near, peak_torque=0.7)
+
+    def f(at):
+        return objective.measure(some, at)[:2]
 
     (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jacfwd(f)(vector([3.0, 0.7]))
     np.testing.assert_allclose(value, np.log(objective.FAILED))
@@ -191,34 +184,37 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
 
 def test_search_finds_the_constrained_optimum(monkeypatch):
     """Against a brute-force scan of the same problem, screening for harder trials left out."""
-    monkeypatch.setattr(optimise, "SCREENED", 16)
+    monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(optimise, "CANDIDATES", 8)
     some = problem(peak_torque=0.9)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)
     seen = []
-    found = optimise.search(some, limits, wanted, np.array([3.0, 0.5]), 3, 40, 1, lambda *told: seen.append(told))
+    evaluate = Evaluator(limits)
+    found = optimise.search(
+        evaluate, some, wanted, np.array([3.0, 0.5]), 3, 40, 1, report=lambda *told: seen.append(told)
+    )
     assert found.dropped == []
     assert found.worst[0] <= 1.0
-    assert len(seen) == len(found.history)
-    final = replace(some, trials=jnp.asarray(found.trials))
+    assert sum(told[0] == "searching" or "harder" in told[0] for told in seen) == len(found.history)
+    final = found.problem
 
     @jax.jit
     def scan(points):
-        return jax.lax.map(lambda gains: objective.measure(final, gains), points)
+        return jax.lax.map(lambda at: objective.measure(final, at)[:2], points)
 
     grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 25), np.geomspace(0.2, 5.0, 41)), axis=-1).reshape(-1, 2)
     f, c = scan(jnp.asarray(grid))
     best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= 0.0].min())
-    assert found.rms <= best * 1.01
-    f, c = objective.measure(final, jnp.asarray(found.gains))
-    np.testing.assert_allclose(np.exp(f), found.rms, rtol=1e-9)
+    assert found.value <= best * 1.01
+    f, c, _ = objective.measure(final, jnp.asarray(found.gains))
+    np.testing.assert_allclose(np.exp(f), found.value, rtol=1e-9)
     assert np.asarray(c).max() <= 0.0
 
 
 def test_starts_begin_with_the_scenarios_own_gains_and_differ():
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-    z = optimise.starting_points(problem(), limits, np.array([3.0, 0.5]), 4, 7)
+    z = optimise.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
     assert z.shape == (4, 2)
     np.testing.assert_allclose(limits.gains(jnp.asarray(z[0])), [3.0, 0.5], rtol=1e-9)
     assert len(np.unique(z, axis=0)) == 4
@@ -234,7 +230,7 @@ def test_statistics_count_failures_and_average_the_rest():
     run = parts(20.0, 3.0, 0.5, period=0.2, t_end=21.0)
     wide = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
     trials = montecarlo.run(run, wide, 5, np.arange(64))
-    told = report.statistics(trials, "spacecraft")
+    told = results.statistics(trials, "spacecraft")
     assert told["trials"] == 64
     assert 0 < told["counts"]["singular"] < 64
     errors = trials.metrics.window_error[trials.ok]

@@ -1,22 +1,14 @@
-"""Which gains are free and their intervals; free reals <-> gains inside the bounds."""
+"""Intervals of the free gains; free reals <-> gains inside the bounds."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.rollout import Parts
-
-_STATE_UNITS = {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "x1"}
-# gain: unit, by the kind of the plant
-UNITS = {
-    "spacecraft": {"eta": "-", "delta": "s", "observer_gain": "N m s", "k1": "1/s", "sign_width": "-"},
-    "chain": {**_STATE_UNITS, "sign_width": "s"},
-    "system": _STATE_UNITS,
-}
+from ptsmc_jax.tables import Scenario
+from tuning import gains as gain_names
 
 
 @dataclass(frozen=True)
@@ -59,20 +51,9 @@ class Bounds:
         return sides
 
 
-def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
-    """The parts with other gains, by name; `observer_gain` is set on all axes."""
-    controller = {k: jnp.asarray(v, float) for k, v in gains.items() if k != "observer_gain"}
-    parts = replace(parts, controller=replace(parts.controller, **controller))
-    if "observer_gain" in gains:
-        gain = jnp.full(parts.plant.inputs, jnp.asarray(gains["observer_gain"], float))
-        parts = replace(parts, observer=replace(parts.observer, gain=gain))
-    return parts
-
-
-def gains_of(parts: Parts) -> dict[str, float]:
-    """Every tunable gain of the parts by name (the observer's, if there is one: the mean over the axes)."""
-    controller = parts.controller
-    gains = {"eta": float(controller.eta), "delta": float(controller.delta)}
-    if hasattr(parts.observer, "gain"):
-        gains["observer_gain"] = float(jnp.mean(parts.observer.gain))
-    return {**gains, "k1": float(controller.k1), "sign_width": float(controller.sign_width)}
+def of_scenario(scenario: Scenario) -> Bounds:
+    """The bounds of a checked scenario's free gains."""
+    assert scenario.tune is not None
+    names = gain_names.named(scenario)
+    intervals = [scenario.tune.bounds[gain_names.base(name)] for name in names]
+    return Bounds(names, tuple(low for low, _ in intervals), tuple(high for _, high in intervals))

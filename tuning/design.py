@@ -1,7 +1,6 @@
 """The design rule that a torque limit asks for: the shortest t_f, by theory and confirmed by simulation."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ from ptsmc_jax import montecarlo, scenario, theory
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.tables import Scenario
+from tuning.gains import with_gains
 
 FARTHEST = 100.0  # times the scenario's t_f: no longer one is looked at
 CLOSE = 1e-3  # relative width at which the search by simulation ends
@@ -60,21 +60,13 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
     roomy = scenario.study(scenario.replace(flown, controller__t_f=longest, loop__t_end=None))
 
     def simulated(t_f: float) -> float:
-        parts = _at(roomy.parts, t_f)
+        parts = with_gains(roomy.parts, {"t_f": t_f})
         result = montecarlo.run(parts, ready.dispersion, seed, trials)
         peaks = np.where(result.finished, result.metrics.peak_torque, np.inf)
         return float(peaks.max())
 
     found = _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
     return ShortestTime(limit, rule, found, len(trials))
-
-
-def _at(parts: Parts, t_f: Any) -> Parts:
-    """The parts with another t_f, the time after it kept."""
-    after = parts.t_end - parts.controller.t_f
-    timing = replace(parts.clock, t_end=t_f + after)
-    controller = replace(parts.controller, t_f=jnp.asarray(t_f, float))
-    return replace(parts, controller=controller, clock=timing, t_end=jnp.asarray(t_f + after, float))
 
 
 @jax.jit

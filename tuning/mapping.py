@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import linear, montecarlo, plotting, schema, store
+from ptsmc_jax import drawing, linear, montecarlo, schema, store, study_plots
 from ptsmc_jax.clock import Anchored, Flight
 from ptsmc_jax.observers import NonlinearObserver, NoObserver
 from ptsmc_jax.plants import Spacecraft
@@ -199,7 +199,7 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
         if not any(np.isfinite(grid).any() for grid in grids.values()):
             return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
         lost = np.array([cell.failures + cell.missed > 0 for cell in cells]).reshape(shape)
-        made = plotting.accuracy_map(
+        made = study_plots.accuracy_map(
             (x.key, x.values, x.logarithmic),
             (y.key, y.values, y.logarithmic),
             grids,
@@ -207,4 +207,4 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
             borders(scenario, x, y),
             scenario.plant.kind,
         )
-        plotting.save({"map": made}, folder / "figures")
+        drawing.save({"map": made}, folder / "figures")

@@ -1,67 +1,131 @@
-"""What is minimised: the window error over the training trials, with requirements as constraints per trial."""
+"""What is minimised over the training trials, with requirements as constraints per trial."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import montecarlo, rollout
-from ptsmc_jax.dispersions import Dispersion
+from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import Parts
-from tuning.bounds import with_gains
+from tuning.gains import with_gains
 
 FAILED = 1e3  # stands for the window error, and for metric / limit, of a trial that failed
+T_F = "t_f"
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Problem:
-    """A tuning problem. The first `averaged` trials count in the RMS, all of them in the constraints."""
+    """A tuning problem. The first `averaged` trials count in the objective, all of them in the constraints."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Leaf  # uint32
-    trials: Leaf  # (trials,) uint32
+    trials: Leaf  # (trials,) uint32, that name the noise
+    coordinates: Coordinates  # of what is drawn, arrays over the trials first
     limits: Leaf  # (requirements,) in the metrics' units
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
     # of the averaged trials, how many must keep each limit; None: every trial must
     least: tuple[int | None, ...] = field(default=(), metadata={"static": True})
+    goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
+    torque_weight: float = field(default=0.0, metadata={"static": True})
 
 
-def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array]:
-    """F = ln RMS window error [-] and c = metric / limit - 1, (requirements, trials): met where c <= 0.
+def problem(
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: int,
+    trials: np.ndarray,
+    names: tuple[str, ...],
+    requirements: Sequence[Requirement] = (),
+    **others: object,
+) -> Problem:
+    """A problem over these trials of the seed; others: fields of `Problem`."""
+    made = Problem(
+        parts=parts,
+        dispersion=dispersion,
+        seed=jnp.uint32(seed),
+        trials=jnp.zeros(0, dtype=jnp.uint32),
+        coordinates=dispersion_of(dispersion, parts, seed, np.zeros(0)),
+        limits=jnp.asarray([r.limit for r in requirements], dtype=float),
+        averaged=len(trials),
+        names=names,
+        metrics=tuple(r.metric for r in requirements),
+    )
+    return replace(with_trials(made, trials), **others)
 
-    The RMS is over the averaged trials, or the `tail` worst of them: CVaR, or with one the worst case. Where only some
-    must keep a limit, c of the others is cut down to that of the last one that must. A trial that fails counts with a
-    window error of `FAILED`, and as that many times over its limits.
+
+def dispersion_of(dispersion: Dispersion, parts: Parts, seed: int, trials: np.ndarray) -> Coordinates:
+    """Coordinates of these trials, arrays over the trials first."""
+    numbers = jnp.asarray(trials, dtype=jnp.uint32)
+    return _coordinates(dispersion, parts, jnp.uint32(seed), numbers)
+
+
+@jax.jit
+def _coordinates(dispersion: Dispersion, parts: Parts, seed: jax.Array, trials: jax.Array) -> Coordinates:
+    return jax.vmap(lambda trial: dispersion.coordinates(parts, seed, trial))(trials)
+
+
+def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None) -> Problem:
+    """The problem with these trials added, which count in the constraints; coordinates: if not their own."""
+    if coordinates is None:
+        coordinates = dispersion_of(problem.dispersion, problem.parts, int(problem.seed), trials)
+    return replace(
+        problem,
+        trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
+        coordinates={name: jnp.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
+    )
+
+
+def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
+    """F that is minimised, c = metric / limit - 1, (requirements, trials), met where c <= 0, and ln of the goal.
+
+    The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
+    worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
+    only some trials must keep a limit, c of the others is cut down to that of the last one that must. A trial that
+    fails counts with a metric of `FAILED`, and as that many times over its limits.
     """
-    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
+    named = dict(zip(problem.names, gains, strict=True))
+    parts = with_gains(problem.parts, named)
 
-    def fly(trial: Array) -> tuple[Array, Array]:
-        metrics, status, _, _ = montecarlo.one(parts, problem.dispersion, problem.seed, trial)
+    def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
+        trial, coordinates = case
+        metrics, status, _, _ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         ok = (status == rollout.OK) | (status == rollout.MISSED)
-        error = jnp.where(ok, metrics.window_error, FAILED)
         over = [
             jnp.where(ok, getattr(metrics, name) / limit, FAILED) - 1.0
             for name, limit in zip(problem.metrics, problem.limits, strict=True)
         ]
-        return error, jnp.stack(over) if over else jnp.zeros(0)
+        goal = metrics.window_error if problem.goal == T_F else getattr(metrics, problem.goal)
+        square, torque = (jnp.where(ok, v, FAILED) ** 2 for v in (goal, metrics.peak_torque))
+        return square, torque, jnp.stack(over) if over else jnp.zeros(0)
 
-    errors, over = montecarlo.blocks(fly, problem.trials)
-    squares = errors[: problem.averaged] ** 2
-    if problem.tail is not None:
-        squares = jax.lax.top_k(squares, problem.tail)[0]
+    squares, torques, over = montecarlo.blocks(fly, (problem.trials, problem.coordinates))
+    value = jnp.log(named[T_F]) if problem.goal == T_F else _log_rms(squares[: problem.averaged], problem.tail)
+    weighted = value
+    if problem.torque_weight:
+        weighted = value + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
     rows = [
         row if least is None else _cut(row, least, problem.averaged)
         for row, least in zip(over.T, problem.least or (None,) * len(problem.metrics), strict=True)
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
-    return 0.5 * jnp.log(jnp.mean(squares)), constraints
+    return weighted, constraints, value
+
+
+def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:
+    if tail is not None:
+        squares = jax.lax.top_k(squares, tail)[0]
+    return 0.5 * jnp.log(jnp.mean(squares))
 
 
 def _cut(over: Float[Array, " trials"], least: int, averaged: int) -> Float[Array, " trials"]:

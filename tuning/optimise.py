@@ -5,37 +5,43 @@ L = f + sum (max(0, m + p c)^2 - m^2) / (2 p) (Nocedal and Wright, Numerical Opt
 then the most promising ones one by one by sequential quadratic programming (SciPy's SLSQP).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from ptsmc_jax import montecarlo
 from ptsmc_jax.requirements import Requirement
-from tuning.bounds import Bounds, with_gains
-from tuning.objective import Problem, measure
+from tuning import worst as worst_case
+from tuning.evaluate import Evaluator, Sloped
+from tuning.objective import Problem, with_trials
+from tuning.worst import Hardest
 
 PENALTY = 20.0
 UPDATE_FROM, UPDATE_EVERY = 0.25, 5  # multipliers: updated from this share of the steps on, at this distance
 LARGEST_UPDATE = 0.02  # violations beyond this count as this much: far-off gains say nothing about multipliers
-POLISHED = 3  # starts that are polished
 POLISH_STEPS = 40  # iterations of each, at most
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
-CANDIDATES = 32  # points flown for each start that is chosen
+PATIENCE, GAINED = 30, 1e-3  # steps without this much less F in any start end the descent
+CANDIDATES = 64  # points flown for each start that is chosen
 CHARGE, APART = 3.0, 0.15
+CROSSED, FOLLOWED, CROSSINGS = 512, 4, 3  # points that share gains with the best one; those polished; times, at most
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
-SCREENED = 4096  # trials looked through for those that a limit depends on
-HARDEST = 8  # of them that join the constraints
-DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
-FLAT = 1e-6  # slopes of the log error below this are none
-ROUNDS = 2  # searches again with hardest trials added, at most
+SLACK = 1e-4  # of it that an admissible iterate may use
+SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
+HARDEST = 8  # of the screened trials, that join the constraints
+SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
+ROUNDS = 6  # searches again with hardest trials added, at most
+NEAR = 1e-3  # how far the worst case may be beyond a limit
+
+CHOOSING, CROSSING = "choosing starts", "looking for a better valley"
+# what is being done, steps done, in all, best goal, how far beyond a limit
+Report = Callable[[str, int, int, float, float], None]
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class Step:
     """One step of all starts, arrays over starts first; kept as the history."""
 
     gains: np.ndarray  # (starts, gains)
-    rms: np.ndarray  # (starts,) RMS window error of the training trials [-]
+    value: np.ndarray  # (starts,) the goal over the training trials
     worst: np.ndarray  # (starts, requirements) largest metric / limit
 
 
@@ -52,229 +58,314 @@ class Search:
     """Outcome of a search."""
 
     gains: np.ndarray  # (gains,) the best admissible iterate
-    rms: float  # its RMS window error over the training trials
+    z: np.ndarray  # its free reals
+    value: float  # its goal over the training trials
     worst: np.ndarray  # (requirements,) its largest metric / limit
     history: list[Step]
-    dropped: list[int]  # starts that met a number that is not finite
-    rounds: int  # searches again with harder trials
-    slope_error: tuple[float, float]  # of the objective's slopes at the first start and at the end, see `slope_error`
-    trials: np.ndarray  # training trials and the hardest ones
+    problem: Problem  # with the hardest trials
+    first: np.ndarray  # (gains,) free reals of the first start
+    dropped: list[int] = field(default_factory=list)  # starts that met a number that is not finite
+    rounds: int = 0  # searches again with harder trials
+    margin: float = MARGIN  # that was kept from the limits
+    hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
+    interrupted: bool = False
 
 
-def starting_points(problem: Problem, bounds: Bounds, own: np.ndarray, starts: int, seed: int) -> np.ndarray:
-    """(starts, gains) free reals: the scenario's own gains first, then the most promising of a Latin hypercube.
-
-    Each is flown once without gradients; chosen are the lowest errors, breaches of a limit charged, none nearer than
-    `APART` to another in the unit cube: the valleys of this problem are narrow, and one of them can hide another.
-    """
-    first = bounds.free(own)[None]
+def starting_points(
+    evaluate: Evaluator, problem: Problem, own: np.ndarray, starts: int, seed: int, report: Report
+) -> np.ndarray:
+    """(starts, gains) free reals: the scenario's own gains first, then the most promising of a Latin hypercube."""
+    first = evaluate.bounds.free(own)[None]
     if starts == 1:
         return first
-    share = qmc.LatinHypercube(len(bounds.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
-    share = 0.02 + 0.96 * share
-    z = np.log(share / (1.0 - share))
-    f, c = map(np.asarray, _fly(problem, bounds, z, _divisor(len(z))))
-    merit = f + CHARGE * np.log1p(c.max(axis=(1, 2), initial=0.0))
-    order = [k for k in np.argsort(merit) if np.isfinite(merit[k])]
+    share = qmc.LatinHypercube(len(problem.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
+    z = logit(0.02 + 0.96 * share)
+    return np.concatenate([first, _promising(evaluate, problem, z, starts - 1, partial(report, CHOOSING))])
+
+
+def _promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int, tell: Callable) -> np.ndarray:
+    """So many of the points z, (points, gains), by F with breaches of a limit charged: one of each valley first.
+
+    A point that has no better one within `APART` of it, in the unit cube, is taken for the lowest of its valley (as in
+    multi-level single linkage, Rinnooy Kan and Timmer, Math. Programming 39, 1987); the others follow, not too close.
+    """
+    merit = []
+    for k in range(0, len(z), 64):
+        flown = evaluate.fly(problem, z[k : k + 64])
+        merit.append(flown.f + CHARGE * np.log1p(flown.c.max(axis=(1, 2), initial=0.0)))
+        tell(min(k + 64, len(z)), len(z), np.nan, np.nan)
+    merits, share = np.concatenate(merit), 1.0 / (1.0 + np.exp(-z))
+    order = np.asarray([k for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])], dtype=int)
+    apart = np.abs(share[order, None] - share[None, order]).max(axis=2)  # row and column by merit
+    lowest = [k for k in range(len(order)) if np.all(apart[k, :k] >= APART)]
     chosen: list[int] = []
-    for apart in (APART, 0.0):
-        for k in order:
-            distances = [np.abs(share[k] - share[j]).max() for j in chosen]
-            if len(chosen) < starts - 1 and k not in chosen and min(distances, default=1.0) >= apart:
+    for candidates, distance in ((lowest, 0.0), (range(len(order)), APART), (range(len(order)), 0.0)):
+        for k in candidates:
+            if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
                 chosen.append(k)
-    return np.concatenate([first, z[chosen]])
+    return z[order[chosen]]
+
+
+def logit(share: np.ndarray) -> np.ndarray:
+    """Free reals of shares of the bounds' intervals."""
+    return np.log(share / (1.0 - share))
 
 
 def search(
+    evaluate: Evaluator,
     problem: Problem,
-    bounds: Bounds,
-    requirements: tuple[Requirement, ...],
+    requirements: Sequence[Requirement],
     own: np.ndarray,
     starts: int,
     steps: int,
     seed: int,
-    report: Callable[[int, int, float, bool], None] = lambda done, total, rms, admissible: None,
+    *,
+    robust: bool = False,
+    report: Report = lambda *told: None,
 ) -> Search:
-    """Minimise the window error with every requirement met on the training trials.
+    """Minimise F with every requirement met on the training trials.
 
-    A limit on the worst case hangs on the few hardest trials, which a training set need not hold: the hardest of
-    `SCREENED` further ones join the constraints first, and again after a search whose gains some of them still break.
-    own: (gains,) the scenario's gains, the first start. report(steps done, in all, best RMS, admissible) is called
-    after every step.
+    A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
+    screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
+    not those drawn, but the worst case inside the dispersions' support. own: (gains,) the scenario's gains, the first
+    start. report is called after every step. Interrupted, it returns the best so far once there is one.
     """
-    requirements = tuple(r for r in requirements if r.quantile is None)  # those that hang on the hardest trials
-    problem = _add_hardest(problem, requirements, np.asarray(bounds.gains(jnp.zeros(len(bounds.names)))))
-    z = starting_points(problem, bounds, own, starts, seed)
-    found = _descend(problem, bounds, z, steps, report)
-    rounds, checked = 0, slope_error(problem, bounds, z[0], len(z))
-    while requirements and rounds < ROUNDS and not _holds(problem, requirements, found.gains):
-        rounds += 1
-        problem = _add_hardest(problem, requirements, found.gains)
-        again = _descend(problem, bounds, bounds.free(found.gains, edge=1e-6)[None], max(20, steps // 3), report)
-        found = replace(again, history=[*found.history, *again.history], dropped=found.dropped, rounds=rounds)
-    end = bounds.free(found.gains, edge=1e-6)
-    return replace(found, slope_error=(checked, slope_error(problem, bounds, end, len(z))))
+    sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
+    margin = SURE_MARGIN if robust or problem.trials.size == 1 else MARGIN
+    run = _Run(evaluate, margin, report)
+    first, interrupted, hardest = evaluate.bounds.free(own), False, None
+    try:
+        if sure:
+            middle = np.asarray(evaluate.bounds.gains(jnp.zeros(len(problem.names))))
+            problem = _with_room(_add_screened(problem, sure, middle))
+        z = starting_points(evaluate, problem, own, starts, seed, report)
+        run.descend(problem, z, steps, "searching")
+        run.cross(problem, np.random.default_rng(seed))
+        rounds = 0
+        while sure:
+            found = run.gains
+            if robust:
+                report("looking for the worst case", 0, 0, *run.best_so_far)
+                hardest = worst_case.hardest(problem, sure, found)
+                if hardest.unbounded or hardest.ratio <= 1.0 + NEAR or rounds == ROUNDS:
+                    break
+                problem = _add(problem, np.asarray([hardest.trial]), hardest.coordinates)
+            else:
+                trials, ratio = worst_case.screen(problem, sure, found)
+                if np.all(ratio <= 1.0) or rounds == ROUNDS:
+                    break
+                problem = _add_screened(problem, sure, found, (trials, ratio))
+            rounds += 1
+            again = max(20, steps // 3)
+            run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
+            run.rounds = rounds
+        if sure and hardest is None:
+            report("looking for the worst case", 0, 0, *run.best_so_far)
+            hardest = worst_case.hardest(problem, sure, run.gains)
+    except KeyboardInterrupt:
+        if not run.started:
+            raise
+        interrupted = True
+    return replace(run.outcome(first), hardest=hardest, interrupted=interrupted)
 
 
-def slope_error(problem: Problem, bounds: Bounds, z: np.ndarray, batch: int) -> float:
-    """Largest difference of the objective's slopes, by automatic differentiation, from central differences.
-
-    Over the largest slope, in the free reals; differences of order 4 over +-`DIFFERENCE`. batch: points flown at once.
-    """
-    count = z.size
-    offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
-    points = np.concatenate([z[None], z + offsets])
-    points = np.resize(points, (-(-len(points) // batch) * batch, count))
-    flown = [_evaluate(problem, bounds, points[k : k + batch]) for k in range(0, len(points), batch)]
-    f = np.concatenate([f for _, f, *_ in flown])[1 : 1 + 4 * count].reshape(4, count)
-    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
-    exact = flown[0][3][0]
-    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), FLAT))
+def _with_room(problem: Problem) -> Problem:
+    """With `SPARE` places more, that hold the first trial again: it counts in the constraints, which it meets twice."""
+    return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], SPARE))
 
 
-def _screen(problem: Problem, requirements, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trials that no search has seen and how near each comes to its limits (largest metric / limit)."""
-    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
-    trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
-    flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
-    ratios = [np.where(flown.finished, getattr(flown.metrics, r.metric) / r.limit, np.inf) for r in requirements]
-    return trials, np.max(ratios, axis=0)
+def _add(problem: Problem, trials: np.ndarray, coordinates: dict | None = None) -> Problem:
+    """The problem with these trials in the places that repeat the first one; with more trials, if none is left."""
+    spare = [k for k in range(problem.averaged, problem.trials.size) if problem.trials[k] == problem.trials[0]]
+    if len(spare) < len(trials):
+        spare = list(range(problem.averaged, problem.trials.size))[: len(trials)]  # those that joined first
+    places = jnp.asarray(spare[: len(trials)])
+    numbers = jnp.asarray(trials, dtype=jnp.uint32)
+    if coordinates is None:
+        own = worst_case.dispersion_of(problem.dispersion, problem.parts, int(problem.seed), trials)
+    else:
+        own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
+    return replace(
+        problem,
+        trials=problem.trials.at[places].set(numbers),
+        coordinates={name: v.at[places].set(own[name]) for name, v in problem.coordinates.items()},
+    )
 
 
-def _add_hardest(problem: Problem, requirements, gains: np.ndarray) -> Problem:
-    if not requirements or not problem.dispersion.varies:
-        return problem
-    trials, ratio = _screen(problem, requirements, gains)
+def _add_screened(problem: Problem, requirements, gains: np.ndarray, screened: tuple | None = None) -> Problem:
+    trials, ratio = screened or worst_case.screen(problem, requirements, gains)
     known = set(np.asarray(problem.trials).tolist())
-    order = [t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST]
-    return replace(problem, trials=jnp.concatenate([problem.trials, jnp.asarray(order, dtype=jnp.uint32)]))
+    hardest = np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)
+    return with_trials(problem, hardest) if screened is None else _add(problem, hardest)
 
 
-def _holds(problem: Problem, requirements, gains: np.ndarray) -> bool:
-    if not problem.dispersion.varies:
-        return True
-    return bool(np.all(_screen(problem, requirements, gains)[1] <= 1.0))
+def largest(c: np.ndarray, margin: float) -> np.ndarray:
+    """(points, requirements) largest metric / limit, from constraints against limits that are tighter by a margin."""
+    return (c.max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
 
 
-class _Best:
-    """The best iterate so far of each start: admissible ones by their error, others by how far they are over."""
+class Best:
+    """The best iterate so far of each start: admissible ones by their F, others by how far they are over."""
 
-    def __init__(self, starts: int, gains: int):
-        self.z = np.zeros((starts, gains))
-        self.rms, self.over = np.full(starts, np.inf), np.full(starts, np.inf)
+    def __init__(self, z: np.ndarray, requirements: int, margin: float):
+        self.z, self.margin = z.copy(), margin
+        self.f, self.value, self.over = (np.full(len(z), np.inf) for _ in range(3))
+        self.worst = np.full((len(z), requirements), np.inf)  # largest metric / limit
 
-    def offer(self, z: np.ndarray, rms: np.ndarray, worst: np.ndarray, allowed: np.ndarray) -> None:
-        """Keep what is better; arrays over starts. Admissible is what keeps nearly the whole margin from the limits."""
-        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - 0.9 * MARGIN), 0.0)
-        better = allowed & ((over < self.over) | ((over == self.over) & (rms < self.rms)))
-        self.z[better], self.rms[better], self.over[better] = z[better], rms[better], over[better]
+    def offer(self, z: np.ndarray, seen: Sloped, allowed: np.ndarray, starts: slice = slice(None)) -> None:
+        """Keep what is better; arrays over these starts. Admissible is what keeps the margin but for `SLACK`."""
+        worst = largest(seen.c, self.margin)
+        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
+        better = allowed & ((over < self.over[starts]) | ((over == self.over[starts]) & (seen.f < self.f[starts])))
+        kept = (self.z, self.f, self.value, self.over, self.worst)
+        for old, new in zip(kept, (z, seen.f, np.exp(seen.value), over, worst), strict=True):
+            old[starts][better] = new[better]
+
+    def add(self, z: np.ndarray) -> list[int]:
+        """More starts, z (starts, gains); returns their numbers."""
+        more = Best(z, self.worst.shape[1], self.margin)
+        for name in ("z", "f", "value", "over", "worst"):
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
+        return list(range(len(self.f) - len(z), len(self.f)))
 
     def order(self) -> np.ndarray:
         """Starts from the best to the worst."""
-        return np.lexsort((self.rms, self.over))
+        return np.lexsort((self.f, self.over))
 
 
-def _descend(problem: Problem, bounds: Bounds, z: np.ndarray, steps: int, report: Callable) -> Search:
-    # slopes range over decades as limits are crossed: clipped, and with a short memory of their size
-    rate = optax.cosine_decay_schedule(RATE, steps, LAST_RATE / RATE)
-    optimiser = optax.chain(optax.clip(LARGEST_SLOPE), optax.adam(rate, b2=0.9))
-    tightened = replace(problem, limits=problem.limits * (1.0 - MARGIN))
-    starts = len(z)
-    multipliers = np.zeros((starts, len(problem.metrics), problem.trials.size))
-    state = optimiser.init(jnp.asarray(z))
-    history: list[Step] = []
-    best, alive = _Best(*z.shape), np.ones(starts, dtype=bool)
-    for step in range(steps + 1):
-        gains, f, c, f_slope, c_slope = _evaluate(tightened, bounds, z)
-        rms, worst = np.exp(f), (c.max(axis=2, initial=-1.0) + 1.0) * (1.0 - MARGIN)
-        alive &= np.isfinite(rms) & np.all(np.isfinite(f_slope), axis=1) & np.all(np.isfinite(c_slope), axis=(1, 2, 3))
-        history.append(Step(gains, rms, worst))
-        best.offer(z, rms, worst, alive)
-        first = best.order()[0]
-        report(step, steps, float(best.rms[first]), bool(best.over[first] == 0.0))
-        if step == steps or not alive.any():
-            break
-        if step >= UPDATE_FROM * steps and step % UPDATE_EVERY == 0:
-            multipliers = np.maximum(0.0, multipliers + PENALTY * np.clip(c, -LARGEST_UPDATE, LARGEST_UPDATE))
-        force = np.maximum(0.0, multipliers + PENALTY * c)
-        slope = f_slope + np.einsum("srt,srtg->sg", force, c_slope)
-        updates, state = optimiser.update(jnp.where(alive[:, None], slope, 0.0), state)
-        z = np.asarray(optax.apply_updates(z, updates))
-    for start in best.order()[:POLISHED]:
-        if np.isfinite(best.rms[start]):
-            _polish(tightened, bounds, best, int(start))
-    chosen = best.order()[0]
-    gains, f, c, _, _ = _evaluate(tightened, bounds, best.z[chosen : chosen + 1])
-    worst = (c[0].max(axis=1, initial=-1.0) + 1.0) * (1.0 - MARGIN)
-    dropped = np.flatnonzero(~alive).tolist()
-    unchecked = (np.nan, np.nan)
-    return Search(gains[0], float(np.exp(f[0])), worst, history, dropped, 0, unchecked, np.asarray(problem.trials))
+class _Run:
+    """Descents and what they leave: the best iterate, the history."""
+
+    def __init__(self, evaluate: Evaluator, margin: float, report: Report):
+        self._evaluate, self._margin, self._report = evaluate, margin, report
+        self._best: Best | None = None
+        self._problem: Problem | None = None
+        self._history: list[Step] = []
+        self._dropped: list[int] = []
+        self.rounds = 0
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an iterate at all."""
+        return self._best is not None and bool(np.isfinite(self._best.f).any())
+
+    @property
+    def best_so_far(self) -> tuple[float, float]:
+        """The goal of the best iterate, and how far it is beyond a limit."""
+        assert self._best is not None
+        first = self._best.order()[0]
+        return float(self._best.value[first]), float(self._best.over[first])
+
+    @property
+    def gains(self) -> np.ndarray:
+        """(gains,) of the best iterate."""
+        assert self._best is not None
+        return np.asarray(self._evaluate.bounds.gains(jnp.asarray(self._best.z[self._best.order()[0]])))
+
+    def descend(self, problem: Problem, z: np.ndarray, steps: int, what: str) -> None:
+        """All starts by Adam, then a polish of the best ones."""
+        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
+        best, alive = Best(z, len(problem.metrics), self._margin), np.ones(len(z), dtype=bool)
+        # slopes range over decades as limits are crossed: clipped, and with a short memory of their size
+        rate = optax.cosine_decay_schedule(RATE, steps, LAST_RATE / RATE)
+        optimiser = optax.chain(optax.clip(LARGEST_SLOPE), optax.adam(rate, b2=0.9))
+        multipliers = np.zeros((len(z), len(problem.metrics), problem.trials.size))
+        state, record = optimiser.init(jnp.asarray(z)), list[tuple[float, float]]()
+        for step in range(steps + 1):
+            seen = self._evaluate.slopes(tightened, z)
+            alive &= seen.finite
+            best.offer(z, seen, alive)
+            if not self._history or np.isfinite(best.f).any():
+                self._best, self._problem = best, tightened
+            self._history.append(Step(seen.gains, np.exp(seen.value), largest(seen.c, self._margin)))
+            first = best.order()[0]
+            self._report(what, step, steps, float(best.value[first]), float(best.over[first]))
+            record.append((float(best.over[first]), float(best.f[first])))
+            if step == steps or not alive.any() or _stalled(record, UPDATE_FROM * steps):
+                break
+            if step >= UPDATE_FROM * steps and step % UPDATE_EVERY == 0:
+                multipliers += PENALTY * np.clip(seen.c, -LARGEST_UPDATE, LARGEST_UPDATE)
+                multipliers = np.maximum(0.0, multipliers)
+            force = np.maximum(0.0, multipliers + PENALTY * seen.c)
+            slope = seen.f_slope + np.einsum("srt,srtg->sg", force, seen.c_slope)
+            updates, state = optimiser.update(jnp.where(alive[:, None], slope, 0.0), state)
+            z = np.asarray(optax.apply_updates(jnp.asarray(z), updates))
+        if not self._dropped and len(z) > 1:
+            self._dropped = np.flatnonzero(~alive).tolist()
+        # all of them: the best start of a descent need not lie in the best valley
+        self._polish(tightened, best, [int(start) for start in best.order() if np.isfinite(best.f[start])])
+
+    def cross(self, problem: Problem, rng: np.random.Generator) -> None:
+        """Look for a better valley: points that share some gains, and so the active limits, with the best one."""
+        best, count = self._best, len(problem.names)
+        if count < 2 or not self.started:
+            return
+        assert best is not None
+        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
+        for _ in range(CROSSINGS):
+            before, f = self.best_so_far, best.f[best.order()[0]]
+            share = 0.02 + 0.96 * rng.random((CROSSED, count))
+            kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
+            points = np.where(kept, best.z[best.order()[0]], logit(share))
+            z = _promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
+            self._polish(tightened, best, best.add(z))
+            if self.best_so_far[1] >= before[1] and f - best.f[best.order()[0]] < GAINED:
+                return
+
+    def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
+        for k, start in enumerate(starts):
+            self._report("polishing", k, len(starts), *self.best_so_far)
+            polish(self._evaluate, tightened, best, start)
+
+    def outcome(self, first: np.ndarray) -> Search:
+        """The best iterate."""
+        assert self._best is not None
+        assert self._problem is not None
+        best = self._best.order()[0]
+        return Search(
+            gains=self.gains,
+            z=self._best.z[best],
+            value=float(self._best.value[best]),
+            worst=self._best.worst[best],
+            history=self._history,
+            problem=replace(self._problem, limits=self._problem.limits / (1.0 - self._margin)),
+            first=first,
+            dropped=self._dropped,
+            rounds=self.rounds,
+            margin=self._margin,
+        )
 
 
-def _polish(problem: Problem, bounds: Bounds, best: _Best, start: int) -> None:
+def _stalled(record: list[tuple[float, float]], earliest: float) -> bool:
+    """Whether the best of all starts has hardly become better over the last `PATIENCE` steps."""
+    if len(record) <= max(earliest, PATIENCE):
+        return False
+    (over_before, f_before), (over, f) = record[-1 - PATIENCE], record[-1]
+    return over_before == over == 0.0 and f_before - f < GAINED
+
+
+def polish(evaluate: Evaluator, problem: Problem, best: Best, start: int) -> None:
     """Follow the active limits to the optimum next to a start's best iterate; what is better is kept in `best`."""
-    seen: dict[bytes, tuple] = {}
+    seen: dict[bytes, Sloped] = {}
 
-    def at(z: np.ndarray) -> tuple:
+    def at(z: np.ndarray) -> Sloped:
         key = z.tobytes()
         if key not in seen:
-            seen[key] = _evaluate(problem, bounds, z[None])
-            _, f, c, _, _ = seen[key]
-            worst = (c.max(axis=2, initial=-1.0) + 1.0) * (1.0 - MARGIN)
-            one = _Best(1, z.size)
-            one.z, one.rms, one.over = (v[start : start + 1] for v in (best.z, best.rms, best.over))
-            one.offer(z[None], np.exp(f), worst, np.isfinite(f))
+            seen[key] = evaluate.slopes(problem, z[None])
+            best.offer(z[None], seen[key], seen[key].finite, slice(start, start + 1))
         return seen[key]
 
     limits = {
         "type": "ineq",
-        "fun": lambda z: -at(z)[2].reshape(-1),
-        "jac": lambda z: -at(z)[4].reshape(-1, z.size),
+        "fun": lambda z: -at(z).c.reshape(-1),
+        "jac": lambda z: -at(z).c_slope.reshape(-1, z.size),
     }
     minimize(
-        lambda z: float(at(z)[1][0]),
+        lambda z: float(at(z).f[0]),
         best.z[start].copy(),
-        jac=lambda z: at(z)[3][0],
+        jac=lambda z: at(z).f_slope[0],
         method="SLSQP",
         bounds=[(-8.0, 8.0)] * best.z.shape[1],
         constraints=[limits] if problem.metrics else [],
         options={"maxiter": POLISH_STEPS, "ftol": 1e-7},
     )
-
-
-@partial(jax.jit, static_argnames=("bounds", "devices"))
-def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """Measures f and c of (points, gains) free reals, without derivatives, point after point."""
-
-    def share(z: jax.Array) -> tuple:
-        return jax.lax.map(lambda z: measure(problem, bounds.gains(z)), z)
-
-    return montecarlo.spread(share, z, devices)
-
-
-def _divisor(count: int) -> int:
-    """The most local devices that share `count` things evenly."""
-    return max(d for d in range(1, len(jax.local_devices()) + 1) if count % d == 0)
-
-
-def _evaluate(problem: Problem, bounds: Bounds, z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """For each start: gains, f, c and their derivatives by z; starts shared out over as many devices as divide them."""
-    devices = _divisor(len(z))
-    # plain arrays in and out: what came back spread over the devices would be compiled for anew
-    gains, f, c, f_slope, c_slope = map(np.asarray, _compiled(problem, bounds, z, devices))
-    return gains, f, c, f_slope, c_slope
-
-
-@partial(jax.jit, static_argnames=("bounds", "devices"))
-def _compiled(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> tuple:
-    """Tangents forward, as one more batch axis; start after start, so that a branch on the time stays a branch."""
-
-    def one(z: jax.Array) -> tuple:
-        def twice(z: jax.Array) -> tuple:
-            measured = measure(problem, bounds.gains(z))
-            return measured, measured
-
-        (f_slope, c_slope), (f, c) = jax.jacfwd(twice, has_aux=True)(z)
-        return bounds.gains(z), f, c, f_slope, c_slope
-
-    return montecarlo.spread(lambda z: jax.lax.map(one, z), z, devices)

@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ptsmc_jax import paper, plotting, remark_2, schema, slips, store
+from ptsmc_jax import drawing, paper, plotting, remark_2, schema, slips, store
 from ptsmc_jax.plants import Chain
 from ptsmc_jax.runs import Run
 from ptsmc_jax.scenario import from_tables
@@ -60,7 +60,7 @@ def write(folder: Path, made: Reproduction, figures: bool) -> None:
     for name, (_, _, tables) in paper.CASES.items():
         store.write_toml(folder / "scenarios" / f"{name}.toml", schema.dump(from_tables(tables)))
     if figures:
-        plotting.save(_figures(made), folder / "figures")
+        drawing.save(_figures(made), folder / "figures")
 
 
 def _figures(made: Reproduction) -> dict[str, Figure]:

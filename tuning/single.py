@@ -21,7 +21,7 @@ def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | No
     header = ["t", *(f"{name}{k + 1}" for name, block in columns.items() for k in range(block.shape[1]))]
     store.write_csv(folder / "trajectory.csv", header, np.column_stack([log.t, *columns.values()]).tolist())
     if figures:
-        from ptsmc_jax import plotting  # takes 0.3 s, which a run without figures need not wait for
+        from ptsmc_jax import drawing, plotting  # takes 0.3 s, which a run without figures need not wait for
 
         limit = next((v.limit for v in run.verdicts if v.metric.startswith("peak_torque")), None)
-        plotting.save(plotting.run_figures(run.parts, log, limit), folder / "figures")
+        drawing.save(plotting.run_figures(run.parts, log, limit), folder / "figures")

@@ -15,7 +15,7 @@ def main() -> None:
     """Fly every row without noise, with noise, and with noise through the filter; else scenarios/first_flight.toml."""
     configure()
     from ptsmc_jax import montecarlo, scenario
-    from tuning.report import with_gains
+    from tuning.gains import in_scenario
 
     base = scenario.from_tables(
         {
@@ -33,7 +33,7 @@ def main() -> None:
     for eta, delta, gain in GAINS:
         rms, peak = [], []
         for case in (quiet, base, filtered):
-            ready = scenario.study(with_gains(case, {"eta": eta, "delta": delta, "observer_gain": gain}))
+            ready = scenario.study(in_scenario(case, {"eta": eta, "delta": delta, "observer_gain": gain}))
             trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(TRIALS))
             assert np.all(trials.ok)
             rms.append(float(np.sqrt(np.mean(trials.metrics.window_error**2))))

@@ -1,0 +1,58 @@
+"""The common look of all figures, and how they are written."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import matplotlib.ticker
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
+STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"))
+TIME = "time [s]"
+RC: Any = {
+    "font.size": 11,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "savefig.dpi": 130,
+}
+
+
+def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write NAME.png for each figure into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name}.png")
+    return [folder / f"{name}.png" for name in figures]
+
+
+def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
+    """A figure of one plot over time."""
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+        axes = figure.subplots()
+        axes.set(xlabel=TIME, ylabel=ylabel)
+        axes.set_title(title, loc="left", pad=19)
+    return figure, axes
+
+
+def edges(values: Sequence[float], logarithmic: bool) -> np.ndarray:
+    """Borders of the cells around these values, half way to the next one on the axis as it is drawn."""
+    middle = np.log(values) if logarithmic else np.asarray(values)
+    between = (middle[:-1] + middle[1:]) / 2
+    edges = np.concatenate([[2 * middle[0] - between[0]], between, [2 * middle[-1] - between[-1]]])
+    return np.exp(edges) if logarithmic else edges
+
+
+def plain_ticks(line: Any) -> None:
+    """Numbers such as 0.05 on a log axis."""
+    line.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    line.set_minor_formatter(matplotlib.ticker.NullFormatter())

@@ -1,0 +1,143 @@
+"""What tuning may move in a scenario: the default bounds of each gain, and how far they may be set."""
+
+import math
+
+import msgspec
+
+from ptsmc_jax import schema, sensors, tables
+from ptsmc_jax.schema import ScenarioError, wrong
+from ptsmc_jax.tables import Scenario
+
+FINITE_TIME = tables.FiniteTimeObserver | tables.EachFiniteTimeObserver
+MOST_STEPS = 200_000  # of a run
+
+
+def least_eta(scenario: Scenario) -> float:
+    """What eta must exceed: 2 by Theorems 1 and 2, the order of a chain by Theorem 3."""
+    return float(scenario.plant.order) if isinstance(scenario.plant, tables.ChainPlant) else 2.0
+
+
+def filter_bandwidth(scenario: Scenario) -> float:
+    """Bandwidth of the scenario's filter [rad/s]: where star tracker and gyro weigh the same, if it gives none."""
+    assert isinstance(scenario.filter, tables.SteadyStateFilter)
+    if scenario.filter.bandwidth is not None:
+        return scenario.filter.bandwidth
+    table, period = scenario.hardware, scenario.loop.period
+    assert isinstance(table, tables.Hardware)
+    gyro = table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
+    return sensors.best_bandwidth(table.attitude_noise or 0.0, gyro, period, _interval(scenario))
+
+
+def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
+    """The table with its defaults: gains, bounds, level."""
+    free = tune.free
+    if free is None:
+        free = ("eta", "delta", "observer_gain") if _has_gain(scenario) else ("eta", "delta")
+    bounds = {**{key: _default(scenario, tune, key, free) for key in free if key not in tune.bounds}, **tune.bounds}
+    bounds = {key: bounds[key] for key in (*free, *(key for key in bounds if key not in free)) if key in bounds}
+    level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
+    return msgspec.structs.replace(tune, free=free, bounds=bounds, level=level)
+
+
+def check(scenario: Scenario, tune: tables.Tune) -> None:
+    """Raise ScenarioError where the table asks for what cannot be tuned."""
+    free = tune.free
+    assert free is not None  # `resolve` filled it in
+    if len(set(free)) < len(free):
+        raise wrong("tune.free", free, "a list that names each gain once")
+    said = f"tune.free is {schema.show(free)}, but"
+    if "observer_gain" in free and not _has_gain(scenario):
+        raise ScenarioError(
+            f'{said} observer.kind = "none" has no gain; allowed is observer_gain with an observer of another kind'
+        )
+    if "filter_bandwidth" in free and not isinstance(scenario.filter, tables.SteadyStateFilter):
+        raise ScenarioError(
+            f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
+        )
+    if "t_f" in free and isinstance(scenario.observer, tables.Prescribed) and scenario.observer.t_o is None:
+        raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
+    if tune.per_axis and "observer_gain" not in free:
+        raise ScenarioError(f"tune.per_axis is true, but tune.free is {schema.show(free)}, without observer_gain")
+    if tune.level is not None and tune.objective != "cvar":
+        raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
+    if tune.objective == "t_f":
+        if "t_f" not in free:
+            raise ScenarioError(f'{said} tune.objective = "t_f" needs t_f to be free')
+        if not scenario.requirements:
+            raise ScenarioError('tune.objective is "t_f", but there is no requirement that a short t_f could break')
+        if tune.torque_weight:
+            raise wrong("tune.torque_weight", tune.torque_weight, 'absent where tune.objective is "t_f"')
+    for name, bounds in tune.bounds.items():
+        _check_bounds(scenario, tune, name, bounds)
+
+
+def _check_bounds(scenario: Scenario, tune: tables.Tune, name: str, bounds: tuple[float, float]) -> None:
+    key, (lower, upper), free = f"tune.bounds.{name}", bounds, tune.free or ()
+    if name not in tables.FREE:
+        raise ScenarioError(f"{key} is not a known gain; the nearest known one is {schema.nearest(name, tables.FREE)}")
+    if name not in free:
+        raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.show(free)}")
+    least, most, closed = _range(scenario, tune, name)
+    if not (least <= lower if closed else least < lower) or not upper < most:
+        allowed = f"two numbers {'from' if closed else 'above'} {least}"
+        raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
+    if lower >= upper:
+        raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")
+
+
+def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, float, bool]:
+    """Lowest and highest that a bound may be, and whether the lowest itself may be."""
+    loop, shortest = scenario.loop, _shortest_delta(scenario)
+    if name == "eta":
+        return least_eta(scenario), math.inf, False
+    if name == "delta":  # below every t_f
+        return shortest, tune.bounds.get("t_f", (scenario.controller.t_f,))[0], shortest > 0.0
+    if name == "t_f":
+        least = max(scenario.controller.delta if "delta" not in (tune.free or ()) else shortest, _t_o(scenario))
+        assert loop.t_end is not None
+        hold = loop.t_end - scenario.controller.t_f
+        return least, MOST_STEPS * loop.period - hold if loop.mode == "sampled" else math.inf, False
+    if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):
+        least = scenario.controller.disturbance_rate_bound
+        return least, math.inf, least > 0.0
+    return 0.0, math.inf, False
+
+
+def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, ...]) -> tuple[float, float]:
+    t_f, delta = scenario.controller.t_f, scenario.controller.delta
+    if name == "eta":
+        return least_eta(scenario) + 0.05, least_eta(scenario) + 6.0
+    if name == "t_f":
+        least = delta if "delta" not in free else 4.0 * _shortest_delta(scenario)
+        return max(0.5 * t_f, 1.05 * least, 1.05 * _t_o(scenario)), 2.0 * t_f
+    if name == "delta":
+        if "t_f" in free:  # below every t_f
+            t_f = (tune.bounds.get("t_f") or _default(scenario, tune, "t_f", free))[0]
+        lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
+        return lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)
+    if name == "filter_bandwidth":
+        own = filter_bandwidth(scenario) if isinstance(scenario.filter, tables.SteadyStateFilter) else 1.0
+        return 0.1 * own, max(own, min(10.0 * own, 1.0 / _interval(scenario)))
+    if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
+        assert scenario.observer.gain is not None
+        own = min(scenario.observer.gain), max(scenario.observer.gain)
+        return max(scenario.controller.disturbance_rate_bound, 0.05 * own[0]), 50.0 * own[1]
+    return {"observer_gain": (0.5, 300.0), "k1": (0.1, 10.0), "sign_width": (1e-5, 1e-1)}[name]
+
+
+def _has_gain(scenario: Scenario) -> bool:
+    return not isinstance(scenario.observer, tables.NoObserver)
+
+
+def _interval(scenario: Scenario) -> float:
+    """Between two samples of the star tracker [s]."""
+    return scenario.loop.period * (getattr(scenario.hardware, "star_tracker_every", None) or 1)
+
+
+def _shortest_delta(scenario: Scenario) -> float:
+    return scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+
+
+def _t_o(scenario: Scenario) -> float:
+    """Prescribed time of the observer [s], which t_f must not fall below."""
+    return getattr(scenario.observer, "t_o", None) or 0.0

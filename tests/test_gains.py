@@ -1,0 +1,114 @@
+"""Gains by name: moved in parts as in the scenario, axis by axis, the time after t_f kept."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import montecarlo, rollout, sensors
+from ptsmc_jax.scenario import from_tables, study
+from tests.helpers import finer, vector
+from tuning import bounds, gains, report
+
+BASE = {
+    "spacecraft": {"inertia": [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]},
+    "controller": {"t_f": 8.0, "delta": 0.5},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0},
+    "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "rate_bias_walk": 1e-8, "star_tracker_every": 2},
+    "filter": {"kind": "steady_state", "bandwidth": 0.5},
+    "dispersion": {"attitude": {"kind": "normal", "std_deg": 10.0}},
+}
+TUNED = {
+    "free": ["eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth"],
+    "bounds": {"t_f": [6.0, 12.0], "delta": [0.2, 3.0], "filter_bandwidth": [0.05, 4.0]},
+}
+OTHERS = {
+    "t_f": {"t_f": 10.5},
+    "filter_bandwidth": {"filter_bandwidth": 1.25},
+    "one axis": {"observer_gain_2": 35.0},
+    "all axes": {"observer_gain": 35.0},
+    "each axis": {"observer_gain_1": 5.0, "observer_gain_2": 35.0, "observer_gain_3": 70.0},
+    "all": {
+        "t_f": 7.0,
+        "delta": 1.3,
+        "eta": 3.7,
+        "k1": 2.0,
+        "sign_width": 1e-2,
+        "filter_bandwidth": 2.0,
+        "observer_gain": 4.0,
+    },
+}
+
+
+def wide(tables=None):
+    """The scenario and its parts with room for all gains."""
+    scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
+    return scenario, report.pose(scenario, 0)[0]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
+    """The parts of a search, moved, against the parts that the changed scenario is built into."""
+    scenario, ready = wide()
+    moved = gains.with_gains(ready.parts, OTHERS[name])
+    changed = study(gains.in_scenario(scenario, OTHERS[name]))
+    one, other = (montecarlo.run(parts, ready.dispersion, 3, np.arange(4)).metrics for parts in (moved, changed.parts))
+    for metric in ("window_error", "peak_torque", "effort", "hold_error"):
+        np.testing.assert_allclose(getattr(one, metric), getattr(other, metric), rtol=1e-9, err_msg=metric)
+    for parts in (moved, changed.parts):
+        known = gains.gains_of(parts)
+        for gain, value in OTHERS[name].items():
+            np.testing.assert_allclose(known[gain], value, rtol=1e-12)
+
+
+def test_the_time_after_t_f_is_kept():
+    scenario, ready = wide()
+    changed = gains.in_scenario(scenario, {"t_f": 11.0})
+    assert changed.loop.t_end == 13.0
+    np.testing.assert_allclose(gains.with_gains(ready.parts, {"t_f": 11.0}).t_end, 13.0)
+    assert gains.in_scenario(scenario, {"eta": 4.0}).loop.t_end == 10.0
+
+
+def test_names_and_bounds_axis_by_axis():
+    tables = {"free": ["eta", "observer_gain"], "per_axis": True, "bounds": {"observer_gain": [1.0, 50.0]}}
+    scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
+    names = gains.named(scenario)
+    assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
+    assert gains.own(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
+    some = bounds.of_scenario(scenario)
+    assert some.names == names
+    assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
+    assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
+    assert [gains.base(name) for name in names] == ["eta", "observer_gain", "observer_gain", "observer_gain"]
+
+
+def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
+    def sizes(bandwidth):
+        found = sensors.attitude_filter(bandwidth, 2e-5, 1e-6, 1e-8, 0.1, 2)
+        return jnp.log(jnp.stack([found.attitude_gain, found.bias_gain, found.attitude_error, found.bias_error]))
+
+    at = vector(0.4)
+    exact, step = jax.jacfwd(sizes)(at), 1e-4
+    numeric = (sizes(at + step) - sizes(at - step)) / (2 * step)
+    np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # step^2 times a third derivative of some 10
+    assert np.all(np.isfinite(jax.jacfwd(lambda b: sensors.attitude_filter(b, 2e-5, 0.0, 0.0, 0.1, 2).bias_error)(at)))
+
+
+@pytest.mark.parametrize("kind", ["nonlinear", "finite_time", "prescribed_time"])
+def test_a_chain_and_its_observer_gain_move_too(kind):
+    tables = {
+        "plant": {"kind": "chain", "order": 2},
+        "observer": {"kind": kind, **({"t_o": 2.0} if kind == "prescribed_time" else {})},
+        "controller": {"t_f": 6.0},
+        "disturbance": {"kind": "sinusoid"},
+        "tune": {"free": ["t_f", "eta", "observer_gain"]},
+    }
+    scenario = from_tables(tables)
+    ready = report.pose(scenario, 0)[0]
+    wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
+    moved = gains.with_gains(ready.parts, wanted)
+    changed = study(gains.in_scenario(scenario, wanted))
+    # two grids: both refined four times, which leaves 4^-4 of the 2e-3 that the smooth sign's layer costs
+    one, other = (rollout.simulate_jit(finer(p, 4)).metrics for p in (moved, changed.parts))
+    np.testing.assert_allclose(one.peak_torque, other.peak_torque, rtol=1e-6)
+    np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)

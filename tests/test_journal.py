@@ -1,0 +1,68 @@
+"""What was evaluated is read back, whatever a kill left half written."""
+
+import numpy as np
+import pytest
+
+from tuning.journal import Journal
+
+
+def ask(journal, count, asked):
+    """Answers to so many questions; `asked` collects those that were computed."""
+
+    def compute(k):
+        asked.append(k)
+        return {"f": np.full(3, 1.0 / (k + 1)), "c": np.arange(6.0).reshape(2, 3) * k}
+
+    return [journal.get(b"question %d" % k, lambda k=k: compute(k)) for k in range(count)]
+
+
+def test_a_second_run_reads_what_the_first_one_wrote(tmp_path):
+    first, again, asked = [], [], []
+    wrote = ask(Journal(tmp_path / "j"), 5, first)
+    read = ask(Journal(tmp_path / "j"), 7, again)
+    plain = ask(Journal(), 7, asked)
+    assert (first, again, asked) == ([0, 1, 2, 3, 4], [5, 6], list(range(7)))
+    for one, other in (*zip(wrote, read, strict=False), *zip(plain, read, strict=True)):
+        assert one.keys() == other.keys() == {"f", "c"}
+        for name, value in one.items():
+            np.testing.assert_array_equal(value, other[name])
+            assert value.dtype == other[name].dtype
+
+
+def test_a_journal_cut_anywhere_keeps_its_whole_records(tmp_path):
+    ask(Journal(tmp_path / "j"), 4, [])
+    data = (tmp_path / "j").read_bytes()
+    per_record = len(data) // 4  # all records are as long
+    for cut in (0, 3, 11, per_record - 1, per_record, per_record + 5, 3 * per_record + 7, len(data)):
+        (tmp_path / "j").write_bytes(data[:cut])
+        asked = []
+        ask(Journal(tmp_path / "j"), 4, asked)
+        assert asked == list(range(cut // per_record, 4))
+        assert (tmp_path / "j").read_bytes() == data
+
+
+@pytest.mark.parametrize("at", [0, 9, 30, 200])
+def test_a_damaged_record_and_all_after_it_are_computed_anew(tmp_path, at):
+    ask(Journal(tmp_path / "j"), 3, [])
+    data = bytearray((tmp_path / "j").read_bytes())
+    record = len(data) // 3
+    data[record + at] ^= 0x40
+    (tmp_path / "j").write_bytes(data)
+    asked = []
+    ask(Journal(tmp_path / "j"), 3, asked)
+    assert asked == [1, 2]
+
+
+def test_another_question_drops_what_follows(tmp_path):
+    ask(Journal(tmp_path / "j"), 4, [])
+    journal, asked = Journal(tmp_path / "j"), []
+    journal.get(b"question 0", dict)
+    assert journal.replaying
+    journal.get(b"another", lambda: {"f": np.ones(1)})
+    assert not journal.replaying
+    ask(Journal(tmp_path / "j"), 1, asked)
+    assert asked == []
+    replayed = Journal(tmp_path / "j")
+    replayed.get(b"question 0", dict)
+    np.testing.assert_array_equal(replayed.get(b"another", dict)["f"], np.ones(1))
+    assert not replayed.replaying

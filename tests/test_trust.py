@@ -1,0 +1,118 @@
+"""Slopes, influence, sensitivities, intervals and the global check, against what is known."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from ptsmc_jax import clock, dispersions, signals
+from ptsmc_jax.requirements import Requirement
+from tests.helpers import parts, vector
+from tuning import evolution, objective, optimise, trust
+from tuning.bounds import Bounds
+from tuning.evaluate import Evaluator
+
+SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """From rest, without noise or disturbance: the first torque is the largest, 2 eta^2 |J v / q4| / t_f^2."""
+    run = parts(20.0, 3.0, 1.0, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)))
+    run = replace(run, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
+    return objective.problem(run, SPREAD, 3, np.arange(8), BOUNDS.names, [Requirement("peak_torque", 0.9)])
+
+
+def test_sensitivities_of_the_first_torque_are_its_powers(quiet):
+    found = trust.sensitivities(quiet, np.array([3.3, 1.0, 19.0]), ("peak_torque", "window_error", "settling_time"))
+    powers = found["peak_torque"]
+    # central differences of a power p: off by (p-1)(p-2)/6 of the relative step squared
+    np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-5)
+    assert abs(powers["delta"]) < 1e-6
+    assert found["window_error"]["delta"] > 0.1
+
+
+def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
+    evaluate = Evaluator(BOUNDS)
+    problem = replace(quiet, goal="peak_torque")
+    z = BOUNDS.free(np.array([3.3, 1.0, 19.0]))
+    found = trust.profiles(evaluate, problem, z)
+    assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
+    eta = found["eta"]
+    assert np.all(np.diff(eta.gain) > 0)
+    np.testing.assert_allclose(np.min(np.abs(eta.gain - 3.3)), 0.0, atol=1e-9)  # what was found is among them
+    np.testing.assert_allclose(eta.value / eta.value[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
+
+
+def test_slopes_are_checked_against_differences():
+    run = parts(20.0, 3.0, 1.0, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
+    noisy = objective.problem(
+        replace(run, clock=clock.anchored(0.2, 21.0, 25.0, 5.0)), SPREAD, 3, np.arange(8), BOUNDS.names
+    )
+    # not where t_f - delta is a multiple of the period: there the first period's noise has a kink
+    evaluate, z = Evaluator(BOUNDS), BOUNDS.free(np.array([3.3, 1.07, 19.0]))
+    assert trust.slope_error(evaluate, noisy, z) < 1e-6  # of order 4 over 1e-3
+
+    class Wrong(Evaluator):
+        def slopes(self, problem, z):
+            seen = super().slopes(problem, z)
+            return replace(seen, f_slope=seen.f_slope * np.array([1.0, 1.01, 1.0]))
+
+    share = np.abs(evaluate.slopes(noisy, z[None]).f_slope[0])
+    expected = 0.01 * share[1] / (share * [1.0, 1.01, 1.0]).max()
+    np.testing.assert_allclose(trust.slope_error(Wrong(BOUNDS), noisy, z), expected, rtol=0.01)
+
+
+def test_intervals_of_a_mean_and_an_rms_are_those_of_large_samples():
+    values = np.random.default_rng(1).normal(5.0, 1.0, 4000)
+    low, high = trust.interval(values) or (0.0, 0.0)
+    half = stats.norm.ppf(0.975) * values.std() / np.sqrt(values.size)
+    np.testing.assert_allclose([low, high], [values.mean() - half, values.mean() + half], atol=0.1 * half)
+    low, high = trust.interval(values, trust.rms) or (0.0, 0.0)
+    squares, rms = values**2, np.sqrt(np.mean(values**2))
+    half = stats.norm.ppf(0.975) * squares.std() / np.sqrt(values.size) / (2 * rms)
+    np.testing.assert_allclose([low, high], [rms - half, rms + half], atol=0.1 * half)
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say():
+    rng = np.random.default_rng(2)
+    held = 0
+    for _ in range(100):
+        low, high = trust.interval(rng.normal(0.0, 1.0, 50), trust.rms) or (0.0, 0.0)
+        held += low <= 1.0 <= high
+    assert 86 <= held <= 100  # 95 expected; 3 sigma is 6.5, and two for 50 values being few
+
+
+def test_a_ratio_over_the_same_trials_has_a_narrower_interval():
+    rng = np.random.default_rng(3)
+    common = rng.lognormal(0.0, 0.5, 500)
+    low, high = trust.ratio_interval(10.0 * common, common * rng.normal(1.0, 0.01, 500)) or (0.0, 0.0)
+    assert low < 10.0 < high
+    assert high - low < 0.05  # each RMS alone is known to 5 %
+
+
+def test_what_cannot_be_resampled_has_no_interval():
+    assert trust.interval(np.full(100, 2.0)) is None
+    assert trust.interval(np.arange(5.0)) is None
+
+
+def test_differential_evolution_finds_the_same_optimum(monkeypatch):
+    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    monkeypatch.setattr(evolution, "GENERATIONS", 30)
+    run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
+    run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
+    nothing = dispersions.Dispersion()
+    some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    found = optimise.search(evaluate, some, [Requirement("peak_torque", 0.6)], np.array([3.0, 0.5]), 3, 30, 1)
+    checked = evolution.check(evaluate, found, 0)
+    assert abs(checked.distance) < 1e-3
+    np.testing.assert_allclose(np.log(found.value / checked.value), checked.distance, atol=1e-12)
+    assert checked.rollouts >= 30 * 4
+    # and where the search is stopped at its start, the distance says so
+    lost = replace(found, z=evaluate.bounds.free(np.array([2.3, 3.0])))
+    assert evolution.check(evaluate, lost, 0).distance > 0.5

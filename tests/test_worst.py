@@ -1,0 +1,144 @@
+"""The worst trial inside what the dispersions can draw, against closed forms."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import clock, dispersions, signals
+from ptsmc_jax.requirements import Requirement
+from tests.helpers import parts, vector
+from tuning import objective, optimise, worst
+from tuning.bounds import Bounds
+from tuning.evaluate import Evaluator
+
+T_F, ETA = 20.0, 3.0
+LIMIT = 0.5
+
+
+def posed(dispersion, requirement=None, **others):
+    """A problem without noise or disturbance, from rest to the identity."""
+    run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)), **others)
+    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0))
+    wanted = [requirement or Requirement("peak_torque", LIMIT)]
+    return objective.problem(run, dispersion, 5, np.arange(8), ("eta", "delta"), wanted), wanted
+
+
+def first_torque(inertia, theta, eta=ETA):
+    """Largest torque at t = 0 from rest over all axes: 2 eta^2 max |J n| tan(theta/2) / t_f^2 (theory 3.3)."""
+    return 2 * eta**2 * np.linalg.norm(inertia, axis=1).max() * np.tan(theta / 2) / T_F**2
+
+
+@pytest.fixture(autouse=True)
+def few_screened(monkeypatch):
+    monkeypatch.setattr(worst, "SCREENED", 64)
+
+
+@pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))])
+def test_the_worst_attitude_is_the_one_theory_names(inertia):
+    """For a torque component i, |(J n)_i| is largest along row i of J: the worst axis is that of the longest row."""
+    smallest, largest = np.deg2rad(20.0), np.deg2rad(140.0)
+    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(smallest), vector(largest)))
+    problem, wanted = posed(spread, inertia=inertia)
+    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    tensor = np.diag(inertia) if np.ndim(inertia) == 1 else np.asarray(inertia)
+    expected = first_torque(tensor, largest) / LIMIT
+    # what the ascent's last steps of 1e-2 leave of a maximum is of second order
+    np.testing.assert_allclose(found.ratio, expected, rtol=2e-3)
+    assert found.ratio <= expected * (1 + 1e-9)
+    assert found.screened < found.ratio
+    assert not found.unbounded
+    row = tensor[np.argmax(np.linalg.norm(tensor, axis=1))]
+    q = np.asarray(found.start["q"])
+    np.testing.assert_allclose(2 * np.arccos(abs(q[3])), largest, rtol=1e-3)
+    axis = q[:3] / np.linalg.norm(q[:3])
+    assert abs(axis @ row) / np.linalg.norm(row) > 0.999
+    assert found.moved == ("initial_attitude",)
+
+
+def test_attitudes_up_to_180_degrees_have_no_worst_case():
+    for kind in (dispersions.AxisAngle(vector(np.pi / 2), vector(np.pi)), dispersions.UniformAttitude()):
+        problem, wanted = posed(dispersions.Dispersion(kind))
+        assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
+
+
+def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
+    from scipy.stats import chi2
+
+    spread = dispersions.Dispersion(rate=dispersions.NormalState(vector([1e-3, 1e-3, 1e-3])))
+    problem, wanted = posed(spread, Requirement("peak_rate", 0.05), q=[0.0, 0.0, 0.0, 1.0])
+    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    size = np.linalg.norm(found.coordinates["initial_rate"])
+    np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 3)), rtol=1e-3)  # on the edge of the ball
+    np.testing.assert_allclose(np.linalg.norm(found.start["w"]), 1e-3 * size, rtol=1e-9)
+    np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-6)  # the body only slows down from there
+
+
+def test_slopes_of_the_ascent_agree_with_central_differences():
+    spread = dispersions.Dispersion(
+        dispersions.AxisAngle(vector(0.4), vector(2.0)),
+        rate=dispersions.UniformState(vector([1e-2, 1e-2, 1e-2])),
+        phase=dispersions.UniformPhase(),
+    )
+    problem, _ = posed(spread)
+    sine = signals.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
+    run = replace(problem.parts, disturbance=sine)
+    chosen = np.arange(3, dtype=np.uint32)
+    coordinates = objective.dispersion_of(spread, run, 5, chosen)
+    moved = tuple(coordinates)
+    posed_again = replace(problem, parts=run)
+    y = np.concatenate([worst._charted(posed_again, name, np.asarray(coordinates[name])) for name in moved], axis=1)
+    case = (run, spread, problem.seed, jnp.asarray(chosen), coordinates, vector([0.5, 3.0]))
+    names = ("peak_torque", "effort")
+
+    def value(y):
+        return np.asarray(worst._climb(*case, jnp.asarray(y), moved, names)[0])
+
+    slope = np.asarray(worst._climb(*case, jnp.asarray(y), moved, names)[1])
+    assert slope.shape == (3, 9)
+    for k in range(9):
+        step = 1e-5 * np.eye(9)[k]
+        numeric = (value(y + step) - value(y - step)) / 2e-5
+        np.testing.assert_allclose(slope[:, k], numeric, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+
+
+def test_a_robust_search_keeps_the_limit_in_the_worst_case():
+    """Closed form again: the largest eta that keeps the limit at 140 degrees about the longest row."""
+    largest = np.deg2rad(140.0)
+    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
+    problem, wanted = posed(spread, Requirement("peak_torque", 1.9))
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    eta = np.sqrt(1.9 / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
+    robust, plain = (
+        optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 2, 20, 0, robust=robust)
+        for robust in (True, False)
+    )
+    assert robust.hardest is not None
+    assert plain.hardest is not None
+    assert robust.hardest.ratio <= 1.0 + optimise.NEAR
+    assert robust.gains[0] <= eta * (1 + optimise.NEAR)
+    np.testing.assert_allclose(robust.gains[0], eta, rtol=0.01)  # it gives up no more than its margin
+    np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
+
+
+def test_coordinates_given_are_flown_as_drawn_ones():
+    """A case that joined by its coordinates counts in the constraints like the trial that has them."""
+    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
+    problem, _ = posed(spread)
+    more = objective.with_trials(problem, np.asarray([40]))
+    own = {
+        name: np.asarray(v)[0]
+        for name, v in objective.dispersion_of(spread, problem.parts, 5, np.asarray([40])).items()
+    }
+    roomy = optimise._with_room(problem)
+    assert roomy.trials.size == 8 + optimise.SPARE
+    given = optimise._add(roomy, np.asarray([7]), {name: v.tolist() for name, v in own.items()})
+    at = vector([3.2, 0.9])
+    measure = jax.jit(objective.measure)
+    f, c, _ = measure(more, at)
+    f_roomy, c_roomy, _ = measure(given, at)
+    np.testing.assert_allclose(f, f_roomy, rtol=1e-12)
+    np.testing.assert_allclose(c_roomy[0, 8], c[0, 8], rtol=1e-12)
+    np.testing.assert_allclose(c_roomy[0, 9:], c[0, 0], rtol=1e-12)

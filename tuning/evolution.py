@@ -1,0 +1,72 @@
+"""A global search of the same problem without slopes: how far the gradient search ended from it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from tuning.evaluate import Evaluator
+from tuning.optimise import SLACK, Best, Report, Search, logit, polish
+
+POPULATION = 40  # points for each gain
+GENERATIONS = 80
+SPREAD = 1e-4  # of F in the population, at which it ends
+FORBIDDEN = 10.0  # beside F, for a point that breaks a limit
+EDGE = 3e-4  # of each gain's interval, left out at both ends
+
+
+@dataclass(frozen=True)
+class Check:
+    """What differential evolution found of the same problem."""
+
+    gains: dict[str, float]
+    value: float  # its goal
+    distance: float  # the search's F less this one's: about the share by which the search is worse
+    rollouts: int  # trials flown for it
+
+
+def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *told: None) -> Check:
+    """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
+
+    Then the same polish as in the search: what is compared is the valley that each of them found.
+    """
+    problem = replace(found.problem, limits=found.problem.limits * (1.0 - found.margin))
+    before, generation = evaluate.rollouts, 0
+
+    def merit(share: np.ndarray) -> np.ndarray:
+        flown = evaluate.fly(problem, logit(share.T))
+        worst = flown.c.max(axis=(1, 2), initial=-1.0)
+        bad = FORBIDDEN + np.log1p(np.maximum(worst, 0.0))
+        return np.where(worst <= SLACK, flown.f, np.where(np.isfinite(worst), bad, 2.0 * FORBIDDEN))
+
+    def tell(intermediate_result) -> None:
+        nonlocal generation
+        generation += 1
+        best = float(intermediate_result.fun)
+        report("differential evolution", generation, GENERATIONS, float(np.exp(best)), 0.0 if best < FORBIDDEN else 1.0)
+
+    result = differential_evolution(
+        merit,
+        [(EDGE, 1.0 - EDGE)] * len(problem.names),
+        popsize=POPULATION,
+        maxiter=GENERATIONS,
+        tol=0.0,
+        atol=SPREAD,  # pyright: ignore[reportArgumentType]
+        rng=np.random.default_rng(seed),
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        init="sobol",
+        callback=tell,
+    )
+    # near a limit evolution goes slowly: from where it ends, along it
+    best = Best(logit(result.x[None]), len(problem.metrics), found.margin)
+    polish(evaluate, problem, best, 0)
+    seen = evaluate.slopes(problem, best.z)
+    own = evaluate.slopes(problem, found.z[None])
+    return Check(
+        gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),
+        value=float(np.exp(seen.value[0])),
+        distance=float(own.f[0] - seen.f[0]),
+        rollouts=evaluate.rollouts - before,
+    )

@@ -1,0 +1,122 @@
+"""The gains that tuning can move: their units, and how they are read from and set in parts and scenarios.
+
+A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ptsmc_jax import scenario as scenarios
+from ptsmc_jax import tables
+from ptsmc_jax.rollout import Parts
+from ptsmc_jax.sensors import Sensors
+from ptsmc_jax.tables import Scenario
+
+_STATE_UNITS = {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "x1", "t_f": "s"}
+# gain: unit, by the kind of the plant
+UNITS = {
+    "spacecraft": {
+        "eta": "-",
+        "delta": "s",
+        "observer_gain": "N m s",
+        "k1": "1/s",
+        "sign_width": "-",
+        "t_f": "s",
+        "filter_bandwidth": "rad/s",
+    },
+    "chain": {**_STATE_UNITS, "sign_width": "s"},
+    "system": _STATE_UNITS,
+}
+_AXIS = "observer_gain_"
+
+
+def base(name: str) -> str:
+    """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
+    return "observer_gain" if name.startswith(_AXIS) else name
+
+
+def named(scenario: Scenario) -> tuple[str, ...]:
+    """Names of the free gains, axis by axis where the scenario says so."""
+    tune = scenario.tune
+    assert tune is not None
+    assert tune.free is not None  # a checked scenario names them
+    names: list[str] = []
+    for name in tune.free:
+        each = tune.per_axis and name == "observer_gain"
+        names += [f"{_AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))] if each else [name]
+    return tuple(names)
+
+
+def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
+    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept."""
+    gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    if "t_f" in gains:
+        t_end = gains["t_f"] + (parts.t_end - parts.controller.t_f)
+        parts = replace(parts, t_end=t_end, clock=replace(parts.clock, t_end=t_end))
+    law = {k: v for k, v in gains.items() if base(k) not in ("observer_gain", "filter_bandwidth")}
+    parts = replace(parts, controller=replace(parts.controller, **law))
+    each = _each(gains, list(getattr(parts.observer, "gain", ())))
+    if each is not None:
+        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
+    if "filter_bandwidth" in gains:
+        assert isinstance(parts.sensors, Sensors)
+        sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        parts = replace(parts, sensors=sensors)
+    return parts
+
+
+def gains_of(parts: Parts) -> dict[str, float]:
+    """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
+    controller = parts.controller
+    gains = {name: float(getattr(controller, name)) for name in ("eta", "delta")}
+    each = [float(v) for v in getattr(parts.observer, "gain", ())]
+    if each:
+        gains["observer_gain"] = sum(each) / len(each)
+    gains |= {name: float(getattr(controller, name)) for name in ("k1", "sign_width", "t_f")}
+    if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
+        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    return {**gains, **{f"{_AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
+
+
+def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
+    """The parts' own values of these gains."""
+    gains, each = gains_of(parts), getattr(parts.observer, "gain", ())
+    return [float(each[int(name.removeprefix(_AXIS)) - 1]) if name != base(name) else gains[name] for name in names]
+
+
+def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
+    """The scenario with other gains, checked; with another t_f the time after it is kept, unless it was free."""
+    changes: dict[str, Any] = {
+        f"controller__{k}": v for k, v in gains.items() if base(k) not in ("observer_gain", "filter_bandwidth")
+    }
+    each = _each(gains, list(getattr(scenario.observer, "gain", ())))
+    if each is not None:
+        changes["observer__gain"] = each
+    if "filter_bandwidth" in gains:
+        changes["filter__bandwidth"] = gains["filter_bandwidth"]
+    if "t_f" in gains:
+        assert scenario.loop.t_end is not None
+        changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)
+    return scenarios.replace(scenario, **changes)
+
+
+def of_paper(scenario: Scenario) -> dict[str, float]:
+    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; delta at least a period."""
+    shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+    gains = {"eta": 3.0, "delta": max(0.05, shortest), "k1": 1.0}
+    if isinstance(scenario.plant, tables.ChainPlant):
+        gains["eta"] = scenario.plant.order + 1.0
+    papers = isinstance(scenario.observer, tables.NonlinearObserver | tables.EachNonlinearObserver)
+    return {**gains, "observer_gain": 10.0} if papers else gains
+
+
+def _each(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
+    """The observer's gain on every axis, where these gains name one."""
+    if not any(base(name) == "observer_gain" for name in gains):
+        return None
+    common = [gains.get("observer_gain", value) for value in own]
+    return [gains.get(f"{_AXIS}{k + 1}", value) for k, value in enumerate(common)]

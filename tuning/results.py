@@ -1,0 +1,172 @@
+"""The files of a tuning run: summary, history, tuned scenario, figures."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ptsmc_jax import drawing, metrics, schema, store, study_plots, systems
+from ptsmc_jax.montecarlo import Trials
+from ptsmc_jax.tables import Scenario
+from tuning import gains as gain_names
+from tuning import trust
+from tuning.report import GOALS, Trust, Tuning
+
+JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
+
+
+def statistics(trials: Trials, kind: str) -> dict[str, Any]:
+    """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
+    summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
+    for name in metrics.CATALOGUES[kind]:
+        values = getattr(trials.metrics, name)[trials.finished]
+        known = values[np.isfinite(values)]
+        if known.size == 0:
+            summary[name] = None
+            continue
+        summary[name] = {
+            "mean": known.mean(),
+            "rms": np.sqrt(np.mean(known**2)),
+            "median": np.median(known),
+            "q99": np.quantile(known, 0.99),
+            "max": known.max(),
+        }
+        if known.size < values.size:
+            summary[name]["without_value"] = int(values.size - known.size)
+        if name in JUDGED:
+            statistic = JUDGED[name]
+            summary[name][f"{statistic}_interval"] = trust.interval(known, getattr(trust, statistic))
+    return summary
+
+
+def summary(tuning: Tuning) -> dict[str, Any]:
+    """What `summary.json` says."""
+    kind, found = tuning.tuned.plant.kind, tuning.search
+    assert tuning.tuned.tune is not None
+    groups = {
+        name: {"gains": tuning.judged_gains[name], **statistics(trials, kind)} for name, trials in tuning.fresh.items()
+    }
+    tuned, paper = (groups[name]["window_error"] for name in ("tuned", "paper"))
+    both = tuning.fresh["tuned"].finished & tuning.fresh["paper"].finished
+    errors = {name: np.asarray(tuning.fresh[name].metrics.window_error)[both] for name in ("paper", "tuned")}
+    checked = None if tuning.check is None else asdict(tuning.check)
+    return {
+        "status": tuning.status,
+        "plant": kind,
+        "gains": tuning.gains,
+        "at_bound": tuning.at_bound,
+        "accuracy_gain_over_paper": paper["rms"] / tuned["rms"] if tuned and paper else None,
+        "accuracy_gain_interval": trust.ratio_interval(errors["paper"], errors["tuned"]),
+        "interval_confidence": trust.CONFIDENCE,
+        "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
+        "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
+        "paper": {"seed": tuning.fresh_seed, **groups["paper"]},
+        **({"before": {"seed": tuning.fresh_seed, **groups["before"]}} if "before" in groups else {}),
+        "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
+        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
+        "judged_on": "flight clock, exact sign" if tuning.tuned.loop.mode == "sampled" else "the continuous loop",
+        "search": {
+            "objective": tuning.tuned.tune.objective,
+            "goal": found.value,
+            "starts": int(found.history[0].value.size),
+            "steps": len(found.history) - 1,
+            "rounds_with_harder_trials": found.rounds,
+            "dropped_starts": found.dropped,
+            "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
+            "hardest": None
+            if found.hardest is None
+            else {**asdict(found.hardest), "unbounded": found.hardest.unbounded},
+            "trials": np.asarray(found.problem.trials).tolist(),
+            "rollouts": tuning.rollouts,
+            "gradients": tuning.gradients,
+            "seconds": tuning.seconds,
+        },
+        "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
+        "differential_evolution": checked,
+    }
+
+
+def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
+    loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
+    influence = {}
+    for name, profile in believed.profiles.items():
+        if profile.flat:
+            influence[name] = "none"
+        elif name not in tuning.at_bound:
+            influence[name] = "optimum inside its bounds"
+        elif loop.mode == "continuous" and not sensed and gain_names.base(name) in ("delta", "observer_gain"):
+            influence[name] = "no trade-off: without sampling and noise more of it only helps"
+        else:
+            influence[name] = "better beyond its bound"
+    return {
+        "slopes_off_central_differences": dict(zip(("start", "end"), believed.slope_error, strict=True)),
+        "influence": influence,
+        "sensitivities": believed.sensitivities,
+        "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
+    }
+
+
+def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
+    """Fill a result folder; known_by: see `told`."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
+    store.write_json(folder / "versions.json", store.versions(**known_by))
+    store.write_json(folder / "summary.json", summary(tuning))
+    assert scenario.tune is not None
+    goal = {"t_f": "t_f"}.get(scenario.tune.objective, f"{scenario.tune.objective}_window_error")
+    over = [f"{m}_over_limit" for m in scenario.requirements]
+    rows = [
+        [step, start, row.value[start], *row.gains[start], *row.worst[start]]
+        for step, row in enumerate(tuning.search.history)
+        for start in range(row.value.size)
+    ]
+    store.write_csv(folder / "history.csv", ["step", "start", goal, *gain_names.named(scenario), *over], rows)
+    if figures:
+        drawing.save(_figures(scenario, tuning), folder / "figures")
+
+
+def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
+    """By what a finished or interrupted run is known again."""
+    source = systems.source(getattr(scenario.plant, "system", None))
+    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
+
+
+def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+    assert scenario.tune is not None
+    kind, names = scenario.plant.kind, gain_names.named(scenario)
+    units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]
+    first = tuning.search.history[0].value.size
+    history = [step for step in tuning.search.history if step.value.size == first]
+    limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
+    unit = "s" if scenario.tune.objective == "t_f" else metrics.CATALOGUES[kind]["window_error"][0]
+    goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
+    moved = np.stack([step.gains for step in history])
+    found = {
+        "history": study_plots.tuning_history(
+            {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
+            np.stack([step.value for step in history]),
+            np.stack([np.all(step.worst <= 1.0, axis=1) for step in history]),
+            goal,
+        ),
+        "tradeoff": study_plots.tradeoff(
+            {
+                name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
+                for name, trials in tuning.fresh.items()
+            },
+            limit,
+            kind,
+        ),
+    }
+    if tuning.trust is not None:
+        found["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
+        found["profiles"] = study_plots.profiles(
+            {
+                name: (units[k], p.gain, p.value, p.over, float(tuning.search.gains[k]))
+                for k, (name, p) in enumerate(tuning.trust.profiles.items())
+            },
+            goal,
+        )
+    return found

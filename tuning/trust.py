@@ -1,0 +1,126 @@
+"""What makes a tuning result believable: slopes checked, gains' influence, intervals of what was averaged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from ptsmc_jax import montecarlo
+from tuning.evaluate import Evaluator
+from tuning.gains import with_gains
+from tuning.objective import Problem
+
+DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
+STEP = 1e-3  # of the gains, relative, for sensitivities
+SMALLEST = 1e-6  # slopes of ln F below this are none
+ACROSS = 15  # gains looked at between the bounds of each, besides the one found
+FLAT = 0.01  # a goal that changes by less than this share between the bounds does not depend on the gain
+CONFIDENCE = 0.95  # of intervals
+RESAMPLED = 2000  # times, for an interval
+
+
+def slope_error(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> float:
+    """Largest difference of F's slopes, by automatic differentiation, from central differences, at z (gains,).
+
+    Over the largest slope, in the free reals; differences of order 4 over +-`DIFFERENCE`.
+    """
+    count = z.size
+    offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
+    f = evaluate.fly(problem, z + offsets).f.reshape(4, count)
+    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
+    exact = evaluate.slopes(problem, z[None]).f_slope[0]
+    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The goal along one gain between its bounds, the others as they were found."""
+
+    gain: np.ndarray  # (points,)
+    value: np.ndarray  # (points,) the goal
+    over: np.ndarray  # (points,) largest metric / limit; -inf without a requirement
+
+    @property
+    def flat(self) -> bool:
+        """Whether the goal does not depend on the gain."""
+        return bool(self.value.max() <= (1.0 + FLAT) * self.value.min())
+
+
+def profiles(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> dict[str, Profile]:
+    """How the goal goes with each gain, by its name; z: (gains,) free reals of what was found."""
+    share = np.linspace(0.01, 0.99, ACROSS)
+    points = np.repeat(z[None], (ACROSS + 1) * z.size, axis=0).reshape(z.size, ACROSS + 1, z.size)
+    for k in range(z.size):
+        points[k, :, k] = np.sort(np.append(np.log(share / (1.0 - share)), z[k]))
+    flown = evaluate.fly(problem, points.reshape(-1, z.size))
+    gains = np.asarray(jax.vmap(evaluate.bounds.gains)(jnp.asarray(points.reshape(-1, z.size))))
+    over = flown.c.max(axis=(1, 2), initial=-np.inf) + 1.0
+    shape = (z.size, ACROSS + 1)
+    rows = zip(problem.names, range(z.size), np.exp(flown.value).reshape(shape), over.reshape(shape), strict=True)
+    return {name: Profile(gains.reshape(*shape, -1)[k, :, k], value, most) for name, k, value, most in rows}
+
+
+def sensitivities(problem: Problem, gains: np.ndarray, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """D ln(metric) / d ln(gain), percent by percent, of each metric's RMS over the averaged trials; by metric and gain.
+
+    Central differences of the program that judges, which has every metric: one that slopes are compiled for takes
+    longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is left out.
+    """
+    trials = np.asarray(problem.trials)[: problem.averaged]
+
+    def statistics(gains: np.ndarray) -> np.ndarray:
+        parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
+        flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
+        return np.asarray([rms(getattr(flown.metrics, name)[flown.finished]) for name in names])
+
+    steps = np.diag(STEP * gains)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rows = [np.log(statistics(gains + step) / statistics(gains - step)) / (2.0 * STEP) for step in steps]
+    return {
+        metric: dict(zip(problem.names, row.tolist(), strict=True))
+        for metric, row in zip(names, np.transpose(rows), strict=True)
+        if np.all(np.isfinite(row))
+    }
+
+
+def rms(values: np.ndarray, axis: int = -1) -> Any:
+    """Root mean square."""
+    return np.sqrt(np.mean(values**2, axis=axis))
+
+
+def mean(values: np.ndarray, axis: int = -1) -> Any:
+    """Mean."""
+    return np.mean(values, axis=axis)
+
+
+def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
+    """Bootstrap interval (bias-corrected and accelerated, Efron, JASA 82, 1987) of a statistic, at `CONFIDENCE`.
+
+    None where there are too few trials to resample, or all are equal.
+    """
+    return _bootstrap((values,), statistic, paired=False)
+
+
+def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[float, float] | None:
+    """The same of the ratio of two RMS over the same trials, which are resampled together."""
+    return _bootstrap((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
+
+
+def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
+    if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
+        return None
+    found = stats.bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLED,
+        batch=250,
+        confidence_level=CONFIDENCE,
+        paired=paired,
+        rng=np.random.default_rng(0),
+    )
+    low, high = found.confidence_interval
+    return (float(low), float(high)) if np.isfinite(low) and np.isfinite(high) else None
