@@ -1,6 +1,7 @@
 """Studies of many runs as matplotlib figures: tuning, trade-offs, maps; each function returns a Figure."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import matplotlib.colors
@@ -107,6 +108,37 @@ def tradeoff(
         axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
     axes.set_xlabel(f"window error [{error_unit}]")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19))
+    return figure
+
+
+def front(
+    points: Sequence[Any], others: Mapping[str, Any], limit: float | None, units: tuple[str, ...], name: str = "front"
+) -> Figure:
+    """Window error against peak torque of the points of a front, with their intervals.
+
+    Points have rms, interval, peak, dominated and knee; others, by label: such points that are no part of it; units: of
+    error and torque.
+    """
+    figure, axes = figure_of(f"Accuracy against torque: the {name}, fresh trials", f"RMS window error [{units[0]}]")
+    kept = [point for point in points if not point.dominated]
+    axes.loglog([p.peak for p in kept], [p.rms for p in kept], color=STYLES[0][0], lw=1.2)
+    for chosen, colour, marker, label in ((kept, STYLES[0][0], "o", "front"),
+                                          ([p for p in points if p.dominated], "0.6", "o", "dominated")):  # fmt: skip
+        for k, p in enumerate(chosen):
+            low, high = p.interval or (p.rms, p.rms)
+            axes.errorbar(p.peak, p.rms, [[max(p.rms - low, 0.0)], [max(high - p.rms, 0.0)]], fmt=marker, ms=4,
+                          color=colour, elinewidth=1.0, capsize=2, label=label if k == 0 else None)  # fmt: skip
+    for p in kept:
+        if p.knee:
+            axes.loglog(p.peak, p.rms, "o", ms=13, mfc="none", mec=STYLES[3][0], mew=1.4, label="knee")
+    for (label, p), marker, style in zip(others.items(), ("^", "s", "D"), STYLES[1:], strict=False):
+        if np.isfinite(p.rms):
+            axes.loglog(p.peak, p.rms, marker, ms=8, color=style[0], label=f"{label}: {p.rms:.2e}")
+    if limit is not None:
+        axes.axvline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {units[1]}")
+    axes.set_xlabel(f"largest peak torque [{units[1]}]")
+    plain_ticks(axes.xaxis)
+    axes.legend(fontsize=9)
     return figure
 
 

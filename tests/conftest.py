@@ -1,5 +1,6 @@
 """Strictness for the tests alone: 64 bit, two host devices, no silent rank promotion, shapes checked at run time."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,3 +25,23 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Runs `ptsmc ...` in an empty folder with the scenario `SHORT` as s.toml: exit status, output, errors."""
+    from tests.helpers import SHORT
+    from tuning import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    (tmp_path / "s.toml").write_text(SHORT)
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["ptsmc", *map(str, args)])
+        with pytest.raises(SystemExit) as done:
+            cli.main()
+        told = capsys.readouterr()
+        return done.value.code, told.out, told.err
+
+    return run

@@ -21,6 +21,31 @@ FULL_INERTIA = ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))
 PAPER_ATTITUDE = np.array([np.sqrt(2) / 3, -1 / 3, np.sqrt(3) / 3, np.sqrt(3) / 3])
 
 
+# a scenario that flies and tunes in seconds
+SHORT = """
+[controller]
+t_f = 5.0
+delta = 0.5
+[loop]
+mode = "sampled"
+period = 0.1
+t_end = 6.5
+[hardware]
+attitude_noise = 2e-5
+rate_noise = 1e-6
+[dispersion]
+attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 90.0 }
+[requirements]
+peak_torque = 30.0
+[tune]
+free = ["eta", "delta"]
+bounds = { eta = [2.1, 6.0], delta = [0.1, 2.0] }
+trials = 8
+starts = 2
+steps = 4
+"""
+
+
 def vector(*values: Any) -> Any:
     """A float64 array."""
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float))
@@ -134,3 +159,17 @@ def finer(run: Parts, times: int) -> Parts:
         grid, before=grid.before * times, after=grid.after * times, max_step=grid.max_step / times
     )
     return dataclasses.replace(run, clock=grid)
+
+
+def tree(folder):
+    """Files of a folder: path -> content."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def small_search(monkeypatch, fresh=40):
+    """A search that looks at a few points only, judged on so many trials."""
+    from tuning import optimise, report, worst
+
+    small = ((worst, "SCREENED", 64), (optimise, "CANDIDATES", 8), (optimise, "CROSSED", 16), (report, "FRESH", fresh))
+    for module, name, value in small:
+        monkeypatch.setattr(module, name, value)

@@ -11,53 +11,9 @@ import pytest
 
 from ptsmc_jax import metrics, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
-from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT
+from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
 from tests.test_scenario import check_sentence
 from tuning import cli, single
-
-SHORT = """
-[controller]
-t_f = 5.0
-delta = 0.5
-[loop]
-mode = "sampled"
-period = 0.1
-t_end = 6.5
-[hardware]
-attitude_noise = 2e-5
-rate_noise = 1e-6
-[dispersion]
-attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 90.0 }
-[requirements]
-peak_torque = 30.0
-[tune]
-free = ["eta", "delta"]
-bounds = { eta = [2.1, 6.0], delta = [0.1, 2.0] }
-trials = 8
-starts = 2
-steps = 4
-"""
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """Runs `ptsmc ...` in an empty folder with the scenario above as s.toml: exit status, output, errors."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
-    (tmp_path / "s.toml").write_text(SHORT)
-
-    def run(*args):
-        monkeypatch.setattr(sys, "argv", ["ptsmc", *map(str, args)])
-        with pytest.raises(SystemExit) as done:
-            cli.main()
-        told = capsys.readouterr()
-        return done.value.code, told.out, told.err
-
-    return run
-
-
-def tree(folder):
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_simulate_leaves_what_the_contract_says(command, tmp_path):
@@ -349,18 +305,6 @@ def stop_at(monkeypatch, call):
     monkeypatch.setattr(Evaluator, "slopes", interrupted)
     monkeypatch.setattr(Journal, "get", counted)
     return computed
-
-
-def small_search(monkeypatch):
-    from tuning import optimise, report, worst
-
-    for module, name, value in (
-        (worst, "SCREENED", 64),
-        (optimise, "CANDIDATES", 8),
-        (optimise, "CROSSED", 16),
-        (report, "FRESH", 40),
-    ):
-        monkeypatch.setattr(module, name, value)
 
 
 @pytest.mark.parametrize("call", [1, 4, 30])

@@ -57,7 +57,7 @@ FLOORS = {
         optimise
         evolution
         report single reproduction mapping
-        results
+        results pareto
         show
         cli table
     """,

@@ -188,6 +188,60 @@ def tune(
     return {"met": 0, "not met": 1, "interrupted": 130}[result.status]
 
 
+@app.command
+def pareto(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    points: Annotated[str, Parameter(help="Limits on the torque to tune for, a whole number from 3 to 100.")] = "20",
+    out: Out = None,
+    seed: Seed = "0",
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find the front of accuracy against peak torque, every point of it judged on fresh trials.
+
+    Interrupted or killed, the same command goes on from there.
+
+    Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
+    interrupted.
+    """
+    key, count = _whole("--seed", seed), _whole("--points", points, 3, 100)
+    loaded, folder = _prepare(scenario, "pareto", out)
+    from ptsmc_jax import schema, store
+    from ptsmc_jax.scenario import replace, study
+    from tuning import pareto as fronts
+
+    if loaded.tune is None:
+        loaded = replace(loaded, tune={})
+    known_by, tables = fronts.told(loaded, key, count), schema.dump(loaded)
+    done = None if force else store.previous(folder, tables, known_by)
+    if done is not None:
+        if not quiet:
+            show.front(done, folder, "already done")
+        return 0 if done["status"] == "met" else 1
+    going_on = not force and store.begun(folder, tables, known_by)
+    if not going_on:
+        store.check(folder, force)
+    study(loaded)
+    fronts.check(loaded)
+    from tuning.journal import Journal
+
+    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
+    try:
+        with show.Progress(quiet, "window error") as told:
+            found = fronts.trace(loaded, key, count, told, journal)
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    store.write(folder, lambda making: fronts.write(making, loaded, found, figures, known_by))
+    store.end(folder)
+    if not quiet:
+        show.front(fronts.summary(found, loaded), folder, "done")
+    return 0 if found.met else 1
+
+
 def main() -> None:
     """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
     status: object = None

@@ -6,13 +6,12 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from tuning.evaluate import Evaluator
-from tuning.optimise import SLACK, Best, Report, Search, logit, polish
+from tuning.optimise import EDGE, SLACK, Best, Report, Search, logit, polish
 
 POPULATION = 40  # points for each gain
 GENERATIONS = 80
 SPREAD = 1e-4  # of F in the population, at which it ends
 FORBIDDEN = 10.0  # beside F, for a point that breaks a limit
-EDGE = 3e-4  # of each gain's interval, left out at both ends
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,14 @@ from tuning.worst import Hardest
 PENALTY = 20.0
 UPDATE_FROM, UPDATE_EVERY = 0.25, 5  # multipliers: updated from this share of the steps on, at this distance
 LARGEST_UPDATE = 0.02  # violations beyond this count as this much: far-off gains say nothing about multipliers
+SAME = 0.01  # of the bounds: starts as near to a polished one are not polished
 POLISH_STEPS = 40  # iterations of each, at most
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
 PATIENCE, GAINED = 30, 1e-3  # steps without this much less F in any start end the descent
-CANDIDATES = 64  # points flown for each start that is chosen
+CANDIDATES = 128  # points flown for each start that is chosen
 CHARGE, APART = 3.0, 0.15
+EDGE = 3e-4  # share of each interval that is left out at both ends
 CROSSED, FOLLOWED, CROSSINGS = 512, 4, 3  # points that share gains with the best one; those polished; times, at most
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
 SLACK = 1e-4  # of it that an admissible iterate may use
@@ -79,7 +81,7 @@ def starting_points(
     if starts == 1:
         return first
     share = qmc.LatinHypercube(len(problem.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
-    z = logit(0.02 + 0.96 * share)
+    z = logit(_toward_edges(share))
     return np.concatenate([first, _promising(evaluate, problem, z, starts - 1, partial(report, CHOOSING))])
 
 
@@ -94,7 +96,7 @@ def _promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int,
         flown = evaluate.fly(problem, z[k : k + 64])
         merit.append(flown.f + CHARGE * np.log1p(flown.c.max(axis=(1, 2), initial=0.0)))
         tell(min(k + 64, len(z)), len(z), np.nan, np.nan)
-    merits, share = np.concatenate(merit), 1.0 / (1.0 + np.exp(-z))
+    merits, share = np.concatenate(merit), _share(z)
     order = np.asarray([k for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])], dtype=int)
     apart = np.abs(share[order, None] - share[None, order]).max(axis=2)  # row and column by merit
     lowest = [k for k in range(len(order)) if np.all(apart[k, :k] >= APART)]
@@ -104,6 +106,15 @@ def _promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int,
             if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
                 chosen.append(k)
     return z[order[chosen]]
+
+
+def _toward_edges(uniform: np.ndarray) -> np.ndarray:
+    """Shares of the bounds' intervals, denser toward both ends (arcsine law): optima often lie near bounds."""
+    return np.clip(0.5 - 0.5 * np.cos(np.pi * uniform), EDGE, 1.0 - EDGE)
+
+
+def _share(z: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-z))
 
 
 def logit(share: np.ndarray) -> np.ndarray:
@@ -121,6 +132,7 @@ def search(
     seed: int,
     *,
     robust: bool = False,
+    judged: bool = True,
     report: Report = lambda *told: None,
 ) -> Search:
     """Minimise F with every requirement met on the training trials.
@@ -128,7 +140,8 @@ def search(
     A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
     screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
     not those drawn, but the worst case inside the dispersions' support. own: (gains,) the scenario's gains, the first
-    start. report is called after every step. Interrupted, it returns the best so far once there is one.
+    start. judged: say how hard the worst case is. report is called after every step. Interrupted, it returns the best
+    so far once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
     margin = SURE_MARGIN if robust or problem.trials.size == 1 else MARGIN
@@ -159,7 +172,7 @@ def search(
             again = max(20, steps // 3)
             run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
             run.rounds = rounds
-        if sure and hardest is None:
+        if sure and judged and hardest is None:
             report("looking for the worst case", 0, 0, *run.best_so_far)
             hardest = worst_case.hardest(problem, sure, run.gains)
     except KeyboardInterrupt:
@@ -304,7 +317,7 @@ class _Run:
         tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
         for _ in range(CROSSINGS):
             before, f = self.best_so_far, best.f[best.order()[0]]
-            share = 0.02 + 0.96 * rng.random((CROSSED, count))
+            share = _toward_edges(rng.random((CROSSED, count)))
             kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
             points = np.where(kept, best.z[best.order()[0]], logit(share))
             z = _promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
@@ -313,9 +326,12 @@ class _Run:
                 return
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
+        done: list[np.ndarray] = []  # shares of the bounds at which a polish ended
         for k, start in enumerate(starts):
             self._report("polishing", k, len(starts), *self.best_so_far)
-            polish(self._evaluate, tightened, best, start)
+            if all(np.abs(_share(best.z[start]) - other).max() >= SAME for other in done):
+                polish(self._evaluate, tightened, best, start)
+                done.append(_share(best.z[start]))
 
     def outcome(self, first: np.ndarray) -> Search:
         """The best iterate."""

@@ -102,7 +102,7 @@ def tune(
     check = evolution.check(evaluate, found, seed, report) if globally and not found.interrupted else None
 
     report("judging on fresh trials", 0, 0, found.value, 0.0)
-    named = {name: _rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
+    named = {name: rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
     tuned = gains.in_scenario(scenario, named)
     trained = gains.with_gains(ready.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
@@ -240,5 +240,6 @@ def _fresh_trials(requirements: Sequence[Requirement]) -> int:
     return max([FRESH, *(2 * count for count in needed)])
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
+    """A gain as it is handed over."""
     return float(f"{value:.{DIGITS}g}")

@@ -162,6 +162,9 @@ def _accuracy(summary: dict[str, Any]) -> Iterator[str]:
         both = [f"{where} {one['rms']:.3e}" + _between(one.get("rms_interval"), ".3e")
                 for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
         yield f"RMS window error: {', '.join(both)}"
+        (low, high), (least, most) = (one.get("rms_interval") or (0.0, float("inf")) for one in (trained, fresh))
+        if low > most or least > high:
+            yield "they differ: training flies the smooth sign on the anchored clock, the judge the exact one as flown"
 
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
@@ -210,3 +213,34 @@ def _trust(summary: dict[str, Any]) -> Iterator[str]:
         off = believed["slopes_off_central_differences"]
         shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items() if value is not None)
         yield f"slopes by automatic differentiation agree with differences to {shown}"
+
+
+def front(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """A front of accuracy against torque, as its `summary.json` says."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from ptsmc_jax.metrics import CATALOGUES
+
+    console, units = Console(highlight=False), CATALOGUES[summary["plant"]]
+    kept = [point for point in summary["points"] if not point["dominated"]]
+    names = list(kept[0]["gains"]) if kept else []
+    table = Table("", f"peak {units['peak_torque'][0]}", "mean", f"error {units['window_error'][0]}",
+                  "+-", *names, "", box=None, pad_edge=False)  # fmt: skip
+    rows = [("", point) for point in kept] + [(name, summary[name]) for name in ("paper", "before") if name in summary]
+    for name, point in rows:
+        low, high = point["interval"] or (point["rms"], point["rms"])
+        marks = [word for word in ("knee", "meets") if point[word]]
+        if point["failures"]:
+            marks.append(f"{point['failures']} failed or missed")
+        cells = (f"{point['gains'].get(gain, float('nan')):.4g}" for gain in names)
+        table.add_row(name, f"{point['peak']:.4g}", f"{point['mean_peak']:.4g}", f"{point['rms']:.3e}",
+                      f"{50 * (high - low) / point['rms']:.1f} %", *cells, ", ".join(marks))  # fmt: skip
+    console.print(f"front {how}: {len(kept)} points, each judged on {summary['trials']} fresh trials", soft_wrap=True)
+    console.print(table)
+    lost = len(summary["points"]) - len(kept)
+    if lost:
+        console.print(f"{lost} more left out: others are better in both, beyond the interval", soft_wrap=True)
+    if summary["requirements"] and not any(point["meets"] for point in kept):
+        console.print("no gains on the front meet every requirement", soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)

@@ -1,0 +1,127 @@
+"""The front of accuracy against peak torque: points, dominance, knee, what it leaves."""
+
+import csv
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.metrics import Metrics
+from ptsmc_jax.montecarlo import Trials
+from ptsmc_jax.schema import ScenarioError
+from tests.helpers import SHORT, small_search, tree
+from tuning import pareto, report
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_the_knee_is_where_a_front_bends(scale):
+    """Two straight lines in logs, steep then flat: the knee is where they meet."""
+    torque = np.geomspace(0.1, 10.0, 21)
+    error = np.where(torque < 1.0, torque**-3.0, torque**-0.2) * scale
+    assert pareto.knee_of(np.stack([torque, error], axis=1)) == 10
+
+
+def point(peak, rms, **others):
+    made = {
+        "limit": peak,
+        "gains": {},
+        "trained": rms,
+        "interval": None,
+        "mean_peak": peak,
+        "failures": 0,
+        "meets": True,
+    }
+    return pareto.Point(rms=rms, peak=peak, **{**made, **others})
+
+
+def trials(errors):
+    """Trials with these window errors; nothing else of them is looked at."""
+    ok = np.zeros(len(errors), dtype=np.int32)
+    metrics = Metrics(**dict.fromkeys(Metrics._fields, jnp.asarray(errors)))
+    return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), None)
+
+
+def test_only_what_is_beaten_beyond_its_interval_is_dominated():
+    rng = np.random.default_rng(0)
+    common = rng.lognormal(0.0, 0.5, 400)
+    sizes = {0.2: 4.0, 0.3: 2.0, 0.4: 2.5, 0.5: 1.0, 0.6: 1.0005}  # by peak torque
+    judged = {}
+    for peak, size in sizes.items():
+        errors = size * common * rng.normal(1.0, 0.05, 400)
+        judged[peak] = point(peak, float(np.sqrt(np.mean(errors**2)))), trials(errors)
+    marked = pareto._marked(judged)
+    assert [p.peak for p in marked] == sorted(sizes)
+    # 0.4 is worse than 0.3 by a quarter; 0.6 than 0.5 by less than chance
+    assert {p.peak for p in marked if p.dominated} == {0.4}
+    assert sum(p.knee for p in marked) == 1
+    assert not any(p.knee and p.dominated for p in marked)
+
+
+def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
+    small_search(monkeypatch, 60)
+    text = SHORT.replace("peak_torque = 30.0", "peak_torque = 10.0").replace("steps = 4", "steps = 20")
+    (tmp_path / "s.toml").write_text(text)
+    status, told, _ = command("pareto", "s.toml", "--points", 6, "--out", "p")
+    assert set(tree(tmp_path / "p")) == {
+        "front.csv", "summary.json", "scenario.toml", "versions.json", "figures/front.png"
+    }  # fmt: skip
+    summary = json.loads((tmp_path / "p" / "summary.json").read_text())
+    assert status == (0 if summary["status"] == "met" else 1)
+    with (tmp_path / "p" / "front.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    kept = [row for row in rows if row["dominated"] == "0"]
+    assert len(kept) >= 3
+    assert sum(row["knee"] == "1" for row in rows) == 1
+    peaks = [float(row["peak_torque"]) for row in rows]
+    assert peaks == sorted(peaks)
+    assert any(float(row["limit"]) == 10.0 for row in rows)  # the scenario's own limit is one of the rungs
+    for row in rows:
+        assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
+        # the gains of a row, flown as the row says
+        values = {"eta": float(row["eta"]), "delta": float(row["delta"])}
+        made = scenario.replace(
+            scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
+        )
+        flown = report.judge(made, summary["seed"], ())
+        np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
+        np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
+    assert f"{len(kept)} points, each judged on 60 fresh trials" in told
+    assert command("pareto", "s.toml", "--points", 6, "--out", "p")[1].startswith("front already done")
+    assert command("pareto", "s.toml", "--points", 7, "--out", "p")[0] == 2
+
+
+@pytest.mark.parametrize(("change", "value"), [("objective = \"t_f\"", 'tune.objective is "t_f"'),
+                                               ("torque_weight = 0.5", "tune.torque_weight is 0.5")])  # fmt: skip
+def test_a_front_of_something_else_is_refused(command, tmp_path, change, value):
+    text = SHORT.replace('free = ["eta", "delta"]', f'free = ["eta", "delta", "t_f"]\n{change}')
+    (tmp_path / "s.toml").write_text(text)
+    before = tree(tmp_path)
+    status, out, err = command("pareto", "s.toml")
+    assert (status, out) == (2, "")
+    assert value in err
+    assert "for a front of the window error" in err
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("points", ["2", "101", "many", "-3"])
+def test_a_number_of_points_out_of_range_is_refused(command, points):
+    status, out, err = command("pareto", "s.toml", f"--points={points}")
+    assert (status, out) == (2, "")
+    assert f"--points is {points}, but must be a whole number from 3 to 100" in err
+
+
+def test_a_scenario_without_a_limit_on_the_torque_has_a_front_too():
+    made = scenario.from_tables({"requirements": {"effort": 9.0}, "tune": {}})
+    limited, own = pareto._limited(made)
+    assert own is None
+    assert limited.requirements == {"effort": 9.0, "peak_torque": pareto.OFF}
+    share = scenario.replace(made, requirements={"peak_torque": {"limit": 0.5, "quantile": 0.9}})
+    assert pareto._limited(share) == (share, 0.5)
+    with pytest.raises(ScenarioError, match="for a front of the window error"):
+        pareto.check(replace_tune(share, torque_weight=1.0))
+
+
+def replace_tune(made, **changes):
+    return scenario.replace(made, tune={**changes})
