@@ -17,7 +17,7 @@ from ptsmc_jax.configure import configure
 def main() -> None:
     """Print a line a seed."""
     configure()
-    from ptsmc_jax import draws, scenario
+    from ptsmc_jax import scenario
     from tuning import evolution, gains, optimise, report
 
     path, seeds = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 20
@@ -45,7 +45,7 @@ def main() -> None:
     near = [one.value <= 1.01 * reference for one in found]
     print(f"within 1 % of the better of both: {sum(near)} of {seeds}; "
           f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
-    fresh = draws.derive(0, "fresh trials")
+    fresh = report.seed_of_judge(0)
     paper = report.judge(gains.in_scenario(loaded, gains.of_paper(loaded)), fresh, ready.requirements)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
     tuned = report.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)

@@ -153,7 +153,12 @@ def stream_names():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("draws.stream", "draws.derive"):
                 name = node.args[-1]
-                names.append(name.value if isinstance(name, ast.Constant) else constants[ast.unparse(name)])
+                if isinstance(name, ast.Constant):
+                    names.append(name.value)
+                elif ast.unparse(name) in constants:
+                    names.append(constants[ast.unparse(name)])
+                else:  # one of all the names that the file has
+                    names += [value for value in constants.values() if isinstance(value, str)]
     return names
 
 

@@ -125,3 +125,29 @@ def test_a_scenario_without_a_limit_on_the_torque_has_a_front_too():
 
 def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
+
+
+def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch):
+    """Ctrl-C while the ladder is climbed; the front is that of a run without it."""
+    from tuning.evaluate import Evaluator
+
+    small_search(monkeypatch, 60)
+    slopes, calls = Evaluator.slopes, []
+
+    def counted(self, problem, z, stop=0):
+        calls.append(1)
+        if len(calls) == stop:
+            raise KeyboardInterrupt
+        return slopes(self, problem, z)
+
+    monkeypatch.setattr(Evaluator, "slopes", counted)
+    run = ("pareto", "s.toml", "--points", 4, "--no-figures", "--out")
+    whole = command(*run, "whole")[0]
+    stop, calls[:] = len(calls) - 10, []
+    with monkeypatch.context() as patch:
+        patch.setattr(Evaluator, "slopes", lambda self, problem, z: counted(self, problem, z, stop))
+        assert command(*run, "cut")[0] == 130
+    assert not (tmp_path / "cut" / "front.csv").exists()
+    assert command(*run, "cut")[0] == whole
+    assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
+    assert "journal.bin" not in tree(tmp_path / "cut")

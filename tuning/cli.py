@@ -1,8 +1,9 @@
 """The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -11,7 +12,6 @@ from tuning import show
 
 if TYPE_CHECKING:
     from ptsmc_jax.tables import Scenario
-    from tuning.report import Tuning
 
 app = App(
     name="ptsmc",
@@ -29,6 +29,9 @@ Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
+
+
+_STATUS = {"met": 0, "not met": 1, "interrupted": 130}  # of the exit
 
 
 class UsageError(ValueError):
@@ -154,38 +157,18 @@ def tune(
     """
     key = _whole("--seed", seed)
     loaded, folder = _prepare(scenario, "tune", out)
-    from ptsmc_jax import schema, store
-    from ptsmc_jax.scenario import replace, study
-    from tuning import results
+    from tuning import report, results
 
-    if loaded.tune is None:
-        loaded = replace(loaded, tune={})
-    known_by, tables = results.told(loaded, key, globally=global_check), schema.dump(loaded)
-    done = None if force else store.previous(folder, tables, known_by)
-    if done is not None and done["status"] != "interrupted":
-        if not quiet:
-            show.tuning(done, folder, "already done")
-        return 0 if done["status"] == "met" else 1
-    going_on = not force and store.begun(folder, tables, known_by)
-    if not going_on:
-        store.check(folder, force)
-    study(loaded)  # what it refuses, it refuses before the search
-    from tuning import report
-    from tuning.journal import Journal
-
-    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
-    try:
-        with show.Progress(quiet, report.GOALS[loaded.tune.objective]) as told:  # pyright: ignore[reportOptionalMemberAccess]
-            result: Tuning = report.tune(loaded, key, told, journal, globally=global_check)
-    except KeyboardInterrupt:
-        print("ptsmc: interrupted before there were gains; the same command goes on from here", file=sys.stderr)
-        return 130
-    store.write(folder, lambda making: results.write(making, loaded, result, figures, known_by))
-    if result.status != "interrupted":
-        store.end(folder)
-    if not quiet:
-        show.tuning(results.summary(result), folder, "interrupted" if result.status == "interrupted" else "done")
-    return {"met": 0, "not met": 1, "interrupted": 130}[result.status]
+    loaded = _with_tune(loaded)
+    goal = report.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
+    known_by = results.told(loaded, key, globally=global_check)
+    return _search(
+        loaded, folder, known_by, force, quiet, goal,
+        work=lambda told, journal: report.tune(loaded, key, told, journal, globally=global_check),
+        write=lambda making, found: results.write(making, loaded, found, figures, known_by),
+        summary=results.summary,
+        shown=show.tuning,
+    )  # fmt: skip
 
 
 @app.command
@@ -209,37 +192,18 @@ def pareto(
     """
     key, count = _whole("--seed", seed), _whole("--points", points, 3, 100)
     loaded, folder = _prepare(scenario, "pareto", out)
-    from ptsmc_jax import schema, store
-    from ptsmc_jax.scenario import replace, study
     from tuning import pareto as fronts
 
-    if loaded.tune is None:
-        loaded = replace(loaded, tune={})
-    known_by, tables = fronts.told(loaded, key, count), schema.dump(loaded)
-    done = None if force else store.previous(folder, tables, known_by)
-    if done is not None:
-        if not quiet:
-            show.front(done, folder, "already done")
-        return 0 if done["status"] == "met" else 1
-    going_on = not force and store.begun(folder, tables, known_by)
-    if not going_on:
-        store.check(folder, force)
-    study(loaded)
+    loaded = _with_tune(loaded)
     fronts.check(loaded)
-    from tuning.journal import Journal
-
-    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
-    try:
-        with show.Progress(quiet, "window error") as told:
-            found = fronts.trace(loaded, key, count, told, journal)
-    except KeyboardInterrupt:
-        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    store.write(folder, lambda making: fronts.write(making, loaded, found, figures, known_by))
-    store.end(folder)
-    if not quiet:
-        show.front(fronts.summary(found, loaded), folder, "done")
-    return 0 if found.met else 1
+    known_by = fronts.told(loaded, key, count)
+    return _search(
+        loaded, folder, known_by, force, quiet, "window error",
+        work=lambda told, journal: fronts.trace(loaded, key, count, told, journal),
+        write=lambda making, found: fronts.write(making, loaded, found, figures, known_by),
+        summary=lambda found: fronts.summary(found, loaded),
+        shown=show.front,
+    )  # fmt: skip
 
 
 def main() -> None:
@@ -291,3 +255,54 @@ def _prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Sc
 
     name = scenario.stem if scenario is not None else "default"
     return from_tables(raw), out if out is not None else Path("out") / f"{command}-{name}"
+
+
+def _with_tune(scenario: "Scenario") -> "Scenario":
+    """The scenario with a `tune` table, the default one where it has none."""
+    from ptsmc_jax.scenario import replace
+
+    return scenario if scenario.tune is not None else replace(scenario, tune={})
+
+
+def _search(
+    loaded: "Scenario",
+    folder: Path,
+    known_by: dict[str, Any],
+    force: bool,
+    quiet: bool,
+    goal: str,
+    *,
+    work: Callable[..., Any],
+    write: Callable[[Path, Any], None],
+    summary: Callable[[Any], dict[str, Any]],
+    shown: Callable[[dict[str, Any], Path, str], None],
+) -> int:
+    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
+    from ptsmc_jax import schema, store
+    from ptsmc_jax.scenario import study
+
+    tables = schema.dump(loaded)
+    done = None if force else store.previous(folder, tables, known_by)
+    if done is not None and done["status"] != "interrupted":
+        if not quiet:
+            shown(done, folder, "already done")
+        return _STATUS[done["status"]]
+    going_on = not force and store.begun(folder, tables, known_by)
+    if not going_on:
+        store.check(folder, force)
+    study(loaded)  # what it refuses, it refuses before the search
+    from tuning.journal import Journal
+
+    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
+    try:
+        with show.Progress(quiet, goal) as told:
+            found = work(told, journal)
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
+        return _STATUS["interrupted"]
+    store.write(folder, lambda making: write(making, found))
+    if found.status != "interrupted":
+        store.end(folder)
+    if not quiet:
+        shown(summary(found), folder, "interrupted" if found.status == "interrupted" else "done")
+    return _STATUS[found.status]

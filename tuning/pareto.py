@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import drawing, draws, metrics, schema, store, study_plots, systems
+from ptsmc_jax import drawing, metrics, schema, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.scenario import replace as changed
@@ -23,7 +23,7 @@ from tuning import gains, report, trust
 from tuning.evaluate import Evaluator
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
-from tuning.optimise import MARGIN, Best, Report, polish, search
+from tuning.optimise import MARGIN, Best, Report, Search, polish, search
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
@@ -68,9 +68,9 @@ class Front:
         return [point for point in self.points if not point.dominated]
 
     @property
-    def met(self) -> bool:
-        """Some gains on the front meet every requirement on the fresh trials."""
-        return any(point.meets for point in self.kept)
+    def status(self) -> str:
+        """Whether some gains on the front meet every requirement on the fresh trials."""
+        return "met" if any(point.meets for point in self.kept) else "not met"
 
 
 def trace(
@@ -80,7 +80,7 @@ def trace(
     tell: Report = lambda *told: None,
     journal: Journal | None = None,
 ) -> Front:
-    """The front of a scenario's free gains, with so many steps of the ladder."""
+    """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""
     limited, own_limit = _limited(scenario)
     table = limited.tune
     assert table is not None
@@ -97,10 +97,12 @@ def trace(
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in ready.requirements]
     free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
+    _unless_interrupted(free)
     problem = replace(free.problem, limits=problem.limits)
     highest = free.worst[at] * OFF
     tight = HARDLY * highest
     least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
+    _unless_interrupted(least)
     lowest = least.worst[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
@@ -115,7 +117,7 @@ def trace(
         if found is not None and (k not in best or found[0] < best[k][0]):
             best[k] = found
             known.append(found[2])
-    fresh_seed = draws.derive(seed, "fresh trials")
+    fresh_seed = report.seed_of_judge(seed)
     climbed: dict[float, tuple[float, float, np.ndarray]] = {}
     for k in sorted(best):  # one rung of those that a limit does not hold back, and whose gains are the same
         if all(np.abs(best[k][2] - other[2]).max() >= APART for other in climbed.values()):
@@ -150,6 +152,11 @@ def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:
         requirements = {**schema.dump(scenario).get("requirements", {}), TORQUE: OFF}
         return changed(scenario, requirements=requirements), None
     return scenario, known.limit if isinstance(known, Limit) else float(known)
+
+
+def _unless_interrupted(found: Search) -> None:
+    if found.interrupted:
+        raise KeyboardInterrupt
 
 
 def _step(evaluate: Evaluator, tightened: Problem, known: np.ndarray) -> tuple[float, float, np.ndarray] | None:
@@ -241,7 +248,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         return {name: getattr(point, name) for name in point.__dataclass_fields__}
 
     return {
-        "status": "met" if front.met else "not met",
+        "status": front.status,
         "plant": scenario.plant.kind,
         "requirements": list(scenario.requirements),
         "trials": front.trials,

@@ -106,7 +106,7 @@ def tune(
     tuned = gains.in_scenario(scenario, named)
     trained = gains.with_gains(ready.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
-    fresh_seed = draws.derive(seed, "fresh trials")
+    fresh_seed = seed_of_judge(seed)
     paper, at_start = gains.of_paper(scenario), gains.gains_of(ready.parts)
     candidates = {"tuned": tuned, "paper": gains.in_scenario(scenario, paper)}
     if any(at_start[name] != paper.get(name, at_start[name]) for name in at_start):
@@ -173,6 +173,11 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> tuple
         torque_weight=table.torque_weight,
     )
     return ready, problem, Evaluator(bounds, journal)
+
+
+def seed_of_judge(seed: int) -> int:
+    """The seed of the fresh trials."""
+    return draws.derive(seed, "fresh trials")
 
 
 def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
