@@ -25,8 +25,9 @@ def main() -> None:
     loaded = loaded if loaded.tune is not None else scenario.replace(loaded, tune={})
     table = loaded.tune
     assert table is not None
-    ready, problem, evaluate = report.pose(loaded, 0)
-    own, found = np.asarray(gains.own(ready.parts, problem.names)), []
+    posed = report.pose(loaded, 0)
+    ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
+    print(f"{posed.smoothing}")
     for seed in range(seeds):
         started, before = time.monotonic(), evaluate.gradients
         one = optimise.search(evaluate, problem, ready.requirements, own, table.starts, table.steps, seed,

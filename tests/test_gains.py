@@ -43,7 +43,7 @@ OTHERS = {
 def wide(tables=None):
     """The scenario and its parts with room for all gains."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
-    return scenario, report.pose(scenario, 0)[0]
+    return scenario, report.pose(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -104,7 +104,7 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
         "tune": {"free": ["t_f", "eta", "observer_gain"]},
     }
     scenario = from_tables(tables)
-    ready = report.pose(scenario, 0)[0]
+    ready = report.pose(scenario, 0).ready
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))

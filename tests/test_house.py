@@ -53,9 +53,9 @@ FLOORS = {
         bounds design journal
         objective
         evaluate
-        worst trust
+        worst trust polish
         optimise
-        evolution
+        evolution smoothing
         report single reproduction mapping
         results pareto
         show

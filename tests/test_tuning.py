@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario
+from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, signals
 from ptsmc_jax.requirements import Requirement
+from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
 from tuning import bounds, gains, objective, optimise, report, results, worst
 from tuning.evaluate import Evaluator
@@ -236,3 +237,40 @@ def test_statistics_count_failures_and_average_the_rest():
     errors = trials.metrics.window_error[trials.ok]
     np.testing.assert_allclose(told["window_error"]["rms"], np.sqrt(np.mean(errors**2)))
     np.testing.assert_allclose(told["peak_torque"]["max"], trials.metrics.peak_torque[trials.ok].max())
+
+
+def test_the_goal_may_be_t_f_itself_or_another_metric():
+    some = replace(problem(), names=("eta", "t_f"))
+    at = vector([3.0, 19.0])
+    f, _, value = objective.measure(replace(some, goal="t_f"), at)
+    np.testing.assert_allclose([f, value], np.log(19.0), rtol=1e-15)
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "t_f": 19.0}), SPREAD, 3, np.arange(8))
+    f, _, value = objective.measure(replace(some, goal="peak_torque", tail=1), at)
+    np.testing.assert_allclose(np.exp([f, value]), flown.metrics.peak_torque.max(), rtol=1e-10)
+
+
+def test_a_weighted_goal_is_a_product_of_powers():
+    some = replace(problem(), torque_weight=0.3)
+    f, _, value = objective.measure(some, vector([3.0, 0.7]))
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8)).metrics
+    rms = [np.sqrt(np.mean(v**2)) for v in (flown.window_error, flown.peak_torque)]
+    np.testing.assert_allclose(np.exp(value), rms[0], rtol=1e-10)
+    np.testing.assert_allclose(np.exp(f), rms[0] * rms[1] ** 0.3, rtol=1e-10)
+
+
+def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch):
+    """From rest, without noise or disturbance: t_f = eta sqrt(2 max |J n| tan(theta/2) / limit) (theory 3.5)."""
+    helpers.small_search(monkeypatch)
+    eta, limit, theta = 3.0, 0.9, np.deg2rad(100.0)
+    q = [0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)]
+    run = parts(20.0, eta, 1.0, q=q, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)))
+    run = replace(run, clock=clock.anchored(0.2, 21.0, 40.0, 5.0))
+    wanted = [Requirement("peak_torque", limit)]
+    some = objective.problem(run, dispersions.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
+    evaluate = Evaluator(bounds.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
+    found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), 2, 20, 0)
+    expected = eta * np.sqrt(2 * 14.0 * np.tan(theta / 2) / limit)
+    # it keeps SURE_MARGIN of the limit, which costs half as much of t_f
+    np.testing.assert_allclose(found.gains[0], expected * (1 + optimise.SURE_MARGIN / 2), rtol=2e-4)
+    np.testing.assert_allclose(found.value, found.gains[0], rtol=1e-9)
+    assert found.worst[0] <= 1.0

@@ -22,6 +22,11 @@ class Measured:
     c: np.ndarray  # (points, requirements, trials)
     value: np.ndarray  # (points,)
 
+    def at(self, point: int) -> "Measured":
+        """One of the points."""
+        one = slice(point, point + 1)
+        return Measured(self.f[one], self.c[one], self.value[one])
+
 
 @dataclass(frozen=True)
 class Sloped(Measured):

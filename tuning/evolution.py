@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from tuning.evaluate import Evaluator
-from tuning.optimise import EDGE, SLACK, Best, Report, Search, logit, polish
+from tuning.optimise import EDGE, Report, Search, logit
+from tuning.polish import SLACK, Best, polish
 
 POPULATION = 40  # points for each gain
 GENERATIONS = 80

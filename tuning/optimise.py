@@ -12,36 +12,36 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import optax
-from scipy.optimize import minimize
 from scipy.stats import qmc
 
 from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
-from tuning.evaluate import Evaluator, Sloped
+from tuning.evaluate import Evaluator
 from tuning.objective import Problem, with_trials
+from tuning.polish import Best, largest, polish
 from tuning.worst import Hardest
 
 PENALTY = 20.0
 UPDATE_FROM, UPDATE_EVERY = 0.25, 5  # multipliers: updated from this share of the steps on, at this distance
 LARGEST_UPDATE = 0.02  # violations beyond this count as this much: far-off gains say nothing about multipliers
 SAME = 0.01  # of the bounds: starts as near to a polished one are not polished
-POLISH_STEPS = 40  # iterations of each, at most
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
 PATIENCE, GAINED = 30, 1e-3  # steps without this much less F in any start end the descent
 CANDIDATES = 128  # points flown for each start that is chosen
 CHARGE, APART = 3.0, 0.15
 EDGE = 3e-4  # share of each interval that is left out at both ends
+# refinement without slopes: points around the best one, times; spread at first, and by how much it shrinks
+AROUND, REFINED, SPREAD, SHRINK = 64, 18, 0.05, 0.75
 CROSSED, FOLLOWED, CROSSINGS = 512, 4, 3  # points that share gains with the best one; those polished; times, at most
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
-SLACK = 1e-4  # of it that an admissible iterate may use
 SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
 HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
 ROUNDS = 6  # searches again with hardest trials added, at most
 NEAR = 1e-3  # how far the worst case may be beyond a limit
 
-CHOOSING, CROSSING = "choosing starts", "looking for a better valley"
+CHOOSING, CROSSING, REFINING = "choosing starts", "looking for a better valley", "refining"
 # what is being done, steps done, in all, best goal, how far beyond a limit
 Report = Callable[[str, int, int, float, float], None]
 
@@ -81,7 +81,7 @@ def starting_points(
     if starts == 1:
         return first
     share = qmc.LatinHypercube(len(problem.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
-    z = logit(_toward_edges(share))
+    z = logit(toward_edges(share))
     return np.concatenate([first, _promising(evaluate, problem, z, starts - 1, partial(report, CHOOSING))])
 
 
@@ -108,7 +108,7 @@ def _promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int,
     return z[order[chosen]]
 
 
-def _toward_edges(uniform: np.ndarray) -> np.ndarray:
+def toward_edges(uniform: np.ndarray) -> np.ndarray:
     """Shares of the bounds' intervals, denser toward both ends (arcsine law): optima often lie near bounds."""
     return np.clip(0.5 - 0.5 * np.cos(np.pi * uniform), EDGE, 1.0 - EDGE)
 
@@ -154,6 +154,7 @@ def search(
         z = starting_points(evaluate, problem, own, starts, seed, report)
         run.descend(problem, z, steps, "searching")
         run.cross(problem, np.random.default_rng(seed))
+        run.refine(problem, np.random.default_rng(seed))
         rounds = 0
         while sure:
             found = run.gains
@@ -171,6 +172,7 @@ def search(
             rounds += 1
             again = max(20, steps // 3)
             run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
+            run.refine(problem, np.random.default_rng(seed))
             run.rounds = rounds
         if sure and judged and hardest is None:
             report("looking for the worst case", 0, 0, *run.best_so_far)
@@ -210,40 +212,6 @@ def _add_screened(problem: Problem, requirements, gains: np.ndarray, screened: t
     known = set(np.asarray(problem.trials).tolist())
     hardest = np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)
     return with_trials(problem, hardest) if screened is None else _add(problem, hardest)
-
-
-def largest(c: np.ndarray, margin: float) -> np.ndarray:
-    """(points, requirements) largest metric / limit, from constraints against limits that are tighter by a margin."""
-    return (c.max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
-
-
-class Best:
-    """The best iterate so far of each start: admissible ones by their F, others by how far they are over."""
-
-    def __init__(self, z: np.ndarray, requirements: int, margin: float):
-        self.z, self.margin = z.copy(), margin
-        self.f, self.value, self.over = (np.full(len(z), np.inf) for _ in range(3))
-        self.worst = np.full((len(z), requirements), np.inf)  # largest metric / limit
-
-    def offer(self, z: np.ndarray, seen: Sloped, allowed: np.ndarray, starts: slice = slice(None)) -> None:
-        """Keep what is better; arrays over these starts. Admissible is what keeps the margin but for `SLACK`."""
-        worst = largest(seen.c, self.margin)
-        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
-        better = allowed & ((over < self.over[starts]) | ((over == self.over[starts]) & (seen.f < self.f[starts])))
-        kept = (self.z, self.f, self.value, self.over, self.worst)
-        for old, new in zip(kept, (z, seen.f, np.exp(seen.value), over, worst), strict=True):
-            old[starts][better] = new[better]
-
-    def add(self, z: np.ndarray) -> list[int]:
-        """More starts, z (starts, gains); returns their numbers."""
-        more = Best(z, self.worst.shape[1], self.margin)
-        for name in ("z", "f", "value", "over", "worst"):
-            setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
-        return list(range(len(self.f) - len(z), len(self.f)))
-
-    def order(self) -> np.ndarray:
-        """Starts from the best to the worst."""
-        return np.lexsort((self.f, self.over))
 
 
 class _Run:
@@ -317,13 +285,33 @@ class _Run:
         tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
         for _ in range(CROSSINGS):
             before, f = self.best_so_far, best.f[best.order()[0]]
-            share = _toward_edges(rng.random((CROSSED, count)))
+            share = toward_edges(rng.random((CROSSED, count)))
             kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
             points = np.where(kept, best.z[best.order()[0]], logit(share))
             z = _promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
             self._polish(tightened, best, best.add(z))
             if self.best_so_far[1] >= before[1] and f - best.f[best.order()[0]] < GAINED:
                 return
+
+    def refine(self, problem: Problem, rng: np.random.Generator) -> None:
+        """Better points around the best one, without slopes: a narrow smooth sign leaves F rough on a small scale."""
+        best, count = self._best, len(problem.names)
+        if not self.started:
+            return
+        assert best is not None
+        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
+        first = best.order()[0]
+        for k in range(REFINED):
+            self._report(REFINING, k, REFINED, *self.best_so_far)
+            moved = rng.random((AROUND, count)) < 0.5  # the others stay, and with them, often, what a limit hangs on
+            moved[np.arange(AROUND), rng.integers(0, count, AROUND)] = True
+            step = SPREAD * SHRINK**k * rng.normal(size=(AROUND, count)) * moved
+            z = logit(np.clip(_share(best.z[first]) + step, EDGE, 1.0 - EDGE))
+            seen = self._evaluate.fly(tightened, z)
+            for one in np.argsort(seen.f, kind="stable")[:8]:  # the limits decide which of the lowest counts
+                best.offer(
+                    z[one : one + 1], seen.at(int(one)), np.isfinite(seen.f[one : one + 1]), slice(first, first + 1)
+                )
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended
@@ -358,30 +346,3 @@ def _stalled(record: list[tuple[float, float]], earliest: float) -> bool:
         return False
     (over_before, f_before), (over, f) = record[-1 - PATIENCE], record[-1]
     return over_before == over == 0.0 and f_before - f < GAINED
-
-
-def polish(evaluate: Evaluator, problem: Problem, best: Best, start: int) -> None:
-    """Follow the active limits to the optimum next to a start's best iterate; what is better is kept in `best`."""
-    seen: dict[bytes, Sloped] = {}
-
-    def at(z: np.ndarray) -> Sloped:
-        key = z.tobytes()
-        if key not in seen:
-            seen[key] = evaluate.slopes(problem, z[None])
-            best.offer(z[None], seen[key], seen[key].finite, slice(start, start + 1))
-        return seen[key]
-
-    limits = {
-        "type": "ineq",
-        "fun": lambda z: -at(z).c.reshape(-1),
-        "jac": lambda z: -at(z).c_slope.reshape(-1, z.size),
-    }
-    minimize(
-        lambda z: float(at(z).f[0]),
-        best.z[start].copy(),
-        jac=lambda z: at(z).f_slope[0],
-        method="SLSQP",
-        bounds=[(-8.0, 8.0)] * best.z.shape[1],
-        constraints=[limits] if problem.metrics else [],
-        options={"maxiter": POLISH_STEPS, "ftol": 1e-7},
-    )

@@ -23,7 +23,8 @@ from tuning import gains, report, trust
 from tuning.evaluate import Evaluator
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
-from tuning.optimise import MARGIN, Best, Report, Search, polish, search
+from tuning.optimise import MARGIN, Report, Search, search
+from tuning.polish import Best, polish
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
@@ -84,8 +85,8 @@ def trace(
     limited, own_limit = _limited(scenario)
     table = limited.tune
     assert table is not None
-    ready, problem, evaluate = report.pose(limited, seed, journal)
-    own = np.asarray(gains.own(ready.parts, problem.names))
+    posed = report.pose(limited, seed, journal)
+    ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:

@@ -14,13 +14,14 @@ from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_wi
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
-from tuning import evolution, gains, objective, trust
+from tuning import evolution, gains, objective, smoothing, trust
 from tuning.design import ShortestTime, shortest_time
 from tuning.evaluate import Evaluator
 from tuning.evolution import Check
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
 from tuning.optimise import Report, Search, search
+from tuning.smoothing import Smoothing
 from tuning.trust import Profile
 
 FRESH = 1000  # trials on which gains are judged
@@ -55,6 +56,7 @@ class Tuning:
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
     check: Check | None  # of a global search, if it was asked for
+    smoothing: Smoothing | None  # of the sign in training; None: as the scenario says
     rollouts: int  # trials flown in the search without slopes
     gradients: int  # and with
     seconds: float  # of the search
@@ -85,8 +87,9 @@ def tune(
     table = scenario.tune
     assert table is not None
     started = time.monotonic()
-    ready, problem, evaluate = pose(scenario, seed, journal)
-    own = np.asarray(gains.own(ready.parts, problem.names))
+    report("compiling", 0, 0, np.nan, 0.0)
+    posed = pose(scenario, seed, journal)
+    ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
     found = search(
         evaluate,
         problem,
@@ -104,7 +107,7 @@ def tune(
     report("judging on fresh trials", 0, 0, found.value, 0.0)
     named = {name: rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
     tuned = gains.in_scenario(scenario, named)
-    trained = gains.with_gains(ready.parts, named)
+    trained = gains.with_gains(problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
     paper, at_start = gains.of_paper(scenario), gains.gains_of(ready.parts)
@@ -147,14 +150,26 @@ def tune(
         shortest=shortest,
         trust=believed,
         check=check,
+        smoothing=posed.smoothing,
         rollouts=rollouts,
         gradients=gradients,
         seconds=seconds,
     )
 
 
-def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> tuple[Study, Problem, Evaluator]:
-    """The scenario's tuning problem over its training trials, and what evaluates it."""
+@dataclass(frozen=True)
+class Posed:
+    """A scenario's tuning problem over its training trials, and what evaluates it."""
+
+    ready: Study
+    problem: Problem
+    evaluate: Evaluator
+    own: np.ndarray  # (gains,) of the scenario
+    smoothing: Smoothing | None
+
+
+def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
+    """The tuning problem of a scenario: in the sampled loop with a smooth sign as narrow as the exact one asks for."""
     table = scenario.tune
     assert table is not None
     bounds = gain_bounds.of_scenario(scenario)
@@ -172,7 +187,12 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> tuple
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
     )
-    return ready, problem, Evaluator(bounds, journal)
+    evaluate, own, chosen = Evaluator(bounds, journal), np.asarray(gains.own(ready.parts, bounds.names)), None
+    if (
+        scenario.loop.mode == "sampled" and "sign_width" not in bounds.names
+    ):  # what `as_flown` judges with the exact sign
+        problem, chosen = smoothing.narrowed(evaluate, problem, own, seed)
+    return Posed(ready, problem, evaluate, own, chosen)
 
 
 def seed_of_judge(seed: int) -> int:

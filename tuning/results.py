@@ -83,6 +83,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
+            "smoothing": None if tuning.smoothing is None else asdict(tuning.smoothing),
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": checked,

@@ -193,6 +193,12 @@ def _search(summary: dict[str, Any]) -> Iterator[str]:
             f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
             f"{found['seconds']:.0f} s"
         )
+    smooth = found.get("smoothing")
+    if smooth is not None:
+        yield (
+            f"trained with a smooth sign of width {smooth['width']:.0e}: {100 * smooth['difference']:.2g} % from the "
+            f"exact one (the scenario's {smooth['own']:.0e}: {100 * smooth['own_difference']:.2g} %)"
+        )
     checked = summary.get("differential_evolution")
     if checked is not None:
         yield (
