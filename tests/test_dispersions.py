@@ -192,6 +192,7 @@ def test_principal_moments_are_truncated_normal():
     assert np.abs(inertia - inertia * np.eye(3)).max() == 0.0
     np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-14)
     shares = (np.diagonal(inertia, axis1=1, axis2=2) / [10.0, 12.0, 14.0] - 1.0) / 0.05
+    assert 2.9 < np.abs(shares).max() <= 3.0 + 1e-9  # 44 of 16 384 would lie farther out
     for axis in shares.T:
         assert stats.kstest(axis, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)

@@ -14,7 +14,7 @@ BASE = {
     "spacecraft": {"inertia": [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]},
     "controller": {"t_f": 8.0, "delta": 0.5},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0},
-    "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "rate_bias_walk": 1e-8, "star_tracker_every": 2},
+    "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "rate_bias_walk": 1e-5, "star_tracker_every": 2},
     "filter": {"kind": "steady_state", "bandwidth": 0.5},
     "dispersion": {"attitude": {"kind": "normal", "std_deg": 10.0}},
 }

@@ -36,6 +36,23 @@ def test_256_trials_equal_the_loop_over_them(flown):
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
 
 
+@pytest.mark.parametrize("count", [1, 3, 63, 64, 65, 129, 255])
+def test_any_number_of_trials_is_flown(flown, count):
+    """Shared out over two devices, in rows of 128 lanes or all at once: none is lost, none comes twice."""
+    run, trials = flown
+    some = montecarlo.run(run, SPREAD, 5, np.arange(count))
+    assert some.status.shape == some.metrics.window_error.shape == (count,)
+    np.testing.assert_array_equal(some.initial.q, trials.initial.q[:count])
+    np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
+
+
+def test_more_trials_than_one_call_takes(flown, monkeypatch):
+    run, trials = flown
+    monkeypatch.setattr(montecarlo, "CAPACITY", 64)
+    some = montecarlo.run(run, SPREAD, 5, np.arange(201), block=16)
+    np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:201], rtol=1e-12)
+
+
 def test_trials_equal_plain_vmap(flown):
     run, trials = flown
     plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))

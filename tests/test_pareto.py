@@ -12,7 +12,7 @@ from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import SHORT, small_search, tree
-from tuning import pareto, report
+from tuning import pareto, report, show
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
@@ -127,26 +127,21 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
-def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch):
-    """Ctrl-C while the ladder is climbed; the front is that of a run without it."""
-    from tuning.evaluate import Evaluator
-
+@pytest.mark.parametrize("stage", ["most torque: polishing", "least torque: polishing", "ladder", "judging"])
+def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
+    """Ctrl-C at any stage; the front is that of a run without it."""
     small_search(monkeypatch, 60)
-    slopes, calls = Evaluator.slopes, []
-
-    def counted(self, problem, z, stop=0):
-        calls.append(1)
-        if len(calls) == stop:
-            raise KeyboardInterrupt
-        return slopes(self, problem, z)
-
-    monkeypatch.setattr(Evaluator, "slopes", counted)
-    run = ("pareto", "s.toml", "--points", 4, "--no-figures", "--out")
+    run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
     whole = command(*run, "whole")[0]
-    stop, calls[:] = len(calls) - 10, []
+
+    def stop(self, what, *numbers):
+        if what.startswith(stage):
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        patch.setattr(Evaluator, "slopes", lambda self, problem, z: counted(self, problem, z, stop))
-        assert command(*run, "cut")[0] == 130
+        patch.setattr(show.Progress, "__call__", stop)
+        status, _, err = command(*run, "cut")
+    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
     assert not (tmp_path / "cut" / "front.csv").exists()
     assert command(*run, "cut")[0] == whole
     assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()

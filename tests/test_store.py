@@ -259,3 +259,24 @@ def test_arrays_stand_on_one_line_however_deep(tmp_path):
     assert "deep = [[1.0, 0.0], [0.0, 1.0]]" in text
     assert len(text.splitlines()) == 5
     assert tomllib.loads(text) == tables
+
+
+def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path):
+    tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
+    assert not store.begun(folder, tables, TOLD)
+    journal = store.begin(folder, tables, TOLD, fresh=True)
+    journal.write_bytes(b"kept")
+    assert store.begun(folder, tables, TOLD)
+    assert not store.begun(folder, tables, {**TOLD, "seed": 6})
+    assert not store.begun(folder, tables, {**TOLD, "command": "pareto"})
+    assert not store.begun(folder, {"controller": {"eta": 3.1}}, TOLD)
+    assert store.previous(folder, tables, TOLD) is None
+    assert store.begin(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
+    assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
+    made = json.loads((folder / "versions.json").read_text())
+    (folder / "versions.json").write_text(json.dumps({**made, "jax": "0.0.1"}))
+    assert not store.begun(folder, tables, TOLD)  # other versions may round otherwise
+    with pytest.raises(store.RefusedError):
+        store.check(folder, force=False)
+    store.end(folder)
+    assert not store.begun(folder, tables, TOLD)

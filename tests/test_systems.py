@@ -27,6 +27,7 @@ from ptsmc_jax import (
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FULL_INERTIA, ROOT, finer, parts, vector
+from tuning import gains, report
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
@@ -398,3 +399,16 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
     with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names no system'):
         scenario.read(tmp_path / "s.toml")
     assert store.previous(tmp_path, schema.dump(made), {"command": "tune", "seed": 0}) is None
+
+
+def test_steps_are_fine_enough_for_the_shortest_t_f_that_tuning_may_try():
+    tables = {
+        "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.0, 0.0]},
+        "controller": {"t_f": 3.0},
+        "loop": {"mode": "sampled", "period": 0.05},
+        "tune": {"free": ["t_f", "eta"], "bounds": {"t_f": [0.5, 4.0]}},
+    }
+    made = scenario.from_tables(tables)
+    roomy = report.pose(made, 0).ready.parts
+    short = scenario.study(gains.in_scenario(made, {"t_f": 0.5})).parts
+    assert roomy.substeps >= short.substeps > scenario.study(made).parts.substeps

@@ -48,6 +48,12 @@ def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
     np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("ratio", "flat"), [(1.0, True), (1.005, True), (1.02, False), (3.0, False)])
+def test_what_moves_a_goal_by_less_than_a_percent_is_flat(ratio, flat):
+    ones = np.ones(3)
+    assert trust.Profile(ones, np.array([2.0, 2.0 * ratio, 2.0]), ones).flat == flat
+
+
 def test_slopes_are_checked_against_differences():
     run = parts(20.0, 3.0, 1.0, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     noisy = objective.problem(
