@@ -27,11 +27,10 @@ def main() -> None:
     assert table is not None
     posed = report.pose(loaded, 0)
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
-    print(f"{posed.smoothing}")
     for seed in range(seeds):
         started, before = time.monotonic(), evaluate.gradients
         one = optimise.search(evaluate, problem, ready.requirements, own, table.starts, table.steps, seed,
-                              robust=table.worst_case)  # fmt: skip
+                              exact=posed.exact, robust=table.worst_case)  # fmt: skip
         took, slopes = time.monotonic() - started, evaluate.gradients - before
         found.append(one)
         print(f"seed {seed:2}: goal {one.value:.5e}, largest metric/limit {one.worst.max(initial=0.0):.5f}, "

@@ -55,7 +55,7 @@ FLOORS = {
         evaluate
         worst trust polish
         optimise
-        evolution smoothing
+        evolution
         report single reproduction mapping
         results pareto
         show

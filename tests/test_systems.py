@@ -27,7 +27,7 @@ from ptsmc_jax import (
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FULL_INERTIA, ROOT, finer, parts, vector
-from tuning import gains, report
+from tuning import report
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
@@ -401,14 +401,19 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
     assert store.previous(tmp_path, schema.dump(made), {"command": "tune", "seed": 0}) is None
 
 
-def test_steps_are_fine_enough_for_the_shortest_t_f_that_tuning_may_try():
+def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypatch):
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.0, 0.0]},
         "controller": {"t_f": 3.0},
         "loop": {"mode": "sampled", "period": 0.05},
         "tune": {"free": ["t_f", "eta"], "bounds": {"t_f": [0.5, 4.0]}},
     }
-    made = scenario.from_tables(tables)
-    roomy = report.pose(made, 0).ready.parts
-    short = scenario.study(gains.in_scenario(made, {"t_f": 0.5})).parts
-    assert roomy.substeps >= short.substeps > scenario.study(made).parts.substeps
+    looked_at, visited = [], theory.visited
+
+    def spied(parts):
+        looked_at.append((float(parts.controller.t_f), float(parts.t_end)))
+        return visited(parts)
+
+    monkeypatch.setattr(theory, "visited", spied)
+    report.pose(scenario.from_tables(tables), 0)
+    assert looked_at == [(0.5, 10.5)]

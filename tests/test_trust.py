@@ -29,9 +29,9 @@ def quiet():
 def test_sensitivities_of_the_first_torque_are_its_powers(quiet):
     found = trust.sensitivities(quiet, np.array([3.3, 1.0, 19.0]), ("peak_torque", "window_error", "settling_time"))
     powers = found["peak_torque"]
-    # central differences of a power p: off by (p-1)(p-2)/6 of the relative step squared
-    np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-5)
-    assert abs(powers["delta"]) < 1e-6
+    # central differences of a power p in logs: p atanh(h) / h, off by h^2 / 3 for a relative step h of 0.01
+    np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
+    assert abs(powers["delta"]) < 1e-4
     assert found["window_error"]["delta"] > 0.1
 
 

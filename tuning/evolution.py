@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import differential_evolution
 
@@ -61,12 +62,13 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
     )
     # near a limit evolution goes slowly: from where it ends, along it
     best = Best(logit(result.x[None]), len(problem.metrics), found.margin)
-    polish(evaluate, problem, best, 0)
-    seen = evaluate.slopes(problem, best.z)
-    own = evaluate.slopes(problem, found.z[None])
+    polish(evaluate, replace(found.smooth, limits=problem.limits), best, 0)
+    z = np.concatenate([logit(result.x[None]), best.z])
+    seen, own = evaluate.fly(problem, z), evaluate.fly(problem, found.z[None])
+    first = int(np.lexsort((seen.f, seen.c.max(axis=(1, 2), initial=-1.0) > SLACK))[0])
     return Check(
-        gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),
-        value=float(np.exp(seen.value[0])),
-        distance=float(own.f[0] - seen.f[0]),
+        gains=dict(zip(problem.names, np.asarray(evaluate.bounds.gains(jnp.asarray(z[first]))).tolist(), strict=True)),
+        value=float(np.exp(seen.value[first])),
+        distance=float(own.f[0] - seen.f[first]),
         rollouts=evaluate.rollouts - before,
     )

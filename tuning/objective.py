@@ -86,6 +86,12 @@ def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates |
     )
 
 
+def with_sign(problem: Problem, width: float) -> Problem:
+    """The problem flown with another width of the smooth sign; 0 is the exact one."""
+    controller = replace(problem.parts.controller, sign_width=jnp.asarray(float(width)))
+    return replace(problem, parts=replace(problem.parts, controller=controller))
+
+
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
     """F that is minimised, c = metric / limit - 1, (requirements, trials), met where c <= 0, and ln of the goal.
 

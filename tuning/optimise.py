@@ -17,7 +17,7 @@ from scipy.stats import qmc
 from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
-from tuning.objective import Problem, with_trials
+from tuning.objective import Problem, with_sign, with_trials
 from tuning.polish import Best, largest, polish
 from tuning.worst import Hardest
 
@@ -64,7 +64,8 @@ class Search:
     value: float  # its goal over the training trials
     worst: np.ndarray  # (requirements,) its largest metric / limit
     history: list[Step]
-    problem: Problem  # with the hardest trials
+    problem: Problem  # that is judged, with the hardest trials: under the exact sign, if that was asked for
+    smooth: Problem  # that the descent went by
     first: np.ndarray  # (gains,) free reals of the first start
     dropped: list[int] = field(default_factory=list)  # starts that met a number that is not finite
     rounds: int = 0  # searches again with harder trials
@@ -131,6 +132,7 @@ def search(
     steps: int,
     seed: int,
     *,
+    exact: bool = False,
     robust: bool = False,
     judged: bool = True,
     report: Report = lambda *told: None,
@@ -140,43 +142,46 @@ def search(
     A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
     screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
     not those drawn, but the worst case inside the dispersions' support. own: (gains,) the scenario's gains, the first
-    start. judged: say how hard the worst case is. report is called after every step. Interrupted, it returns the best
-    so far once there is one.
+    start. exact: what is found goes on under the exact sign, see `Run.settle`. judged: say how hard the worst case is.
+    report is called after every step. Interrupted, it returns the best so far once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
     margin = SURE_MARGIN if robust or problem.trials.size == 1 else MARGIN
-    run = _Run(evaluate, margin, report)
+    run = Run(evaluate, margin, exact, report)
     first, interrupted, hardest = evaluate.bounds.free(own), False, None
+
+    def flown(problem: Problem) -> Problem:
+        return with_sign(problem, 0.0) if exact else problem
+
     try:
-        if sure:
+        if sure:  # screened as flown
             middle = np.asarray(evaluate.bounds.gains(jnp.zeros(len(problem.names))))
             problem = _with_room(_add_screened(problem, sure, middle))
         z = starting_points(evaluate, problem, own, starts, seed, report)
         run.descend(problem, z, steps, "searching")
-        run.cross(problem, np.random.default_rng(seed))
-        run.refine(problem, np.random.default_rng(seed))
+        run.settle(problem, np.random.default_rng(seed))
         rounds = 0
         while sure:
             found = run.gains
             if robust:
                 report("looking for the worst case", 0, 0, *run.best_so_far)
-                hardest = worst_case.hardest(problem, sure, found)
+                hardest = worst_case.hardest(flown(problem), sure, found)
                 if hardest.unbounded or hardest.ratio <= 1.0 + NEAR or rounds == ROUNDS:
                     break
                 problem = _add(problem, np.asarray([hardest.trial]), hardest.coordinates)
             else:
-                trials, ratio = worst_case.screen(problem, sure, found)
+                trials, ratio = worst_case.screen(flown(problem), sure, found)
                 if np.all(ratio <= 1.0) or rounds == ROUNDS:
                     break
                 problem = _add_screened(problem, sure, found, (trials, ratio))
             rounds += 1
             again = max(20, steps // 3)
             run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
-            run.refine(problem, np.random.default_rng(seed))
+            run.settle(problem, np.random.default_rng(seed))
             run.rounds = rounds
         if sure and judged and hardest is None:
             report("looking for the worst case", 0, 0, *run.best_so_far)
-            hardest = worst_case.hardest(problem, sure, run.gains)
+            hardest = worst_case.hardest(flown(problem), sure, run.gains)
     except KeyboardInterrupt:
         if not run.started:
             raise
@@ -214,15 +219,16 @@ def _add_screened(problem: Problem, requirements, gains: np.ndarray, screened: t
     return with_trials(problem, hardest) if screened is None else _add(problem, hardest)
 
 
-class _Run:
+class Run:
     """Descents and what they leave: the best iterate, the history."""
 
-    def __init__(self, evaluate: Evaluator, margin: float, report: Report):
-        self._evaluate, self._margin, self._report = evaluate, margin, report
+    def __init__(self, evaluate: Evaluator, margin: float, exact: bool, report: Report):
+        self._evaluate, self._margin, self._exact, self._report = evaluate, margin, exact, report
         self._best: Best | None = None
         self._problem: Problem | None = None
         self._history: list[Step] = []
         self._dropped: list[int] = []
+        self._width = 0.0  # of the smooth sign
         self.rounds = 0
 
     @property
@@ -238,6 +244,13 @@ class _Run:
         return float(self._best.value[first]), float(self._best.over[first])
 
     @property
+    def best_point(self) -> tuple[float, float, np.ndarray]:
+        """F, goal and free reals of the best iterate."""
+        assert self._best is not None
+        first = self._best.order()[0]
+        return float(self._best.f[first]), float(self._best.value[first]), self._best.z[first]
+
+    @property
     def gains(self) -> np.ndarray:
         """(gains,) of the best iterate."""
         assert self._best is not None
@@ -245,7 +258,7 @@ class _Run:
 
     def descend(self, problem: Problem, z: np.ndarray, steps: int, what: str) -> None:
         """All starts by Adam, then a polish of the best ones."""
-        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
+        tightened, self._width = self._tightened(problem), float(problem.parts.controller.sign_width)
         best, alive = Best(z, len(problem.metrics), self._margin), np.ones(len(z), dtype=bool)
         # slopes range over decades as limits are crossed: clipped, and with a short memory of their size
         rate = optax.cosine_decay_schedule(RATE, steps, LAST_RATE / RATE)
@@ -276,42 +289,84 @@ class _Run:
         # all of them: the best start of a descent need not lie in the best valley
         self._polish(tightened, best, [int(start) for start in best.order() if np.isfinite(best.f[start])])
 
-    def cross(self, problem: Problem, rng: np.random.Generator) -> None:
-        """Look for a better valley: points that share some gains, and so the active limits, with the best one."""
-        best, count = self._best, len(problem.names)
-        if count < 2 or not self.started:
+    def settle(self, problem: Problem, rng: np.random.Generator) -> None:
+        """From what the descent found to the best gains as they are judged.
+
+        Where the exact sign judges, F has no slopes to go by: it is flown at the gains found, at points spread over the
+        bounds and at points that share gains, and so the active limits, with the best one, and refined around the best
+        of these. Otherwise the points that share gains are polished like the starts.
+        """
+        if not self.started:
             return
+        tightened = self._tightened(with_sign(problem, 0.0) if self._exact else problem)
+        if self._exact:
+            assert self._best is not None
+            spread = logit(toward_edges(rng.random((CROSSED, len(problem.names)))))
+            far = _promising(self._evaluate, tightened, spread, FOLLOWED, partial(self._report, CROSSING))
+            self._as_judged(tightened, np.concatenate([self._best.z, far]))
+        self._cross(tightened, rng)
+        self._refine(tightened, rng)
+
+    def _tightened(self, problem: Problem) -> Problem:
+        return replace(problem, limits=problem.limits * (1.0 - self._margin))
+
+    def _as_judged(self, tightened: Problem, z: np.ndarray) -> None:
+        best, flown = Best(z, len(tightened.metrics), self._margin), self._evaluate.fly(tightened, z)
+        best.offer(z, flown, np.isfinite(flown.f))
+        if np.isfinite(best.f).any():
+            self._best, self._problem = best, tightened
+
+    def _cross(self, tightened: Problem, rng: np.random.Generator) -> None:
+        """Look for a better valley: points that share some gains, and so the active limits, with the best one."""
+        best, count = self._best, len(tightened.names)
         assert best is not None
-        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
-        for _ in range(CROSSINGS):
+        for _ in range(CROSSINGS if count > 1 else 0):
             before, f = self.best_so_far, best.f[best.order()[0]]
             share = toward_edges(rng.random((CROSSED, count)))
             kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
             points = np.where(kept, best.z[best.order()[0]], logit(share))
             z = _promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
-            self._polish(tightened, best, best.add(z))
+            more = best.add(z)
+            if self._exact:
+                flown = self._evaluate.fly(tightened, z)
+                best.offer(z, flown, np.isfinite(flown.f), slice(more[0], None))
+            else:
+                self._polish(tightened, best, more)
             if self.best_so_far[1] >= before[1] and f - best.f[best.order()[0]] < GAINED:
                 return
 
-    def refine(self, problem: Problem, rng: np.random.Generator) -> None:
-        """Better points around the best one, without slopes: a narrow smooth sign leaves F rough on a small scale."""
-        best, count = self._best, len(problem.names)
-        if not self.started:
-            return
+    def _refine(self, tightened: Problem, rng: np.random.Generator) -> None:
+        """Better points around the best ones, without slopes, ever closer."""
+        best, count = self._best, len(tightened.names)
         assert best is not None
-        tightened = replace(problem, limits=problem.limits * (1.0 - self._margin))
-        first = best.order()[0]
-        for k in range(REFINED):
-            self._report(REFINING, k, REFINED, *self.best_so_far)
-            moved = rng.random((AROUND, count)) < 0.5  # the others stay, and with them, often, what a limit hangs on
-            moved[np.arange(AROUND), rng.integers(0, count, AROUND)] = True
-            step = SPREAD * SHRINK**k * rng.normal(size=(AROUND, count)) * moved
-            z = logit(np.clip(_share(best.z[first]) + step, EDGE, 1.0 - EDGE))
-            seen = self._evaluate.fly(tightened, z)
-            for one in np.argsort(seen.f, kind="stable")[:8]:  # the limits decide which of the lowest counts
-                best.offer(
-                    z[one : one + 1], seen.at(int(one)), np.isfinite(seen.f[one : one + 1]), slice(first, first + 1)
-                )
+        chosen: list[int] = []
+        for k in best.order():
+            apart = [np.abs(_share(best.z[k]) - _share(best.z[j])).max() for j in chosen]
+            if np.isfinite(best.f[k]) and min(apart, default=1.0) >= APART / 2:
+                chosen.append(int(k))
+        passes = [*chosen[:FOLLOWED], None, None] if self._exact else [None]
+        for one in passes:  # the best one of all twice more
+            start = int(best.order()[0]) if one is None else one
+            for k in range(REFINED):
+                self._report(REFINING, k, REFINED, *self.best_so_far)
+                moved = rng.random((AROUND, count)) < 0.5  # the others stay, and with them, often, the active limits
+                moved[np.arange(AROUND), rng.integers(0, count, AROUND)] = True
+                step = SPREAD * SHRINK**k * rng.normal(size=(AROUND, count)) * moved
+                z = logit(np.clip(_share(best.z[start]) + step, EDGE, 1.0 - EDGE))
+                seen = self._evaluate.fly(tightened, z)
+                for at in np.argsort(seen.f, kind="stable")[:8]:  # the limits decide which of the lowest counts
+                    finite = np.isfinite(seen.f[at : at + 1])
+                    best.offer(z[at : at + 1], seen.at(int(at)), finite, slice(start, start + 1))
+
+    def step(self, problem: Problem, known: np.ndarray, rng: np.random.Generator) -> None:
+        """The best gains that keep these limits, from known ones (points, gains): polished, then refined as judged."""
+        tightened = self._tightened(problem)
+        self._best, self._problem = Best(known, len(problem.metrics), self._margin), tightened
+        self._polish(tightened, self._best, list(range(len(known))))
+        if self._exact:
+            tightened = self._tightened(with_sign(problem, 0.0))
+            self._as_judged(tightened, np.concatenate([self._best.z, known]))
+        self._refine(tightened, rng)
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended
@@ -332,7 +387,8 @@ class _Run:
             value=float(self._best.value[best]),
             worst=self._best.worst[best],
             history=self._history,
-            problem=replace(self._problem, limits=self._problem.limits / (1.0 - self._margin)),
+            problem=(judged := replace(self._problem, limits=self._problem.limits / (1.0 - self._margin))),
+            smooth=with_sign(judged, self._width),
             first=first,
             dropped=self._dropped,
             rounds=self.rounds,

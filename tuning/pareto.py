@@ -22,9 +22,8 @@ from ptsmc_jax.tables import Limit, Scenario
 from tuning import gains, report, trust
 from tuning.evaluate import Evaluator
 from tuning.journal import Journal
-from tuning.objective import T_F, Problem
-from tuning.optimise import MARGIN, Report, Search, search
-from tuning.polish import Best, polish
+from tuning.objective import T_F, Problem, with_sign
+from tuning.optimise import MARGIN, Report, Run, Search, search
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
@@ -95,11 +94,11 @@ def trace(
     def told(what: str) -> Report:
         return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
 
-    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False}
+    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "exact": posed.exact}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in ready.requirements]
     free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
     _unless_interrupted(free)
-    problem = replace(free.problem, limits=problem.limits)
+    problem = replace(free.smooth, limits=problem.limits)
     highest = free.worst[at] * OFF
     tight = HARDLY * highest
     least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
@@ -113,8 +112,7 @@ def trace(
     rungs = [*range(points - 1, -1, -1), *range(points)]
     for done, k in enumerate(rungs):
         tell("ladder", done, len(rungs), np.nan, 0.0)
-        tightened = under(float(ladder[k]) * (1.0 - MARGIN))
-        found = _step(evaluate, tightened, np.unique(np.asarray(known), axis=0))
+        found = _step(evaluate, under(float(ladder[k])), np.unique(np.asarray(known), axis=0), posed.exact)
         if found is not None and (k not in best or found[0] < best[k][0]):
             best[k] = found
             known.append(found[2])
@@ -160,18 +158,17 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _step(evaluate: Evaluator, tightened: Problem, known: np.ndarray) -> tuple[float, float, np.ndarray] | None:
+def _step(
+    evaluate: Evaluator, problem: Problem, known: np.ndarray, exact: bool
+) -> tuple[float, float, np.ndarray] | None:
     """F, goal and free reals of the best gains that keep these limits, from the most promising known ones."""
-    flown = evaluate.fly(tightened, known)
+    flown = evaluate.fly(with_sign(problem, 0.0) if exact else problem, known)
     over = flown.c.max(axis=(1, 2), initial=0.0)
     chosen = np.lexsort((flown.f, np.maximum(over - 0.05, 0.0)))[:WARM]
-    best = Best(known[chosen], len(tightened.metrics), MARGIN)
-    for start in range(len(chosen)):
-        polish(evaluate, tightened, best, start)
-    first = best.order()[0]
-    if best.over[first] > 0.0 or not np.isfinite(best.f[first]):
-        return None
-    return float(best.f[first]), float(best.value[first]), best.z[first]
+    run = Run(evaluate, MARGIN, exact, lambda *told: None)
+    run.step(problem, known[chosen], np.random.default_rng(0))
+    value, over_limit = run.best_so_far
+    return None if over_limit > 0.0 or not np.isfinite(value) else run.best_point
 
 
 def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[float, tuple[Point, Trials]]:

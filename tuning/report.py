@@ -14,16 +14,16 @@ from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_wi
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
-from tuning import evolution, gains, objective, smoothing, trust
+from tuning import evolution, gains, objective, trust
 from tuning.design import ShortestTime, shortest_time
 from tuning.evaluate import Evaluator
 from tuning.evolution import Check
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
 from tuning.optimise import Report, Search, search
-from tuning.smoothing import Smoothing
 from tuning.trust import Profile
 
+SMOOTH = 1e-3  # width of the sign that is descended by where the scenario flies the exact one
 FRESH = 1000  # trials on which gains are judged
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
@@ -56,7 +56,7 @@ class Tuning:
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
     check: Check | None  # of a global search, if it was asked for
-    smoothing: Smoothing | None  # of the sign in training; None: as the scenario says
+    smooth_value: float | None  # the goal under the smooth sign that the descent went by; None: it is the judge's too
     rollouts: int  # trials flown in the search without slopes
     gradients: int  # and with
     seconds: float  # of the search
@@ -98,6 +98,7 @@ def tune(
         table.starts,
         table.steps,
         seed,
+        exact=posed.exact,
         robust=table.worst_case,
         report=report,
     )
@@ -107,7 +108,7 @@ def tune(
     report("judging on fresh trials", 0, 0, found.value, 0.0)
     named = {name: rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
     tuned = gains.in_scenario(scenario, named)
-    trained = gains.with_gains(problem.parts, named)
+    trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
     paper, at_start = gains.of_paper(scenario), gains.gains_of(ready.parts)
@@ -125,16 +126,18 @@ def tune(
     shortest = None
     if limit is not None and T_F not in problem.names:
         shortest = shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
-    believed = None
+    believed = smooth_value = None
     if not found.interrupted:
+        if posed.exact:
+            smooth_value = float(np.exp(evaluate.fly(found.smooth, found.z[None]).value[0]))
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
         believed = Trust(
             slope_error=(
-                trust.slope_error(evaluate, found.problem, found.first),
-                trust.slope_error(evaluate, found.problem, found.z),
+                trust.slope_error(evaluate, found.smooth, found.first),
+                trust.slope_error(evaluate, found.smooth, found.z),
             ),
             profiles=trust.profiles(evaluate, found.problem, found.z),
-            sensitivities=trust.sensitivities(problem, found.gains, wanted),
+            sensitivities=trust.sensitivities(found.problem, found.gains, wanted),
         )
     return Tuning(
         tuned=tuned,
@@ -150,7 +153,7 @@ def tune(
         shortest=shortest,
         trust=believed,
         check=check,
-        smoothing=posed.smoothing,
+        smooth_value=smooth_value,
         rollouts=rollouts,
         gradients=gradients,
         seconds=seconds,
@@ -165,11 +168,11 @@ class Posed:
     problem: Problem
     evaluate: Evaluator
     own: np.ndarray  # (gains,) of the scenario
-    smoothing: Smoothing | None
+    exact: bool  # gains are judged with the exact sign
 
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
-    """The tuning problem of a scenario: in the sampled loop with a smooth sign as narrow as the exact one asks for."""
+    """The tuning problem of a scenario."""
     table = scenario.tune
     assert table is not None
     bounds = gain_bounds.of_scenario(scenario)
@@ -187,12 +190,11 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
     )
-    evaluate, own, chosen = Evaluator(bounds, journal), np.asarray(gains.own(ready.parts, bounds.names)), None
-    if (
-        scenario.loop.mode == "sampled" and "sign_width" not in bounds.names
-    ):  # what `as_flown` judges with the exact sign
-        problem, chosen = smoothing.narrowed(evaluate, problem, own, seed)
-    return Posed(ready, problem, evaluate, own, chosen)
+    own = np.asarray(gains.own(ready.parts, bounds.names))
+    exact = scenario.loop.mode == "sampled" and "sign_width" not in bounds.names  # as `as_flown` judges
+    if exact and float(ready.parts.controller.sign_width) == 0.0:  # nothing to descend by
+        problem = objective.with_sign(problem, SMOOTH)
+    return Posed(ready, problem, Evaluator(bounds, journal), own, exact)
 
 
 def seed_of_judge(seed: int) -> int:

@@ -83,7 +83,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
-            "smoothing": None if tuning.smoothing is None else asdict(tuning.smoothing),
+            "goal_under_the_smooth_sign": tuning.smooth_value,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": checked,

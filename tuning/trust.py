@@ -15,7 +15,7 @@ from tuning.gains import with_gains
 from tuning.objective import Problem
 
 DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
-STEP = 1e-3  # of the gains, relative, for sensitivities
+STEP = 1e-2  # of the gains, relative, for sensitivities
 SMALLEST = 1e-6  # slopes of ln F below this are none
 ACROSS = 15  # gains looked at between the bounds of each, besides the one found
 FLAT = 0.01  # a goal that changes by less than this share between the bounds does not depend on the gain
