@@ -170,6 +170,10 @@ def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
     from tuning import optimise, report, worst
 
-    small = ((worst, "SCREENED", 64), (optimise, "CANDIDATES", 8), (optimise, "CROSSED", 16), (report, "FRESH", fresh))
-    for module, name, value in small:
+    small = {"CANDIDATES": 8, "CROSSED": 16, "REFINED": 3}
+    for module, name, value in (
+        (worst, "SCREENED", 64),
+        (report, "FRESH", fresh),
+        *((optimise, name, value) for name, value in small.items()),
+    ):
         monkeypatch.setattr(module, name, value)

@@ -93,10 +93,7 @@ def test_bad_input_is_one_sentence_and_exit_status_two(command, tmp_path, args, 
 
 
 def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
-    from tuning import optimise, report, worst
-
-    for module, name, value in ((worst, "SCREENED", 32), (optimise, "CANDIDATES", 8), (report, "FRESH", 40)):
-        monkeypatch.setattr(module, name, value)
+    small_search(monkeypatch)
     status, _, _ = command("tune", "s.toml", "--out", "t")
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
     assert status == (0 if summary["status"] == "met" else 1)
@@ -350,7 +347,8 @@ def test_a_killed_search_goes_on(tmp_path):
     """kill -9 while it searches, in a process of its own; then the same command to the end."""
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
-        "import sys; from tuning import cli, optimise, report, worst; optimise.CANDIDATES = 8; optimise.CROSSED = 16; "
+        "import sys; from tuning import cli, optimise, report, worst; "
+        "optimise.CANDIDATES = 8; optimise.CROSSED = 16; optimise.REFINED = 3; "
         "worst.SCREENED = 64; report.FRESH = 40; cli.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
