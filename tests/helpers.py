@@ -168,12 +168,13 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning import optimise, report, worst
+    from tuning import optimise, report, starts, worst
 
-    small = {"CANDIDATES": 8, "CROSSED": 16, "REFINED": 3}
+    small = {"CROSSED": 16, "REFINED": 3}
     for module, name, value in (
         (worst, "SCREENED", 64),
         (report, "FRESH", fresh),
+        (starts, "CANDIDATES", 8),
         *((optimise, name, value) for name, value in small.items()),
     ):
         monkeypatch.setattr(module, name, value)

@@ -53,7 +53,7 @@ FLOORS = {
         bounds design journal
         objective
         evaluate
-        worst trust polish
+        worst trust polish starts
         optimise
         evolution
         report single reproduction mapping

@@ -10,7 +10,7 @@ from scipy import stats
 from ptsmc_jax import clock, dispersions, signals
 from ptsmc_jax.requirements import Requirement
 from tests.helpers import parts, vector
-from tuning import evolution, objective, optimise, trust
+from tuning import evolution, objective, optimise, starts, trust
 from tuning.bounds import Bounds
 from tuning.evaluate import Evaluator
 
@@ -107,7 +107,7 @@ def test_what_cannot_be_resampled_has_no_interval():
 
 
 def test_differential_evolution_finds_the_same_optimum(monkeypatch):
-    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    monkeypatch.setattr(starts, "CANDIDATES", 8)
     monkeypatch.setattr(evolution, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))

@@ -11,7 +11,7 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, gains, objective, optimise, report, results, worst
+from tuning import bounds, gains, objective, optimise, report, results, starts, worst
 from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -145,7 +145,7 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
 
 
 def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
-    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    monkeypatch.setattr(starts, "CANDIDATES", 8)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     largest = {}
     for tail in (None, 1):
@@ -186,7 +186,7 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
 def test_search_finds_the_constrained_optimum(monkeypatch):
     """Against a brute-force scan of the same problem, screening for harder trials left out."""
     monkeypatch.setattr(worst, "SCREENED", 16)
-    monkeypatch.setattr(optimise, "CANDIDATES", 8)
+    monkeypatch.setattr(starts, "CANDIDATES", 8)
     some = problem(peak_torque=0.9)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)
@@ -215,7 +215,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
 
 def test_starts_begin_with_the_scenarios_own_gains_and_differ():
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-    z = optimise.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
+    z = starts.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
     assert z.shape == (4, 2)
     np.testing.assert_allclose(limits.gains(jnp.asarray(z[0])), [3.0, 0.5], rtol=1e-9)
     assert len(np.unique(z, axis=0)) == 4

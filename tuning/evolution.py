@@ -7,8 +7,9 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from tuning.evaluate import Evaluator
-from tuning.optimise import EDGE, Report, Search, logit
+from tuning.optimise import Search
 from tuning.polish import SLACK, Best, polish
+from tuning.starts import EDGE, Report, logit
 
 POPULATION = 40  # points for each gain
 GENERATIONS = 80

@@ -2,23 +2,23 @@
 
 All starts together by Adam on the augmented Lagrangian for inequalities,
 L = f + sum (max(0, m + p c)^2 - m^2) / (2 p) (Nocedal and Wright, Numerical Optimization, 2006, eq. 17.65),
-then the most promising ones one by one by sequential quadratic programming (SciPy's SLSQP).
+then each by sequential quadratic programming (SciPy's SLSQP), and, where the exact sign judges, without slopes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import optax
-from scipy.stats import qmc
 
 from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
 from tuning.objective import Problem, with_sign, with_trials
 from tuning.polish import Best, largest, polish
+from tuning.starts import APART, EDGE, Report, logit, promising, share_of, starting_points, toward_edges
 from tuning.worst import Hardest
 
 PENALTY = 20.0
@@ -28,9 +28,6 @@ SAME = 0.01  # of the bounds: starts as near to a polished one are not polished
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
 PATIENCE, GAINED = 30, 1e-3  # steps without this much less F in any start end the descent
-CANDIDATES = 128  # points flown for each start that is chosen
-CHARGE, APART = 3.0, 0.15
-EDGE = 3e-4  # share of each interval that is left out at both ends
 # refinement without slopes: points around the best one, times; spread at first, and by how much it shrinks
 AROUND, REFINED, SPREAD, SHRINK = 64, 18, 0.05, 0.75
 CROSSED, FOLLOWED, CROSSINGS = 512, 4, 3  # points that share gains with the best one; those polished; times, at most
@@ -41,9 +38,7 @@ SPARE = 8  # places for those that later rounds add: a trial more would be anoth
 ROUNDS = 6  # searches again with hardest trials added, at most
 NEAR = 1e-3  # how far the worst case may be beyond a limit
 
-CHOOSING, CROSSING, REFINING = "choosing starts", "looking for a better valley", "refining"
-# what is being done, steps done, in all, best goal, how far beyond a limit
-Report = Callable[[str, int, int, float, float], None]
+CROSSING, REFINING = "looking for a better valley", "refining"
 
 
 @dataclass(frozen=True)
@@ -72,55 +67,6 @@ class Search:
     margin: float = MARGIN  # that was kept from the limits
     hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
     interrupted: bool = False
-
-
-def starting_points(
-    evaluate: Evaluator, problem: Problem, own: np.ndarray, starts: int, seed: int, report: Report
-) -> np.ndarray:
-    """(starts, gains) free reals: the scenario's own gains first, then the most promising of a Latin hypercube."""
-    first = evaluate.bounds.free(own)[None]
-    if starts == 1:
-        return first
-    share = qmc.LatinHypercube(len(problem.names), rng=np.random.default_rng(seed)).random(CANDIDATES * starts)
-    z = logit(toward_edges(share))
-    return np.concatenate([first, _promising(evaluate, problem, z, starts - 1, partial(report, CHOOSING))])
-
-
-def _promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int, tell: Callable) -> np.ndarray:
-    """So many of the points z, (points, gains), by F with breaches of a limit charged: one of each valley first.
-
-    A point that has no better one within `APART` of it, in the unit cube, is taken for the lowest of its valley (as in
-    multi-level single linkage, Rinnooy Kan and Timmer, Math. Programming 39, 1987); the others follow, not too close.
-    """
-    merit = []
-    for k in range(0, len(z), 64):
-        flown = evaluate.fly(problem, z[k : k + 64])
-        merit.append(flown.f + CHARGE * np.log1p(flown.c.max(axis=(1, 2), initial=0.0)))
-        tell(min(k + 64, len(z)), len(z), np.nan, np.nan)
-    merits, share = np.concatenate(merit), _share(z)
-    order = np.asarray([k for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])], dtype=int)
-    apart = np.abs(share[order, None] - share[None, order]).max(axis=2)  # row and column by merit
-    lowest = [k for k in range(len(order)) if np.all(apart[k, :k] >= APART)]
-    chosen: list[int] = []
-    for candidates, distance in ((lowest, 0.0), (range(len(order)), APART), (range(len(order)), 0.0)):
-        for k in candidates:
-            if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
-                chosen.append(k)
-    return z[order[chosen]]
-
-
-def toward_edges(uniform: np.ndarray) -> np.ndarray:
-    """Shares of the bounds' intervals, denser toward both ends (arcsine law): optima often lie near bounds."""
-    return np.clip(0.5 - 0.5 * np.cos(np.pi * uniform), EDGE, 1.0 - EDGE)
-
-
-def _share(z: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-z))
-
-
-def logit(share: np.ndarray) -> np.ndarray:
-    """Free reals of shares of the bounds' intervals."""
-    return np.log(share / (1.0 - share))
 
 
 def search(
@@ -302,7 +248,7 @@ class Run:
         if self._exact:
             assert self._best is not None
             spread = logit(toward_edges(rng.random((CROSSED, len(problem.names)))))
-            far = _promising(self._evaluate, tightened, spread, FOLLOWED, partial(self._report, CROSSING))
+            far = promising(self._evaluate, tightened, spread, FOLLOWED, partial(self._report, CROSSING))
             self._as_judged(tightened, np.concatenate([self._best.z, far]))
         self._cross(tightened, rng)
         self._refine(tightened, rng)
@@ -325,7 +271,7 @@ class Run:
             share = toward_edges(rng.random((CROSSED, count)))
             kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
             points = np.where(kept, best.z[best.order()[0]], logit(share))
-            z = _promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
+            z = promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
             more = best.add(z)
             if self._exact:
                 flown = self._evaluate.fly(tightened, z)
@@ -341,7 +287,7 @@ class Run:
         assert best is not None
         chosen: list[int] = []
         for k in best.order():
-            apart = [np.abs(_share(best.z[k]) - _share(best.z[j])).max() for j in chosen]
+            apart = [np.abs(share_of(best.z[k]) - share_of(best.z[j])).max() for j in chosen]
             if np.isfinite(best.f[k]) and min(apart, default=1.0) >= APART / 2:
                 chosen.append(int(k))
         passes = [*chosen[:FOLLOWED], None, None] if self._exact else [None]
@@ -352,7 +298,7 @@ class Run:
                 moved = rng.random((AROUND, count)) < 0.5  # the others stay, and with them, often, the active limits
                 moved[np.arange(AROUND), rng.integers(0, count, AROUND)] = True
                 step = SPREAD * SHRINK**k * rng.normal(size=(AROUND, count)) * moved
-                z = logit(np.clip(_share(best.z[start]) + step, EDGE, 1.0 - EDGE))
+                z = logit(np.clip(share_of(best.z[start]) + step, EDGE, 1.0 - EDGE))
                 seen = self._evaluate.fly(tightened, z)
                 for at in np.argsort(seen.f, kind="stable")[:8]:  # the limits decide which of the lowest counts
                     finite = np.isfinite(seen.f[at : at + 1])
@@ -372,9 +318,9 @@ class Run:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended
         for k, start in enumerate(starts):
             self._report("polishing", k, len(starts), *self.best_so_far)
-            if all(np.abs(_share(best.z[start]) - other).max() >= SAME for other in done):
+            if all(np.abs(share_of(best.z[start]) - other).max() >= SAME for other in done):
                 polish(self._evaluate, tightened, best, start)
-                done.append(_share(best.z[start]))
+                done.append(share_of(best.z[start]))
 
     def outcome(self, first: np.ndarray) -> Search:
         """The best iterate."""

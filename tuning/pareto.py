@@ -23,7 +23,8 @@ from tuning import gains, report, trust
 from tuning.evaluate import Evaluator
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem, with_sign
-from tuning.optimise import MARGIN, Report, Run, Search, search
+from tuning.optimise import MARGIN, Run, Search, search
+from tuning.starts import Report
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back

@@ -20,7 +20,8 @@ from tuning.evaluate import Evaluator
 from tuning.evolution import Check
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
-from tuning.optimise import Report, Search, search
+from tuning.optimise import Search, search
+from tuning.starts import Report
 from tuning.trust import Profile
 
 SMOOTH = 1e-3  # width of the sign that is descended by where the scenario flies the exact one
