@@ -121,7 +121,7 @@ def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     if not filtered and all(noise is None for noise in noises):
         return None
     star, every = table.attitude_noise or 0.0, table.star_tracker_every or 1
-    gyro = table.rate_noise or sensing.per_sample(table.rate_noise_density or 0.0, period)
+    gyro = free_gains.gyro_noise(table, period)
     walk = table.rate_bias_walk
     estimator = None
     if isinstance(scenario.filter, t.SteadyStateFilter):

@@ -24,8 +24,12 @@ def filter_bandwidth(scenario: Scenario) -> float:
         return scenario.filter.bandwidth
     table, period = scenario.hardware, scenario.loop.period
     assert isinstance(table, tables.Hardware)
-    gyro = table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
-    return sensors.best_bandwidth(table.attitude_noise or 0.0, gyro, period, _interval(scenario))
+    return sensors.best_bandwidth(table.attitude_noise or 0.0, gyro_noise(table, period), period, _interval(scenario))
+
+
+def gyro_noise(table: tables.Hardware, period: float) -> float:
+    """Noise of the gyro, 1 sigma a sample [rad/s]."""
+    return table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:

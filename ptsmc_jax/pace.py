@@ -52,8 +52,9 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, reach), None
     if isinstance(parts.plant, System):
-        visited = theory.visited(_hurried(parts, reach))
-        frequencies["plant.system"] = _fastest_of_system(_hurried(parts, reach), visited)
+        hurried = parts.with_t_f(build.vector(reach.smallest_t_f))
+        visited = theory.visited(hurried)
+        frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if loop.mode == "continuous":
         if "plant.system" in frequencies:
             frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
@@ -65,13 +66,6 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
         return dataclasses.replace(clock.flight(loop.period, last), t_end=build.vector(loop.t_end)), substeps
     late = loop.t_end - scenario.controller.t_f + reach.delta
     return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
-
-
-def _hurried(parts: Parts, reach: Reach) -> Parts:
-    """The parts with the shortest t_f."""
-    shorter = build.vector(reach.smallest_t_f)
-    t_end = shorter + (parts.t_end - parts.controller.t_f)
-    return dataclasses.replace(parts, t_end=t_end, controller=dataclasses.replace(parts.controller, t_f=shorter))
 
 
 def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:

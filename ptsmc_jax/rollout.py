@@ -4,7 +4,7 @@
 inertia or noise is the same compiled program.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -58,6 +58,12 @@ class Parts:
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
+
+    def with_t_f(self, t_f: Leaf) -> "Parts":
+        """The parts with another prescribed time [s]; the time after it is kept."""
+        t_end = t_f + (self.t_end - self.controller.t_f)
+        law, timing = replace(self.controller, t_f=t_f), replace(self.clock, t_end=t_end)
+        return replace(self, controller=law, clock=timing, t_end=t_end)
 
 
 class Log(NamedTuple):

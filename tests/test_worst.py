@@ -86,7 +86,7 @@ def test_slopes_of_the_ascent_agree_with_central_differences():
     sine = signals.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
     run = replace(problem.parts, disturbance=sine)
     chosen = np.arange(3, dtype=np.uint32)
-    coordinates = objective.dispersion_of(spread, run, 5, chosen)
+    coordinates = objective.coordinates_of(spread, run, 5, chosen)
     moved = tuple(coordinates)
     posed_again = replace(problem, parts=run)
     y = np.concatenate([worst._charted(posed_again, name, np.asarray(coordinates[name])) for name in moved], axis=1)
@@ -117,8 +117,8 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
     )
     assert robust.hardest is not None
     assert plain.hardest is not None
-    assert robust.hardest.ratio <= 1.0 + optimise.NEAR
-    assert robust.gains[0] <= eta * (1 + optimise.NEAR)
+    assert robust.hardest.ratio <= 1.0 + worst.NEAR
+    assert robust.gains[0] <= eta * (1 + worst.NEAR)
     np.testing.assert_allclose(robust.gains[0], eta, rtol=0.01)  # it gives up no more than its margin
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
@@ -130,7 +130,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     more = objective.with_trials(problem, np.asarray([40]))
     own = {
         name: np.asarray(v)[0]
-        for name, v in objective.dispersion_of(spread, problem.parts, 5, np.asarray([40])).items()
+        for name, v in objective.coordinates_of(spread, problem.parts, 5, np.asarray([40])).items()
     }
     roomy = optimise._with_room(problem)
     assert roomy.trials.size == 8 + optimise.SPARE

@@ -55,9 +55,8 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept."""
     gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
     if "t_f" in gains:
-        t_end = gains["t_f"] + (parts.t_end - parts.controller.t_f)
-        parts = replace(parts, t_end=t_end, clock=replace(parts.clock, t_end=t_end))
-    law = {k: v for k, v in gains.items() if base(k) not in ("observer_gain", "filter_bandwidth")}
+        parts = parts.with_t_f(gains["t_f"])
+    law = {k: v for k, v in gains.items() if base(k) not in ("t_f", "observer_gain", "filter_bandwidth")}
     parts = replace(parts, controller=replace(parts.controller, **law))
     each = _each(gains, list(getattr(parts.observer, "gain", ())))
     if each is not None:

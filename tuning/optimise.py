@@ -16,7 +16,7 @@ import optax
 from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
-from tuning.objective import Problem, with_sign, with_trials
+from tuning.objective import Problem, coordinates_of, with_sign, with_trials
 from tuning.polish import Best, largest, polish
 from tuning.starts import APART, EDGE, Report, logit, promising, share_of, starting_points, toward_edges
 from tuning.worst import Hardest
@@ -36,7 +36,6 @@ SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched 
 HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
 ROUNDS = 6  # searches again with hardest trials added, at most
-NEAR = 1e-3  # how far the worst case may be beyond a limit
 
 CROSSING, REFINING = "looking for a better valley", "refining"
 
@@ -61,7 +60,6 @@ class Search:
     history: list[Step]
     problem: Problem  # that is judged, with the hardest trials: under the exact sign, if that was asked for
     smooth: Problem  # that the descent went by
-    first: np.ndarray  # (gains,) free reals of the first start
     dropped: list[int] = field(default_factory=list)  # starts that met a number that is not finite
     rounds: int = 0  # searches again with harder trials
     margin: float = MARGIN  # that was kept from the limits
@@ -94,7 +92,7 @@ def search(
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
     margin = SURE_MARGIN if robust or problem.trials.size == 1 else MARGIN
     run = Run(evaluate, margin, exact, report)
-    first, interrupted, hardest = evaluate.bounds.free(own), False, None
+    interrupted, hardest = False, None
 
     def flown(problem: Problem) -> Problem:
         return with_sign(problem, 0.0) if exact else problem
@@ -112,7 +110,7 @@ def search(
             if robust:
                 report("looking for the worst case", 0, 0, *run.best_so_far)
                 hardest = worst_case.hardest(flown(problem), sure, found)
-                if hardest.unbounded or hardest.ratio <= 1.0 + NEAR or rounds == ROUNDS:
+                if hardest.unbounded or not hardest.beyond or rounds == ROUNDS:
                     break
                 problem = _add(problem, np.asarray([hardest.trial]), hardest.coordinates)
             else:
@@ -132,7 +130,7 @@ def search(
         if not run.started:
             raise
         interrupted = True
-    return replace(run.outcome(first), hardest=hardest, interrupted=interrupted)
+    return replace(run.outcome(), hardest=hardest, interrupted=interrupted)
 
 
 def _with_room(problem: Problem) -> Problem:
@@ -148,7 +146,7 @@ def _add(problem: Problem, trials: np.ndarray, coordinates: dict | None = None) 
     places = jnp.asarray(spare[: len(trials)])
     numbers = jnp.asarray(trials, dtype=jnp.uint32)
     if coordinates is None:
-        own = worst_case.dispersion_of(problem.dispersion, problem.parts, int(problem.seed), trials)
+        own = coordinates_of(problem.dispersion, problem.parts, int(problem.seed), trials)
     else:
         own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
@@ -322,7 +320,7 @@ class Run:
                 polish(self._evaluate, tightened, best, start)
                 done.append(share_of(best.z[start]))
 
-    def outcome(self, first: np.ndarray) -> Search:
+    def outcome(self) -> Search:
         """The best iterate."""
         assert self._best is not None
         assert self._problem is not None
@@ -335,7 +333,6 @@ class Run:
             history=self._history,
             problem=(judged := replace(self._problem, limits=self._problem.limits / (1.0 - self._margin))),
             smooth=with_sign(judged, self._width),
-            first=first,
             dropped=self._dropped,
             rounds=self.rounds,
             margin=self._margin,

@@ -134,7 +134,7 @@ def tune(
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
         believed = Trust(
             slope_error=(
-                trust.slope_error(evaluate, found.smooth, found.first),
+                trust.slope_error(evaluate, found.smooth, evaluate.bounds.free(own)),
                 trust.slope_error(evaluate, found.smooth, found.z),
             ),
             profiles=trust.profiles(evaluate, found.problem, found.z),

@@ -78,7 +78,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
             "hardest": None
             if found.hardest is None
-            else {**asdict(found.hardest), "unbounded": found.hardest.unbounded},
+            else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
             "trials": np.asarray(found.problem.trials).tolist(),
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,

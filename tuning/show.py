@@ -4,8 +4,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-NEAR = 1e-3  # how far a worst case may be beyond a limit
-
 
 class Progress:
     """A progress bar on the error stream with the best so far and the time left; silent where told to be."""
@@ -184,7 +182,7 @@ def _search(summary: dict[str, Any]) -> Iterator[str]:
         )
     elif hardest is not None:
         said = f"worst case inside the dispersions: {hardest['metric']} {hardest['ratio']:.3f} times its limit"
-        yield said + ("" if hardest["ratio"] <= 1.0 + NEAR else "; tune.worst_case = true tunes for it")
+        yield said + ("; tune.worst_case = true tunes for it" if hardest["beyond"] else "")
     if "rollouts" in found:
         yield (
             f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "

@@ -14,12 +14,13 @@ from ptsmc_jax import lanes, montecarlo, rollout
 from ptsmc_jax.dispersions import INERTIA, Coordinates
 from ptsmc_jax.requirements import Requirement
 from tuning.gains import with_gains
-from tuning.objective import FAILED, Problem, dispersion_of
+from tuning.objective import FAILED, Problem, coordinates_of
 
 SCREENED = 4096  # trials looked through
 CLIMBERS = 8  # of the hardest ones, from which is climbed
 STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # of the ascent by Adam
 HELD = 0.9999  # share of a normal dispersion that is searched
+NEAR = 1e-3  # how far a worst case may be beyond a limit
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ class Hardest:
         """Whether the metric has no largest value inside the dispersions: the law's singularity is among them."""
         return self.status not in ("ok", "missed")
 
+    @property
+    def beyond(self) -> bool:
+        """Whether it breaks its limit by more than `NEAR`."""
+        return not self.ratio <= 1.0 + NEAR
+
 
 def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Trials that no search has averaged, and how near each comes to its limits, (trials,) metric / limit."""
@@ -59,7 +65,7 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     trials, ratio = screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
     names, limits = tuple(r.metric for r in requirements), jnp.asarray([r.limit for r in requirements])
-    coordinates = dispersion_of(problem.dispersion, problem.parts, int(problem.seed), chosen)
+    coordinates = coordinates_of(problem.dispersion, problem.parts, int(problem.seed), chosen)
     moved = tuple(name for name in coordinates if name != INERTIA)
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     y = np.concatenate([_charted(problem, name, np.asarray(coordinates[name])) for name in moved], axis=1)
