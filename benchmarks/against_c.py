@@ -22,7 +22,7 @@ def batch(metrics: bool) -> None:
     numbers = np.arange(TRIALS)
     flown = montecarlo.run(quiet.parts, quiet.dispersion, 0, numbers)
     programs = {"C, any inertia": Program(metrics=metrics), "C, principal axes": Program(metrics=metrics, full=False)}
-    fly = {name: program.prepare(quiet.parts, flown.initial.q) for name, program in programs.items()}
+    fly = {name: program.prepare(quiet.parts, flown.vectors("initial_q")) for name, program in programs.items()}
     if metrics:
         for name, run in fly.items():
             out = run()

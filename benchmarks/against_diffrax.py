@@ -13,6 +13,7 @@ from common import machine, medians, say, steps, study  # noqa: E402
 
 from ptsmc_jax import montecarlo  # noqa: E402
 from ptsmc_jax.clock import Ticks  # noqa: E402
+from ptsmc_jax.plants import AttitudeState  # noqa: E402
 
 TRIALS = 1024
 CLASSICAL = diffrax.ButcherTableau(
@@ -64,7 +65,7 @@ def main() -> None:
     numbers = np.arange(TRIALS)
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)
     aligned = jax.vmap(lambda x: ready.parts.controller.align(x, ready.parts.reference(jnp.zeros(()))))(
-        jax.tree.map(jnp.asarray, flown.initial)
+        AttitudeState(jnp.asarray(flown.vectors("initial_q")), jnp.asarray(flown.vectors("initial_w")))
     )
     by_diffrax = jax.jit(lambda x0: jax.vmap(lambda x: loop(ready.parts, x))(x0))
     found = np.asarray(by_diffrax(aligned))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import attitude_keys, checks, controllers, dispersions, free_gains, hardware, observers, plants, signals
+from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import sensors as sensing
 from ptsmc_jax import tables as t
 from ptsmc_jax.tables import Scenario
@@ -157,33 +158,48 @@ def dispersion(scenario: Scenario) -> dispersions.Dispersion:
     table = scenario.dispersion
     if table is None:
         return dispersions.Dispersion()
-    phase = None if table.disturbance_phase is None else dispersions.UniformPhase()
+    m = checks.inputs(scenario)
+    signal, _ = disturbance(scenario, m)
+    phases, amplitudes = (signals.values(signal, what).size for what in ("phase", "amplitude"))
+    levels = {key: _numbers(getattr(table, key, None)) for key in dispersions.LEVELS}
+    common = {
+        "phase": None if table.disturbance_phase is None else dispersions.UniformPhase(phases),
+        "amplitude": _numbers(table.disturbance_amplitude, amplitudes),
+        "bias": _numbers(table.disturbance_bias, m),
+        "levels": {key: level for key, level in levels.items() if level is not None},
+    }
     if isinstance(table, t.StateDispersion):
-        return dispersions.Dispersion(state=_states(table.x0), phase=phase)
+        return dispersions.Dispersion(state=_numbers(table.x0), **common)
     inertia = None
     if table.inertia is not None:
         moments, axes = np.linalg.eigh(np.asarray(true_body(scenario).inertia))
         spread = (vector(table.inertia.std), vector(np.deg2rad(table.inertia.axes_deg)))
         inertia = dispersions.RelativeInertia(vector(moments), vector(axes), *spread)
     return dispersions.Dispersion(
-        attitude=_attitudes(table.attitude), rate=_states(table.rate, 3), inertia=inertia, phase=phase
+        attitude=_attitudes(table.attitude),
+        rate=_numbers(table.rate, 3),
+        inertia=inertia,
+        reference=_attitudes(table.reference),
+        **common,
     )
 
 
 def _attitudes(table: Any) -> Any:
-    if isinstance(table, t.UniformAttitude):
+    if isinstance(table, dt.UniformAttitude):
         return dispersions.UniformAttitude()
-    if isinstance(table, t.NormalAttitude):
+    if isinstance(table, dt.NormalAttitude):
         return dispersions.NormalAttitude(vector(np.deg2rad(table.std_deg)))
-    if isinstance(table, t.AxisAngle):
+    if isinstance(table, dt.AxisAngle):
         return dispersions.AxisAngle(*(vector(np.deg2rad(a)) for a in (table.min_deg, table.max_deg)))
     return None
 
 
-def _states(table: Any, count: int = 1) -> Any:
-    """How states are drawn; count: how many a single number stands for."""
-    if isinstance(table, t.UniformState | t.UniformRate):
-        return dispersions.UniformState(vector(np.ones(count) * table.half_width))
-    if isinstance(table, t.NormalState | t.NormalRate):
-        return dispersions.NormalState(vector(np.ones(count) * table.std))
+def _numbers(table: Any, count: int = 1) -> Any:
+    """How numbers are drawn; count: how many a single one of the table stands for."""
+    if isinstance(table, dt.RelativeNormal):
+        return dispersions.TruncatedNormal(vector(np.ones(count) * table.std))
+    if hasattr(table, "half_width"):
+        return dispersions.Uniform(vector(np.ones(count) * table.half_width))
+    if hasattr(table, "std"):
+        return dispersions.Normal(vector(np.ones(count) * table.std))
     return None

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import attitude_keys, free_gains, hardware, layouts, plants, schema, systems, tables
+from ptsmc_jax import attitude_keys, dispersion_tables, free_gains, hardware, layouts, plants, schema, systems, tables
 from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.free_gains import FINITE_TIME, MOST_STEPS
 from ptsmc_jax.schema import ScenarioError, wrong
@@ -72,9 +72,9 @@ def check(scenario: Scenario) -> None:
         free_gains.check(scenario, scenario.tune)
 
 
-def _spread(x0: tables.UniformState | tables.NormalState) -> str:
+def _spread(x0: dispersion_tables.UniformState | dispersion_tables.NormalState) -> str:
     """The key that says how wide the initial states are drawn."""
-    return "half_width" if isinstance(x0, tables.UniformState) else "std"
+    return "half_width" if isinstance(x0, dispersion_tables.UniformState) else "std"
 
 
 def _check_requirements(scenario: Scenario) -> None:
@@ -270,17 +270,23 @@ def _check_loop(scenario: Scenario) -> None:
 
 def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
-    if getattr(dispersion, "disturbance_phase", None) is not None and not any(
-        hasattr(term, "phase") for term in terms(scenario)
-    ):
-        raise ScenarioError(
-            f"dispersion.disturbance_phase needs a disturbance that has a phase, but disturbance.kind is "
-            f"{schema.show(scenario.disturbance.kind)}; allowed is a sinusoid, or gravity_gradient"
-        )
-    if isinstance(dispersion, tables.Dispersion) and isinstance(dispersion.attitude, tables.AxisAngle):
-        angles = dispersion.attitude
-        if angles.min_deg > angles.max_deg:
-            raise wrong("dispersion.attitude.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
+    for what, allowed in (("phase", "a sinusoid, or gravity_gradient"), ("amplitude", "a sinusoid, or constant")):
+        asked = getattr(dispersion, f"disturbance_{what}", None) is not None
+        if asked and not any(hasattr(term, what) for term in terms(scenario)):
+            raise ScenarioError(
+                f"dispersion.disturbance_{what} needs a disturbance that has {'a' if what == 'phase' else 'an'} {what},"
+                f" but disturbance.kind is {schema.show(scenario.disturbance.kind)}; allowed is {allowed}"
+            )
+    for key in ("attitude_noise", "rate_noise", "state_noise", "torque_limit"):
+        given = getattr(scenario.hardware, key, None)
+        if key == "rate_noise":
+            given = given or getattr(scenario.hardware, "rate_noise_density", None)
+        if getattr(dispersion, key, None) is not None and given is None:
+            raise ScenarioError(f"dispersion.{key} needs hardware.{key}, which is absent")
+    for key in ("attitude", "reference"):
+        angles = getattr(dispersion, key, None)
+        if isinstance(angles, dispersion_tables.AxisAngle) and angles.min_deg > angles.max_deg:
+            raise wrong(f"dispersion.{key}.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
     if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
         key, states = _spread(dispersion.x0), len(initial_state(scenario))
         value = getattr(dispersion.x0, key)

@@ -4,7 +4,8 @@ Every dispersion is a map from coordinates, numbers uniform on (0, 1) or standar
 coordinates are drawn, and a search for the worst trial moves them.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -19,9 +20,11 @@ from ptsmc_jax.plants import AttitudeState, Spacecraft
 from ptsmc_jax.rollout import Parts
 
 INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
-INERTIA, DISTURBANCE_PHASE = "inertia", "disturbance_phase"
+INERTIA, REFERENCE = "inertia", "reference"
+DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
+DISTURBANCE_BIAS = "disturbance_bias"
 CANDIDATES = 16  # bodies drawn for one that is physical
-FARTHEST = 3.0  # standard deviations of a principal moment, at most
+FARTHEST = 3.0  # standard deviations of what is truncated, at most
 
 Drawn = Literal["uniform", "normal"]
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
@@ -30,13 +33,13 @@ Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UniformAttitude:
-    """Initial attitude uniform on SO(3): a normal 4-vector, normalised (Muller, 1959)."""
+    """An attitude uniform on SO(3): a normal 4-vector, normalised (Muller, 1959)."""
 
     drawn: ClassVar[Drawn] = "normal"
     count: ClassVar[int] = 4
 
     def at(self, c: Float[Array, "4"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Initial attitude, (4,); nominal: that of [initial]; reference: the reference at t = 0."""
+        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
         del nominal, reference
         return attitude.normalise(c)
 
@@ -44,7 +47,7 @@ class UniformAttitude:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class AxisAngle:
-    """Initial attitude turned away from the reference at t = 0: axis uniform on the sphere, angle uniform."""
+    """An attitude turned away from the reference at t = 0: axis uniform on the sphere, angle uniform."""
 
     smallest: Leaf  # [rad]
     largest: Leaf  # [rad]
@@ -52,7 +55,7 @@ class AxisAngle:
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Initial attitude, (4,); nominal: that of [initial]; reference: the reference at t = 0."""
+        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
         del nominal
         height, azimuth = 2.0 * c[0] - 1.0, 2.0 * np.pi * c[1]
         radius = jnp.sqrt(1.0 - height * height)
@@ -64,52 +67,71 @@ class AxisAngle:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class NormalAttitude:
-    """Initial attitude turned from the nominal one by a normal rotation vector."""
+    """An attitude turned from the nominal one by a normal rotation vector."""
 
     std: Leaf  # per axis [rad]
     drawn: ClassVar[Drawn] = "normal"
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Initial attitude, (4,); nominal: that of [initial]; reference: the reference at t = 0."""
+        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
         del reference
         return attitude.multiply(nominal, attitude.from_rotation_vector(self.std * c))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class UniformState:
-    """Initial state of a chain or a system, or initial rate of a spacecraft, uniform about the nominal one."""
+class Uniform:
+    """Numbers uniform about nominal ones."""
 
     half_width: Leaf  # (n,)
     drawn: ClassVar[Drawn] = "uniform"
 
     @property
     def count(self) -> int:
-        """How many states there are."""
+        """How many numbers there are."""
         return self.half_width.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Initial state, (n,)."""
+        """The numbers, (n,)."""
         return nominal + self.half_width * (2.0 * c - 1.0)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class NormalState:
-    """The same, normal about the nominal one."""
+class Normal:
+    """Numbers normal about nominal ones."""
 
     std: Leaf  # (n,)
     drawn: ClassVar[Drawn] = "normal"
 
     @property
     def count(self) -> int:
-        """How many states there are."""
+        """How many numbers there are."""
         return self.std.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Initial state, (n,)."""
+        """The numbers, (n,)."""
         return nominal + self.std * c
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class TruncatedNormal:
+    """Numbers normal about nominal ones, truncated (not clipped) at `FARTHEST` standard deviations."""
+
+    std: Leaf  # (n,)
+    drawn: ClassVar[Drawn] = "uniform"  # through the inverse of the truncated law
+
+    @property
+    def count(self) -> int:
+        """How many numbers there are."""
+        return self.std.shape[-1]
+
+    def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The numbers, (n,): erf_inv of a c between its values at both ends."""
+        within = math.erf(FARTHEST / math.sqrt(2.0))
+        return nominal + self.std * math.sqrt(2.0) * jax.lax.erf_inv((2.0 * c - 1.0) * within)
 
 
 @jax.tree_util.register_dataclass
@@ -146,11 +168,24 @@ class RelativeInertia:
 class UniformPhase:
     """Phase of every sinusoidal disturbance, and of an orbit, later by an angle uniform between 0 and 2 pi."""
 
+    count: int = field(metadata={"static": True})
     drawn: ClassVar[Drawn] = "uniform"
 
-    def at(self, c: Float[Array, " phases"], disturbance: Any) -> Any:
-        """The disturbance."""
-        return signals.later(disturbance, 2.0 * np.pi * c)
+    def at(self, c: Float[Array, " phases"], nominal: Float[Array, " phases"]) -> Float[Array, " phases"]:
+        """The phases, (phases,) [rad]."""
+        return nominal + 2.0 * np.pi * c
+
+
+Attitudes = UniformAttitude | AxisAngle | NormalAttitude
+Factor = Uniform | TruncatedNormal  # about one
+
+# of what a trial may have more or less, by one factor: name -> where in the parts it stands
+LEVELS = {
+    "attitude_noise": ("sensors", "attitude_noise"),
+    "rate_noise": ("sensors", "rate_noise"),
+    "state_noise": ("sensors", "sigma"),
+    "torque_limit": ("actuators", "torque_limit"),
+}
 
 
 @jax.tree_util.register_dataclass
@@ -158,11 +193,15 @@ class UniformPhase:
 class Dispersion:
     """Everything that is drawn for a trial; what is None stays nominal."""
 
-    attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
-    state: UniformState | NormalState | None = None  # of a chain or a system
-    rate: UniformState | NormalState | None = None  # of a spacecraft
+    attitude: Attitudes | None = None
+    state: Uniform | Normal | None = None  # of a chain or a system
+    rate: Uniform | Normal | None = None  # of a spacecraft [rad/s]
     inertia: RelativeInertia | None = None
     phase: UniformPhase | None = None
+    amplitude: Factor | None = None  # of every amplitude of the disturbance
+    bias: Uniform | Normal | None = None  # a constant disturbance that is added, about zero [N m]
+    reference: Attitudes | None = None
+    levels: dict[str, Factor] = field(default_factory=dict)  # see `LEVELS`
 
     @property
     def varies(self) -> bool:
@@ -178,20 +217,30 @@ class Dispersion:
             INITIAL_RATE: self.rate,
             INERTIA: self.inertia,
             DISTURBANCE_PHASE: self.phase,
+            DISTURBANCE_AMPLITUDE: self.amplitude,
+            DISTURBANCE_BIAS: self.bias,
+            REFERENCE: self.reference,
+            **{f"{name}_level": level for name, level in self.levels.items()},
         }
         return {name: kind for name, kind in kinds.items() if kind is not None}
 
-    def coordinates(self, parts: Parts, seed: Whole, trial: Whole) -> Coordinates:
+    def coordinates(self, seed: Whole, trial: Whole) -> Coordinates:
         """Coordinates of a trial; each name has a stream of its own, so one more of them changes no other."""
-        found = {}
-        for name, kind in self.kinds.items():
-            count = signals.phases(parts.disturbance) if isinstance(kind, UniformPhase) else kind.count
-            draw = draws.normals if kind.drawn == "normal" else draws.uniforms
-            found[name] = draw(draws.stream(seed, trial, name), count)
-        return found
+        return {
+            name: (draws.normals if kind.drawn == "normal" else draws.uniforms)(
+                draws.stream(seed, trial, name), kind.count
+            )
+            for name, kind in self.kinds.items()
+        }
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
         """The parts of the trial that has these coordinates."""
+        if not self.varies:
+            return parts
+        if self.reference is not None:
+            q = parts.reference.q
+            turned = self.reference.at(coordinates[REFERENCE], q, q)
+            parts = replace(parts, reference=replace(parts.reference, q=turned))
         if self.state is not None:
             parts = replace(parts, initial=self.state.at(coordinates[INITIAL_STATE], parts.initial))
         if self.attitude is not None:
@@ -204,10 +253,61 @@ class Dispersion:
         if self.inertia is not None:
             body = Spacecraft(*self.inertia.at(coordinates[INERTIA]))
             parts = replace(parts, plant=body, disturbance=signals.on_body(parts.disturbance, body.inertia))
+        for name, level in self.levels.items():
+            part, key = LEVELS[name]
+            device = getattr(parts, part)
+            nominal = getattr(device, key)
+            factor = level.at(coordinates[f"{name}_level"], jnp.ones(level.count))
+            parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
+        return replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
+
+    def _disturbance(self, nominal: Any, coordinates: Coordinates) -> Any:
+        found = nominal
         if self.phase is not None:
-            parts = replace(parts, disturbance=self.phase.at(coordinates[DISTURBANCE_PHASE], parts.disturbance))
-        return parts
+            angles = self.phase.at(coordinates[DISTURBANCE_PHASE], signals.values(found, "phase"))
+            found = signals.with_values(found, "phase", angles)
+        if self.amplitude is not None:
+            factor = self.amplitude.at(coordinates[DISTURBANCE_AMPLITUDE], jnp.ones(self.amplitude.count))
+            found = signals.with_values(found, "amplitude", signals.values(found, "amplitude") * factor)
+        if self.bias is not None:
+            bias = signals.Constant(self.bias.at(coordinates[DISTURBANCE_BIAS], jnp.zeros(self.bias.count)))
+            found = signals.Sum((*(found.terms if isinstance(found, signals.Sum) else (found,)), bias))
+        return found
 
     def apply(self, parts: Parts, seed: Whole, trial: Whole) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
-        return self.at(parts, self.coordinates(parts, seed, trial))
+        return self.at(parts, self.coordinates(seed, trial))
+
+    def values(self, parts: Parts) -> dict[str, Array]:
+        """What a trial flies, read from its parts: the initial state, and what else is drawn, by name, numbers each.
+
+        Attitudes (q1 to q4) [-], rates [rad/s], inertia [kg m^2], phases [rad], torques [N m], noises [rad, rad/s].
+        """
+        initial, reference = parts.initial, parts.reference(jnp.zeros_like(parts.t_end))
+        found: dict[str, Array] = {"initial_angle": parts.controller.angle(initial, reference)}
+        if isinstance(initial, AttitudeState):
+            found |= {f"initial_q{k + 1}": initial.q[k] for k in range(4)}
+            found |= {f"initial_w{k + 1}": initial.w[k] for k in range(3)}
+        else:
+            found |= {f"initial_x{k + 1}": initial[k] for k in range(initial.shape[-1])}
+        if self.reference is not None:
+            found |= {f"reference_q{k + 1}": parts.reference.q[k] for k in range(4)}
+        if self.inertia is not None:
+            found |= {f"inertia_{i + 1}{j + 1}": parts.plant.inertia[i, j] for i in range(3) for j in range(i, 3)}
+        if self.phase is not None:
+            found |= _numbered(DISTURBANCE_PHASE, signals.values(parts.disturbance, "phase"), self.phase.count)
+        if self.amplitude is not None:
+            amplitudes = signals.values(parts.disturbance, "amplitude")
+            found |= _numbered(DISTURBANCE_AMPLITUDE, amplitudes, self.amplitude.count)
+        if self.bias is not None:
+            found |= _numbered(DISTURBANCE_BIAS, parts.disturbance.terms[-1].value, self.bias.count)
+        for name in self.levels:
+            part, key = LEVELS[name]
+            value = getattr(getattr(parts, part), key)
+            found |= {name: value} if value.ndim == 0 else _numbered(name, value, value.shape[0])
+        return found
+
+
+def _numbered(name: str, values: Array, count: int) -> dict[str, Array]:
+    """The first `count` of these numbers, by name and number."""
+    return {f"{name}_{k + 1}": values[k] for k in range(count)}

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import tables as t
 
 # A table is a struct, or one for each kind, the default first; a kind without a struct is not available yet.
@@ -75,12 +76,17 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
     },
 }
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
+_RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
 DISPERSIONS: dict[str, Kinds] = {
-    "attitude": {"axis_angle": t.AxisAngle, "uniform": t.UniformAttitude, "normal": t.NormalAttitude},
-    "rate": {"normal": t.NormalRate, "uniform": t.UniformRate},
-    "inertia": {"relative_normal": t.RelativeInertia},
-    "disturbance_phase": {"uniform": t.UniformPhase},
-    "x0": {"uniform": t.UniformState, "normal": t.NormalState},
+    "attitude": {"axis_angle": dt.AxisAngle, "uniform": dt.UniformAttitude, "normal": dt.NormalAttitude},
+    "reference": {"normal": dt.NormalAttitude, "uniform": dt.UniformAttitude, "axis_angle": dt.AxisAngle},
+    "rate": {"normal": dt.NormalRate, "uniform": dt.UniformRate},
+    "inertia": {"relative_normal": dt.RelativeInertia},
+    "disturbance_phase": {"uniform": dt.UniformPhase},
+    "disturbance_amplitude": _RELATIVE,
+    "disturbance_bias": {"normal": dt.NormalBias, "uniform": dt.UniformBias},
+    **dict.fromkeys(("attitude_noise", "rate_noise", "state_noise", "torque_limit"), _RELATIVE),
+    "x0": {"uniform": dt.UniformState, "normal": dt.NormalState},
 }
 
 _CASE_I: dict[str, Mapping[str, Any]] = {

@@ -14,6 +14,7 @@ from ptsmc_jax import lanes, rollout
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.rollout import Parts
+from ptsmc_jax.sensors import Sensors
 
 FEW = 64  # trials; fewer are flown at once, by a program for their number
 CAPACITY = 4096  # trials in one call
@@ -28,7 +29,7 @@ class Trials:
     metrics: Metrics  # of arrays
     status: np.ndarray  # codes, see rollout.STATUS
     bad_time: np.ndarray  # first bad time [s], NaN if none
-    initial: Any  # initial states as flown, arrays (trials, component)
+    drawn: dict[str, np.ndarray]  # what each flew with, by name, see `Dispersion.values`
 
     @property
     def ok(self) -> np.ndarray:
@@ -40,6 +41,11 @@ class Trials:
         """Which trials were flown to the end, whether or not t_f was met: their metrics are averaged."""
         return np.isin(self.status, rollout.FINISHED)
 
+    def vectors(self, name: str) -> np.ndarray:
+        """What is drawn by this name and a number, `initial_q1` to `initial_q4` for `initial_q`, (trials, numbers)."""
+        numbers = [v for key, v in self.drawn.items() if key.startswith(name) and key[len(name) :].isdigit()]
+        return np.stack(numbers, axis=1)
+
     def counts(self) -> dict[str, int]:
         """How many trials ended with each status."""
         names = dict.fromkeys(status for status, _ in rollout.STATUS.values())
@@ -48,15 +54,24 @@ class Trials:
 
 
 def one(parts: Parts, dispersion: Dispersion, seed, trial, coordinates: Coordinates | None = None) -> tuple:
-    """Metrics, status, bad time and initial state of one trial: pure, for any transformation.
+    """Metrics, status, bad time and drawn values of one trial: pure, for any transformation.
 
     coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
     """
     if coordinates is None:
-        coordinates = dispersion.coordinates(parts, seed, trial)
+        coordinates = dispersion.coordinates(seed, trial)
     drawn = dispersion.at(parts, coordinates)
     result = rollout.simulate(drawn, seed, trial)
-    return result.metrics, result.status, result.bad_time, drawn.initial
+    return result.metrics, result.status, result.bad_time, values(dispersion, drawn, seed, trial)
+
+
+def values(dispersion: Dispersion, drawn: Parts, seed, trial) -> dict[str, jax.Array]:
+    """What a trial flies with, by name: read from its parts, and the gyro's bias from its sensors."""
+    found = dispersion.values(drawn)
+    if isinstance(drawn.sensors, Sensors) and drawn.sensors.rate_bias is not None:
+        bias = drawn.sensors.first_bias(seed, trial)
+        found |= {f"rate_bias_{k + 1}": bias[k] for k in range(3)}
+    return found
 
 
 def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, block: int = BLOCK) -> Trials:

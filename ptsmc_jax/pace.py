@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import attitude_keys, build, checks, clock, observers, theory
+from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import tables as t
 from ptsmc_jax.free_gains import MOST_STEPS
 from ptsmc_jax.laws import SecondOrder
@@ -84,7 +85,7 @@ def _spread(scenario: Scenario) -> float:
     table = getattr(scenario.dispersion, "rate", None)
     if table is None:
         return 0.0
-    return 4.6 * table.std if isinstance(table, t.NormalRate) else np.sqrt(3.0) * table.half_width
+    return 4.6 * table.std if isinstance(table, dt.NormalRate) else np.sqrt(3.0) * table.half_width
 
 
 def _reference_frequencies(table: Any) -> dict[str, float]:

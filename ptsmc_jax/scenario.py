@@ -99,7 +99,7 @@ def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = Non
     if isinstance(parts.plant, System):
         _check_system(scenario, parts.plant, parts)
     # a drawn trial that meets the singularity is marked and counted
-    if scenario.initial is not None and (not drawn or dispersion.attitude is None):
+    if scenario.initial is not None and (not drawn or (dispersion.attitude is None and dispersion.reference is None)):
         _check_start(scenario, parts)
     units = metrics.CATALOGUES[scenario.plant.kind]
     requirements = tuple(

@@ -180,13 +180,17 @@ class Sensors:
             self.rate_noise * draws.normals(keys[1], 3, sample),
         )
 
+    def first_bias(self, seed: Whole, trial: Whole) -> Float[Array, "3"]:
+        """Bias of the gyro at the first sample, (3,) [rad/s]."""
+        if self.rate_bias is None:
+            return jnp.zeros(3)
+        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+
     def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, sample: Int[Array, ""]) -> Memory:
         """Memory before the first sample."""
         keys, bias, estimate = self.keys(seed, trial), None, None
         if self.rate_bias is not None or self.bias_rate is not None:
-            bias = jnp.zeros(3)
-            if self.rate_bias is not None:
-                bias = self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+            bias = self.first_bias(seed, trial)
         if self.filter is not None:
             normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
             estimate = self.filter.begin(x0.q, jnp.zeros(3) if bias is None else bias, normals)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -189,26 +189,31 @@ class Sum:
         return total
 
 
-def phases(disturbance: Any) -> int:
-    """How many phases a disturbance has: one for each component of a sinusoid and for an orbit, in order."""
-    if isinstance(disturbance, Sum):
-        return sum(phases(term) for term in disturbance.terms)
-    return int(jnp.size(disturbance.phase)) if isinstance(disturbance, Sinusoid | GravityGradient) else 0
+# the fields that can be drawn, by the kind of the disturbance
+_FIELDS: dict[str, dict[type, str]] = {
+    "phase": {Sinusoid: "phase", GravityGradient: "phase"},
+    "amplitude": {Sinusoid: "amplitude", Constant: "value"},
+}
 
 
-def later(disturbance: Any, angles: Float[Array, " phases"]) -> Any:
-    """The disturbance with these angles [rad] added to its phases; what has none stays as it is."""
-    if isinstance(disturbance, Sum):
-        terms, used = [], 0
-        for term in disturbance.terms:
-            terms.append(later(term, angles[used : used + phases(term)]))
-            used += phases(term)
-        return Sum(tuple(terms))
-    if isinstance(disturbance, Sinusoid):
-        return replace(disturbance, phase=disturbance.phase + angles)
-    if isinstance(disturbance, GravityGradient):
-        return replace(disturbance, phase=disturbance.phase + angles[0])
-    return disturbance
+def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
+    """Every phase [rad] or amplitude [N m] of a disturbance, (count,): term after term, input after input."""
+    terms = disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
+    fields = [(term, _FIELDS[what].get(type(term))) for term in terms]
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(getattr(term, field)) for term, field in fields if field)])
+
+
+def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
+    """The disturbance with these in the place of `values`; what has none stays as it is."""
+    terms, used = [], 0
+    for term in disturbance.terms if isinstance(disturbance, Sum) else (disturbance,):
+        field = _FIELDS[what].get(type(term))
+        if field is not None:
+            old = jnp.asarray(getattr(term, field))
+            term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
+            used += old.size
+        terms.append(term)
+    return Sum(tuple(terms)) if isinstance(disturbance, Sum) else terms[0]
 
 
 def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:

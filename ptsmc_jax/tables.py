@@ -6,6 +6,10 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from ptsmc_jax.device_tables import AxesWheels, Hardware, NoFilter, PyramidWheels, StateHardware, SteadyStateFilter
+from ptsmc_jax.dispersion_tables import (
+    Dispersion,
+    StateDispersion,
+)
 from ptsmc_jax.values import (
     Count,
     Each,
@@ -16,7 +20,6 @@ from ptsmc_jax.values import (
     Interval,
     Matrix,
     NotNegative,
-    NotNegatives,
     Number,
     Numbers,
     Positive,
@@ -236,59 +239,6 @@ class Loop(Table, frozen=True):
     settling_angle: Positive = 1e-3
 
 
-class UniformAttitude(Table, frozen=True):
-    kind: Literal["uniform"] = "uniform"
-
-
-class AxisAngle(Table, frozen=True):
-    kind: Literal["axis_angle"] = "axis_angle"
-    min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
-    max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
-
-
-class NormalAttitude(Table, frozen=True):
-    kind: Literal["normal"] = "normal"
-    std_deg: NotNegative = 1.0
-
-
-class NormalRate(Table, frozen=True):
-    kind: Literal["normal"] = "normal"
-    std: NotNegative = 0.01
-
-
-class UniformRate(Table, frozen=True):
-    """Each axis uniform within half_width of initial.rate."""
-
-    kind: Literal["uniform"] = "uniform"
-    half_width: NotNegative = 0.01
-
-
-class RelativeInertia(Table, frozen=True):
-    """Principal moments off by a normal share, truncated at three standard deviations, their axes turned."""
-
-    kind: Literal["relative_normal"] = "relative_normal"
-    std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
-    axes_deg: NotNegative = 0.0
-
-
-class UniformPhase(Table, frozen=True):
-    kind: Literal["uniform"] = "uniform"
-
-
-class UniformState(Table, frozen=True):
-    """Every state uniform within half_width of x0."""
-
-    kind: Literal["uniform"] = "uniform"
-    half_width: NotNegatives = ()  # 1 for each state
-
-
-class NormalState(Table, frozen=True):
-    """Every state normal about x0."""
-
-    kind: Literal["normal"] = "normal"
-    std: NotNegatives = ()  # 1 for each state
-
-
 class Limit(Table, frozen=True):
     """A requirement in full: metric <= limit in this share of the trials, with this one-sided confidence."""
 
@@ -313,18 +263,6 @@ class Tune(Table, frozen=True):
     trials: Count = 256
     starts: Count = 8
     steps: Count = 150
-
-
-class Dispersion(Table, frozen=True):
-    attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
-    rate: NormalRate | UniformRate | None = None
-    inertia: RelativeInertia | None = None
-    disturbance_phase: UniformPhase | None = None
-
-
-class StateDispersion(Table, frozen=True):
-    x0: UniformState | NormalState | None = None
-    disturbance_phase: UniformPhase | None = None
 
 
 class Scenario(Table, frozen=True, kw_only=True):

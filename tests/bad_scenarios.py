@@ -364,6 +364,25 @@ BAD = [
         'disturbance.kind is "constant"; allowed is a sinusoid',
     ),
     (
+        "disturbance.kind = 'none'\ndispersion.disturbance_amplitude = {}",
+        "dispersion.disturbance_amplitude needs a disturbance that has an amplitude",
+        'disturbance.kind is "none"; allowed is a sinusoid, or constant',
+    ),
+    ("dispersion.torque_limit = {}", "dispersion.torque_limit needs hardware.torque_limit", "absent"),
+    ("dispersion.rate_noise = {}", "dispersion.rate_noise needs hardware.rate_noise", "absent"),
+    ("dispersion.state_noise = {}", "dispersion.state_noise is not", "rate_noise"),
+    ("dispersion.attitude_noise = { std = 0.5 }", "dispersion.attitude_noise.std is 0.5", "from 0 to 0.3"),
+    (
+        "dispersion.attitude_noise = { kind = 'relative_uniform', half_width = 1 }",
+        "dispersion.attitude_noise.half_width is 1",
+        "from 0 to below 1",
+    ),
+    (
+        "dispersion.reference = { kind = 'axis_angle', min_deg = 50, max_deg = 40 }",
+        "dispersion.reference.min_deg is 50.0",
+        "at most max_deg, 40.0",
+    ),
+    (
         "requirements.effort = { limit = 9.0, confidence = 0.9 }",
         "requirements.effort.confidence is 0.9",
         "goes with a quantile only",

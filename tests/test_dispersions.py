@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import dispersions, lanes, signals
+from ptsmc_jax import dispersions, hardware, lanes, signals
 from tests import helpers
 from tests.helpers import chain_parts, vector
 
@@ -142,14 +142,14 @@ def test_initial_states_of_a_chain_are_drawn_about_the_nominal_one():
     width = vector([1.0, 0.5, 0.0])
     trials = jnp.arange(TRIALS, dtype=jnp.uint32)
     drawn_states = {}
-    for spread in (dispersions.UniformState(width), dispersions.NormalState(width)):
+    for spread in (dispersions.Uniform(width), dispersions.Normal(width)):
         whole = dispersions.Dispersion(state=spread)
         assert whole.varies
         x0 = np.asarray(jax.jit(jax.vmap(lambda k, whole=whole: whole.apply(run, 3, k).initial))(trials))
         np.testing.assert_array_equal(x0[:, 2], 2.0)
         drawn_states[type(spread)] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
         np.testing.assert_array_equal(whole.apply(run, 3, 7).initial, x0[7])
-    uniform, normal = drawn_states[dispersions.UniformState], drawn_states[dispersions.NormalState]
+    uniform, normal = drawn_states[dispersions.Uniform], drawn_states[dispersions.Normal]
     assert np.abs(uniform).max() <= 1.0
     for k in range(2):
         assert stats.kstest(uniform[:, k], "uniform", (-1.0, 2.0)).pvalue > ALARM
@@ -167,8 +167,8 @@ def many_drawn(whole, run=PARTS, count=TRIALS, seed=4):
 def test_initial_rates_are_drawn_about_the_nominal_one():
     nominal, laws = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
     for name, spread in {
-        "uniform": dispersions.UniformState(vector([0.02, 0.02, 0.02])),
-        "normal": dispersions.NormalState(vector([0.02, 0.02, 0.02])),
+        "uniform": dispersions.Uniform(vector([0.02, 0.02, 0.02])),
+        "normal": dispersions.Normal(vector([0.02, 0.02, 0.02])),
     }.items():
         got = many_drawn(dispersions.Dispersion(rate=spread))
         np.testing.assert_array_equal(got.initial.q, np.broadcast_to(PARTS.initial.q, (TRIALS, 4)))
@@ -231,7 +231,7 @@ ORBIT = signals.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]
 def test_every_phase_is_drawn_uniformly_and_on_its_own():
     still = signals.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=signals.Sum((SINE, still, ORBIT, SINE)))
-    got = many_drawn(dispersions.Dispersion(phase=dispersions.UniformPhase()), run).disturbance.terms
+    got = many_drawn(dispersions.Dispersion(phase=dispersions.UniformPhase(7)), run).disturbance.terms
     np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
     turns = np.column_stack(
         [
@@ -255,26 +255,91 @@ def test_a_drawn_body_meets_its_own_gravity_gradient():
     np.testing.assert_array_equal(got.controller.model.inertia, PARTS.controller.model.inertia)  # the law's is nominal
 
 
+NOISY = helpers.parts(
+    q=NOMINAL.as_quat(), reference=signals.Fixed(vector(REFERENCE.as_quat())), period=0.05, noise=(1e-5, 1e-6),
+    disturbance=SINE,
+)  # fmt: skip
+LIMITED = replace(NOISY, actuators=hardware.Actuators(torque_limit=vector(0.5)))
+TENTH = dispersions.TruncatedNormal(vector([0.1]))
+WIDE = dispersions.Uniform(vector([0.5]))
+
+
+def test_relative_numbers_are_truncated_not_clipped():
+    """The factor on a level follows the truncated normal law, or the uniform one, and no two trials sit at an end."""
+    got = many_drawn(dispersions.Dispersion(levels={"torque_limit": TENTH, "attitude_noise": WIDE}), LIMITED)
+    normal = (np.asarray(got.actuators.torque_limit) / 0.5 - 1.0) / 0.1
+    uniform = np.asarray(got.sensors.attitude_noise) / 1e-5
+    assert stats.kstest(normal, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
+    assert is_uniform(uniform, 0.5, 1.5)
+    assert 2.9 < np.abs(normal).max() < 3.0
+    assert len(np.unique(normal)) == len(np.unique(uniform)) == TRIALS
+    np.testing.assert_array_equal(got.sensors.rate_noise, np.full(TRIALS, 1e-6))
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert abs(np.corrcoef(normal, uniform)[0, 1]) < limit
+
+
+def test_amplitudes_are_scaled_each_on_its_own_and_a_bias_is_added():
+    still = signals.Constant(vector([0.1, 0.2, 0.3]))
+    run = replace(PARTS, disturbance=signals.Sum((SINE, ORBIT, still)))
+    spread = dispersions.Dispersion(
+        amplitude=dispersions.Uniform(vector([0.5] * 6)), bias=dispersions.Normal(vector([0.01] * 3))
+    )
+    sine, orbit, constant, bias = many_drawn(spread, run).disturbance.terms
+    factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.value) / [0.1, 0.2, 0.3]])
+    for column in factors.T:
+        assert is_uniform(column, 0.5, 1.5)
+    for column in np.asarray(bias.value).T:
+        assert stats.kstest(column / 0.01, "norm").pvalue > ALARM
+    every = np.column_stack([factors, np.asarray(bias.value)])
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert np.abs(np.corrcoef(every.T) - np.eye(9)).max() < limit
+    np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
+    alone = dispersions.Dispersion(bias=spread.bias).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
+    np.testing.assert_array_equal(alone.terms[-1].value, bias.value[9])
+    t = vector(3.7)
+    np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.value[9], rtol=1e-14)
+
+
+def test_a_drawn_reference_takes_the_start_with_it():
+    turned = dispersions.Dispersion(KINDS["axis_angle"], reference=dispersions.NormalAttitude(vector(0.05)))
+    got = many_drawn(turned)
+    q_f = Rotation.from_quat(np.asarray(got.reference.q))
+    for axis in ((REFERENCE.inv() * q_f).as_rotvec() / 0.05).T:
+        assert stats.kstest(axis, "norm").pvalue > ALARM
+    same = drawn("axis_angle", seed=4)  # the turn from the reference is the one drawn without it
+    turn = (q_f.inv() * Rotation.from_quat(np.asarray(got.initial.q))).as_quat(canonical=True)
+    np.testing.assert_allclose(turn, (REFERENCE.inv() * same).as_quat(canonical=True), atol=1e-14)
+    np.testing.assert_array_equal(got.reference.rate, np.broadcast_to([0.1, 0.0, 0.2], (TRIALS, 3)))
+
+
 def test_one_more_thing_drawn_changes_no_other_draw():
-    run = replace(PARTS, disturbance=SINE)
     inertia = dispersions.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
     kinds = {
-        "attitude": KINDS["axis_angle"],
-        "rate": dispersions.NormalState(vector([0.01, 0.01, 0.01])),
-        "inertia": inertia,
-        "phase": dispersions.UniformPhase(),
+        "attitude": (KINDS["normal"], lambda p: p.initial.q),
+        "rate": (dispersions.Normal(vector([0.01, 0.01, 0.01])), lambda p: p.initial.w),
+        "inertia": (inertia, lambda p: p.plant.inertia),
+        "phase": (dispersions.UniformPhase(3), lambda p: signals.values(p.disturbance, "phase")),
+        "amplitude": (dispersions.Uniform(vector([0.5] * 3)), lambda p: signals.values(p.disturbance, "amplitude")[:3]),
+        "bias": (dispersions.Uniform(vector([0.5] * 3)), lambda p: p.disturbance.terms[-1].value),
+        "reference": (KINDS["uniform"], lambda p: p.reference.q),
+        "levels": (
+            {"torque_limit": TENTH, "rate_noise": WIDE},
+            lambda p: (p.actuators.torque_limit, p.sensors.rate_noise),
+        ),
     }
-    whole = dispersions.Dispersion(**kinds).apply(run, 7, 8)
-    for name, kind in kinds.items():
-        alone = dispersions.Dispersion(**{name: kind}).apply(run, 7, 8)
-        seen = {"attitude": lambda p: p.initial.q, "rate": lambda p: p.initial.w, "inertia": lambda p: p.plant.inertia,
-                "phase": lambda p: p.disturbance.phase}[name]  # fmt: skip
-        np.testing.assert_array_equal(seen(whole), seen(alone))
+    whole = dispersions.Dispersion(**{name: kind for name, (kind, _) in kinds.items()})
+    got = whole.apply(LIMITED, 7, 8)
+    for name, (kind, seen) in kinds.items():
+        alone = dispersions.Dispersion(**{name: kind}).apply(LIMITED, 7, 8)
+        np.testing.assert_array_equal(seen(got), seen(alone), err_msg=name)
+        assert not np.array_equal(seen(alone), seen(dispersions.Dispersion(bias=kinds["bias"][0]).apply(LIMITED, 1, 1)))
+    c = whole.coordinates(7, 8)
+    assert len({float(v[0]) for v in c.values()}) == len(c) == 9
 
 
 def test_the_parts_of_coordinates_are_those_of_the_trial_that_has_them():
-    whole = dispersions.Dispersion(KINDS["axis_angle"], rate=dispersions.NormalState(vector([0.01, 0.01, 0.01])))
-    at = whole.at(PARTS, whole.coordinates(PARTS, 3, 9))
+    whole = dispersions.Dispersion(KINDS["axis_angle"], rate=dispersions.Normal(vector([0.01, 0.01, 0.01])))
+    at = whole.at(PARTS, whole.coordinates(3, 9))
     drawn_parts = whole.apply(PARTS, 3, 9)
     jax.tree.map(np.testing.assert_array_equal, at.initial, drawn_parts.initial)
     middle = whole.at(PARTS, {"initial_attitude": vector([0.5, 0.0, 1.0]), "initial_rate": vector([0.0, 1.0, 0.0])})

@@ -32,7 +32,7 @@ FLOORS = {
         requirements
         dispersions
         values systems
-        device_tables
+        device_tables dispersion_tables
         tables
         layouts
         schema

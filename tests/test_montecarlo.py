@@ -1,10 +1,13 @@
+import tomllib
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import dispersions, montecarlo, rollout, scenario
+from ptsmc_jax import dispersions, hardware, montecarlo, plants, rollout, scenario, sensors, signals
 from tests.helpers import FIRST_FLIGHT, parts, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
@@ -28,9 +31,10 @@ def test_256_trials_equal_the_loop_over_them(flown):
     run, trials = flown
     alone = jax.jit(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial))
     for k in range(256):
-        metrics, status, _, x = alone(np.uint32(k))
+        metrics, status, _, drawn = alone(np.uint32(k))
         assert int(status) == trials.status[k]
-        np.testing.assert_allclose(x.q, trials.initial.q[k], atol=1e-15)
+        for name, value in drawn.items():
+            np.testing.assert_allclose(value, trials.drawn[name][k], atol=1e-15)
         for name in metrics._fields:
             a, b = float(getattr(metrics, name)), float(getattr(trials.metrics, name)[k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
@@ -42,7 +46,7 @@ def test_any_number_of_trials_is_flown(flown, count):
     run, trials = flown
     some = montecarlo.run(run, SPREAD, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
-    np.testing.assert_array_equal(some.initial.q, trials.initial.q[:count])
+    np.testing.assert_array_equal(some.vectors("initial_q"), trials.vectors("initial_q")[:count])
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
 
 
@@ -67,7 +71,7 @@ def test_a_trial_does_not_depend_on_the_others(flown):
     some = np.array([200, 3, 3, 77])
     again = montecarlo.run(run, SPREAD, 5, some)
     np.testing.assert_allclose(again.metrics.window_error, trials.metrics.window_error[some], rtol=1e-12)
-    np.testing.assert_allclose(again.initial.q, trials.initial.q[some], atol=1e-15)
+    np.testing.assert_allclose(again.vectors("initial_q"), trials.vectors("initial_q")[some], atol=1e-15)
     other = montecarlo.run(run, SPREAD, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 
@@ -79,6 +83,86 @@ def test_a_trial_replayed_alone_with_its_history_equals_its_row(flown):
     for name in result.metrics._fields:
         a, b = float(getattr(result.metrics, name)), float(getattr(trials.metrics, name)[42])
         assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), name
+
+
+EVERYTHING = """
+[spacecraft]
+inertia = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
+[controller]
+t_f = 12.0
+delta = 0.5
+[disturbance]
+bias = [0.001, 0.0, -0.002]
+[loop]
+mode = "sampled"
+period = 0.1
+t_end = 13.0
+[hardware]
+attitude_noise = 2e-5
+rate_noise = 1e-6
+rate_bias = 1e-5
+torque_limit = 1.0
+[dispersion]
+attitude = { kind = "normal", std_deg = 20.0 }
+rate = { kind = "normal", std = 0.01 }
+inertia = { kind = "relative_normal", std = 0.05, axes_deg = 2.0 }
+reference = { kind = "normal", std_deg = 3.0 }
+disturbance_phase = {}
+disturbance_amplitude = { kind = "relative_normal", std = 0.2 }
+disturbance_bias = { kind = "uniform", half_width = 0.003 }
+attitude_noise = { kind = "relative_uniform", half_width = 0.5 }
+rate_noise = { kind = "relative_normal", std = 0.2 }
+torque_limit = { kind = "relative_normal", std = 0.2 }
+"""
+
+
+class _Biased(sensors.Sensors):
+    """Sensors with a gyro that is off by what is given, not by what is drawn."""
+
+    def first_bias(self, seed, trial):
+        return jnp.asarray(self.rate_bias)
+
+
+jax.tree_util.register_dataclass(
+    _Biased, ["attitude_noise", "rate_noise", "rate_bias", "bias_rate", "filter"], ["every"]
+)
+
+
+def test_a_trial_made_by_hand_from_its_row_is_the_trial():
+    """Every drawn number stands in the row, and is the one that was flown: the nominal parts with it fly the same."""
+    ready = scenario.study(scenario.from_tables(tomllib.loads(EVERYTHING)))
+    trials = montecarlo.run(ready.parts, ready.dispersion, 3, np.arange(5))
+    assert set(trials.status) == {rollout.OK}
+    for k in range(5):
+        row = {name: vector(values[k]) for name, values in trials.drawn.items()}
+
+        def numbers(name, count, row=row):
+            return jnp.stack([row.pop(f"{name}{j}") for j in range(1, count + 1)])
+
+        upper = [[row.pop(f"inertia_{min(i, j)}{max(i, j)}", None) for j in (1, 2, 3)] for i in (1, 2, 3)]
+        body = np.zeros((3, 3))
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            body[i, j] = body[j, i] = upper[i][j]
+        sine = ready.parts.disturbance
+        d = signals.Sinusoid(numbers("disturbance_amplitude_", 3), sine.frequency, numbers("disturbance_phase_", 3),
+                             sine.bias + numbers("disturbance_bias_", 3))  # fmt: skip
+        eyes = _Biased(row.pop("attitude_noise"), row.pop("rate_noise"), numbers("rate_bias_", 3))
+        by_hand = replace(
+            ready.parts,
+            plant=plants.spacecraft(body),
+            initial=plants.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
+            reference=signals.Fixed(numbers("reference_q", 4)),
+            disturbance=d,
+            sensors=eyes,
+            actuators=hardware.Actuators(torque_limit=row.pop("torque_limit")),
+        )
+        turn = Rotation.from_quat(by_hand.reference.q).inv() * Rotation.from_quat(by_hand.initial.q)
+        assert float(row.pop("initial_angle")) == pytest.approx(turn.magnitude(), rel=1e-12)
+        assert not row  # nothing else was drawn
+        found = rollout.simulate_jit(by_hand, np.uint32(3), np.uint32(k)).metrics
+        for name in found._fields:
+            a, b = float(getattr(found, name)), float(getattr(trials.metrics, name)[k])
+            assert a == pytest.approx(b, rel=1e-9, abs=1e-12, nan_ok=True), (k, name)
 
 
 def test_failed_trials_are_counted_and_leave_the_others_alone(flown):

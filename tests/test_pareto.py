@@ -40,7 +40,7 @@ def trials(errors):
     """Trials with these window errors; nothing else of them is looked at."""
     ok = np.zeros(len(errors), dtype=np.int32)
     metrics = Metrics(**dict.fromkeys(Metrics._fields, jnp.asarray(errors)))
-    return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), None)
+    return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), {})
 
 
 def test_only_what_is_beaten_beyond_its_interval_is_dominated():

@@ -99,6 +99,7 @@ ATTITUDES = [
     {"dcm_body_to_inertial": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
     {"euler_deg": [10.0, 20.0, 30.0], "sequence": "ZYX"},
 ]
+DRAWN_ATTITUDES = {"axis_angle": {"min_deg": 20.0, "max_deg": 140.0}, "normal": {"std_deg": 3.0}, "uniform": {}}
 # every key of every table, one table at a time so that what is made wrong in it is all that is wrong
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SYSTEM_CONTROLLER = {key: value for key, value in CHAIN_DEFAULTS["controller"].items() if key != "a"}
@@ -140,13 +141,32 @@ COMPLETE = [
     {"filter": {"kind": "steady_state", "bandwidth": 0.1}},
     {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-3, "phase": 0.1, "mrp": [0.0, 0.0, 0.1]}},
     {"disturbance": {"kind": "random_walk", "density": [1e-4, 1e-4, 1e-4]}},
-    {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 140.0}}},
-    {"dispersion": {"attitude": {"kind": "normal", "std_deg": 3.0}}},
-    {"dispersion": {"attitude": {"kind": "uniform"}}},
+    *({"dispersion": {"attitude": {"kind": kind, **keys}}} for kind, keys in DRAWN_ATTITUDES.items()),
     {"dispersion": {"rate": {"kind": "normal", "std": 0.01}}},
     {"dispersion": {"inertia": {"kind": "relative_normal", "std": 0.05, "axes_deg": 2.0}}},
     {"dispersion": {"rate": {"kind": "uniform", "half_width": 0.01}}},
     {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
+    {
+        "dispersion": {
+            "disturbance_amplitude": {"kind": "relative_normal", "std": 0.1},
+            "disturbance_bias": {"kind": "normal", "std": 1e-3},
+        }
+    },
+    {
+        "dispersion": {
+            "disturbance_amplitude": {"kind": "relative_uniform", "half_width": 0.1},
+            "disturbance_bias": {"kind": "uniform", "half_width": 1e-3},
+        }
+    },
+    *({"dispersion": {"reference": {"kind": kind, **keys}}} for kind, keys in DRAWN_ATTITUDES.items()),
+    {
+        "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6, "torque_limit": 0.5},
+        "dispersion": {
+            "attitude_noise": {"kind": "relative_normal", "std": 0.1},
+            "rate_noise": {"kind": "relative_uniform", "half_width": 0.1},
+            "torque_limit": {"kind": "relative_normal", "std": 0.1},
+        },
+    },
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
     {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
@@ -167,6 +187,15 @@ COMPLETE = [
             {"dispersion": {"x0": {"kind": "uniform", "half_width": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"x0": {"kind": "normal", "std": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
+            {"dispersion": {"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1}}},
+            {"dispersion": {"disturbance_bias": {"kind": "normal", "std": 1e-3}}},
+            {
+                "hardware": {"state_noise": [1e-5, 1e-5, 0.0], "torque_limit": 0.5},
+                "dispersion": {
+                    "state_noise": {"kind": "relative_normal", "std": 0.1},
+                    "torque_limit": {"kind": "relative_uniform", "half_width": 0.1},
+                },
+            },
             {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},
         )
     ),

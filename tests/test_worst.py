@@ -51,7 +51,7 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
     assert found.screened < found.ratio
     assert not found.unbounded
     row = tensor[np.argmax(np.linalg.norm(tensor, axis=1))]
-    q = np.asarray(found.start["q"])
+    q = np.asarray([found.start[f"initial_q{k}"] for k in range(1, 5)])
     np.testing.assert_allclose(2 * np.arccos(abs(q[3])), largest, rtol=1e-3)
     axis = q[:3] / np.linalg.norm(q[:3])
     assert abs(axis @ row) / np.linalg.norm(row) > 0.999
@@ -67,26 +67,28 @@ def test_attitudes_up_to_180_degrees_have_no_worst_case():
 def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
     from scipy.stats import chi2
 
-    spread = dispersions.Dispersion(rate=dispersions.NormalState(vector([1e-3, 1e-3, 1e-3])))
+    spread = dispersions.Dispersion(rate=dispersions.Normal(vector([1e-3, 1e-3, 1e-3])))
     problem, wanted = posed(spread, Requirement("peak_rate", 0.05), q=[0.0, 0.0, 0.0, 1.0])
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     size = np.linalg.norm(found.coordinates["initial_rate"])
     np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 3)), rtol=1e-3)  # on the edge of the ball
-    np.testing.assert_allclose(np.linalg.norm(found.start["w"]), 1e-3 * size, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm([found.start[f"initial_w{k}"] for k in range(1, 4)]), 1e-3 * size, rtol=1e-9
+    )
     np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-6)  # the body only slows down from there
 
 
 def test_slopes_of_the_ascent_agree_with_central_differences():
     spread = dispersions.Dispersion(
         dispersions.AxisAngle(vector(0.4), vector(2.0)),
-        rate=dispersions.UniformState(vector([1e-2, 1e-2, 1e-2])),
-        phase=dispersions.UniformPhase(),
+        rate=dispersions.Uniform(vector([1e-2, 1e-2, 1e-2])),
+        phase=dispersions.UniformPhase(3),
     )
     problem, _ = posed(spread)
     sine = signals.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
     run = replace(problem.parts, disturbance=sine)
     chosen = np.arange(3, dtype=np.uint32)
-    coordinates = objective.coordinates_of(spread, run, 5, chosen)
+    coordinates = objective.coordinates_of(spread, 5, chosen)
     moved = tuple(coordinates)
     posed_again = replace(problem, parts=run)
     y = np.concatenate([worst._charted(posed_again, name, np.asarray(coordinates[name])) for name in moved], axis=1)
@@ -128,10 +130,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
     problem, _ = posed(spread)
     more = objective.with_trials(problem, np.asarray([40]))
-    own = {
-        name: np.asarray(v)[0]
-        for name, v in objective.coordinates_of(spread, problem.parts, 5, np.asarray([40])).items()
-    }
+    own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
     roomy = optimise._with_room(problem)
     assert roomy.trials.size == 8 + optimise.SPARE
     given = optimise._add(roomy, np.asarray([7]), {name: v.tolist() for name, v in own.items()})

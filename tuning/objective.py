@@ -55,7 +55,7 @@ def problem(
         dispersion=dispersion,
         seed=jnp.uint32(seed),
         trials=jnp.zeros(0, dtype=jnp.uint32),
-        coordinates=coordinates_of(dispersion, parts, seed, np.zeros(0)),
+        coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=jnp.asarray([r.limit for r in requirements], dtype=float),
         averaged=len(trials),
         names=names,
@@ -64,21 +64,21 @@ def problem(
     return replace(with_trials(made, trials), **others)
 
 
-def coordinates_of(dispersion: Dispersion, parts: Parts, seed: int, trials: np.ndarray) -> Coordinates:
+def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
     """Coordinates of these trials, arrays over the trials first."""
     numbers = jnp.asarray(trials, dtype=jnp.uint32)
-    return _coordinates(dispersion, parts, jnp.uint32(seed), numbers)
+    return _coordinates(dispersion, jnp.uint32(seed), numbers)
 
 
 @jax.jit
-def _coordinates(dispersion: Dispersion, parts: Parts, seed: jax.Array, trials: jax.Array) -> Coordinates:
-    return jax.vmap(lambda trial: dispersion.coordinates(parts, seed, trial))(trials)
+def _coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
+    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
 def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None) -> Problem:
     """The problem with these trials added, which count in the constraints; coordinates: if not their own."""
     if coordinates is None:
-        coordinates = coordinates_of(problem.dispersion, problem.parts, int(problem.seed), trials)
+        coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
     return replace(
         problem,
         trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),

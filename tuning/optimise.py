@@ -146,7 +146,7 @@ def _add(problem: Problem, trials: np.ndarray, coordinates: dict | None = None) 
     places = jnp.asarray(spare[: len(trials)])
     numbers = jnp.asarray(trials, dtype=jnp.uint32)
     if coordinates is None:
-        own = coordinates_of(problem.dispersion, problem.parts, int(problem.seed), trials)
+        own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
         own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
     return replace(

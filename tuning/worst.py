@@ -33,7 +33,7 @@ class Hardest:
     status: str
     trial: int  # which names its noise, and what was not moved
     coordinates: dict[str, list[float]]  # of what is drawn
-    start: dict[str, list[float]]  # initial state, by its parts
+    start: dict[str, float]  # what it flies with, see `Dispersion.values`
     moved: tuple[str, ...]  # what the ascent moved
 
     @property
@@ -65,7 +65,7 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     trials, ratio = screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
     names, limits = tuple(r.metric for r in requirements), jnp.asarray([r.limit for r in requirements])
-    coordinates = coordinates_of(problem.dispersion, problem.parts, int(problem.seed), chosen)
+    coordinates = coordinates_of(problem.dispersion, int(problem.seed), chosen)
     moved = tuple(name for name in coordinates if name != INERTIA)
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     y = np.concatenate([_charted(problem, name, np.asarray(coordinates[name])) for name in moved], axis=1)
@@ -83,10 +83,9 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     first = int(np.argmax(best))
     found = {**coordinates, **_moved(problem.dispersion, coordinates, jnp.asarray(best_y), moved)}
     one = {name: v[first] for name, v in found.items()}
-    metrics, code, _, initial = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
+    metrics, code, _, values = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
     ratios = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
     worst = int(np.argmax(ratios))
-    start = initial._asdict() if hasattr(initial, "_asdict") else {"x": initial}
     return Hardest(
         metric=names[worst],
         ratio=ratios[worst],
@@ -94,7 +93,7 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
         status=rollout.STATUS[int(code)][0],
         trial=int(chosen[first]),
         coordinates={name: np.asarray(v).tolist() for name, v in one.items()},
-        start={name: np.asarray(v).tolist() for name, v in start.items()},
+        start={name: float(v) for name, v in values.items()},
         moved=moved,
     )
 
