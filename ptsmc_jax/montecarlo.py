@@ -1,9 +1,9 @@
 """Many trials of one set of parts: in blocks, over all local devices."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,8 @@ class Trials:
     metrics: Metrics  # of arrays
     status: np.ndarray  # codes, see rollout.STATUS
     bad_time: np.ndarray  # first bad time [s], NaN if none
-    drawn: dict[str, np.ndarray]  # what each flew with, by name, see `Dispersion.values`
+    drawn: dict[str, np.ndarray]  # what each flew with, by name, see `values`
+    own: dict[str, np.ndarray] = field(default_factory=dict)  # metrics of one's own
 
     @property
     def ok(self) -> np.ndarray:
@@ -53,16 +54,39 @@ class Trials:
                 for name in names}  # fmt: skip
 
 
-def one(parts: Parts, dispersion: Dispersion, seed, trial, coordinates: Coordinates | None = None) -> tuple:
-    """Metrics, status, bad time and drawn values of one trial: pure, for any transformation.
+# a metric of one's own: the run with its history, and the parts that flew it -> named numbers
+OwnMetrics = Callable[[rollout.Result, Parts], dict[str, jax.Array]]
 
-    coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
+
+class Flown(NamedTuple):
+    """What is known of one trial, see `Trials`."""
+
+    metrics: Metrics
+    status: jax.Array
+    bad_time: jax.Array
+    drawn: dict[str, jax.Array]
+    own: dict[str, jax.Array]
+
+
+def one(
+    parts: Parts,
+    dispersion: Dispersion,
+    seed,
+    trial,
+    coordinates: Coordinates | None = None,
+    own: OwnMetrics | None = None,
+) -> Flown:
+    """Fly one trial: pure, for any transformation.
+
+    coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone. own:
+    metrics besides the usual ones, for which the run's history is recorded.
     """
     if coordinates is None:
         coordinates = dispersion.coordinates(seed, trial)
     drawn = dispersion.at(parts, coordinates)
-    result = rollout.simulate(drawn, seed, trial)
-    return result.metrics, result.status, result.bad_time, values(dispersion, drawn, seed, trial)
+    result = rollout.simulate(drawn, seed, trial, record=own is not None)
+    more = {} if own is None else own(result, drawn)
+    return Flown(result.metrics, result.status, result.bad_time, values(dispersion, drawn, seed, trial), more)
 
 
 def values(dispersion: Dispersion, drawn: Parts, seed, trial) -> dict[str, jax.Array]:
@@ -74,11 +98,18 @@ def values(dispersion: Dispersion, drawn: Parts, seed, trial) -> dict[str, jax.A
     return found
 
 
-def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, block: int = BLOCK) -> Trials:
+def run(
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: int,
+    trials: np.ndarray,
+    block: int = BLOCK,
+    own: OwnMetrics | None = None,
+) -> Trials:
     """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
 
     block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
-    any number of trials from `FEW` on.
+    any number of trials from `FEW` on. own: see `one`.
     """
     trials = np.asarray(trials, dtype=np.uint32)
     devices = len(jax.local_devices())
@@ -92,7 +123,7 @@ def run(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, blo
         padded[:, :share] = np.resize(part, (devices, share))
         needed = jnp.int32(-(-share // block))
         shape = (devices, rows, block)
-        found = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices)
+        found = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices, own)
         calls.append(jax.tree.map(lambda v, share=share, n=part.size: _joined(np.asarray(v), share)[:n], found))
     return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
@@ -103,18 +134,24 @@ def _joined(v: np.ndarray, share: int) -> np.ndarray:
     return flat.reshape(-1, *flat.shape[2:])
 
 
-@partial(jax.jit, static_argnames="devices")
+@partial(jax.jit, static_argnames=("devices", "own"))
 def _fly(
-    parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, needed: jax.Array, devices: int
-) -> tuple:
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: jax.Array,
+    trials: jax.Array,
+    needed: jax.Array,
+    devices: int,
+    own: OwnMetrics | None,
+) -> Flown:
     """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
-    flown = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial))
+    flown = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial, own=own))
 
-    def mine(trials: jax.Array) -> tuple:
+    def mine(trials: jax.Array) -> Flown:
         row, rows = trials[0], jax.eval_shape(flown, trials[0, 0])
         empty = jax.tree.map(lambda v: jnp.zeros((row.shape[0], *v.shape), v.dtype), rows)
 
-        def fly(k: jax.Array, found: tuple) -> tuple:
+        def fly(k: jax.Array, found: Flown) -> Flown:
             return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, fly, empty))

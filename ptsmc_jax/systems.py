@@ -1,4 +1,4 @@
-"""Systems of one's own by where they stand, "FILE.py:NAME" or "package.module:NAME"."""
+"""Systems and functions of one's own by where they stand, "FILE.py:NAME" or "package.module:NAME"."""
 
 import functools
 import hashlib
@@ -10,19 +10,31 @@ from types import ModuleType
 
 from ptsmc_jax.plants import System
 
-ALLOWED = '"FILE.py:NAME" or "package.module:NAME", a system made with plants.system'
+WHERE = '"FILE.py:NAME" or "package.module:NAME"'
+
+ALLOWED = f"{WHERE}, a system made with plants.system"
 
 
 @functools.cache
 def load(where: str) -> System:
-    """The system that stands there; one program for all its runs, since it is made once.
+    """The system that stands there; one program for all its runs, since it is made once; see `item`."""
+    found = item(where, ALLOWED)
+    if not isinstance(found, System):
+        name = where.rpartition(":")
+        raise ValueError(f"{name[0]} has a {type(found).__name__} of that name; allowed is {ALLOWED}")
+    return found
+
+
+@functools.cache
+def item(where: str, allowed: str) -> object:
+    """What stands there under its name.
 
     Runs the file, as Python does with any import; it may import from its own folder, a module from where the command
     was called. Raises ValueError that says what is wrong in one line.
     """
     place, _, name = where.rpartition(":")
     if not place or not name:
-        raise ValueError(f"it names no system; allowed is {ALLOWED}")
+        raise ValueError(f"it names nothing of Python's; allowed is {allowed}")
     path = Path(place)
     if place.endswith(".py") and not path.is_file():
         raise ValueError(f"the file {path} is not there")
@@ -35,11 +47,9 @@ def load(where: str) -> System:
         raise ValueError(f"running {place} fails: {type(error).__name__}: {said}") from error
     finally:
         sys.path.remove(folder)
-    found = getattr(module, name, None)
-    if not isinstance(found, System):
-        said = "has no such name" if found is None else f"has a {type(found).__name__} of that name"
-        raise ValueError(f"{place} {said}; allowed is {ALLOWED}")
-    return found
+    if not hasattr(module, name):
+        raise ValueError(f"{place} has no such name; allowed is {allowed}")
+    return getattr(module, name)
 
 
 def _run(path: Path) -> ModuleType:
@@ -58,10 +68,10 @@ def _run(path: Path) -> ModuleType:
     return module
 
 
-def source(where: object) -> dict[str, str]:
-    """What a result depends on besides its scenario: the SHA-256 of the file in which a system stands."""
+def source(where: object, key: str = "system_sha256") -> dict[str, str]:
+    """What a result depends on besides its scenario: the SHA-256 of the file in which a system or a function stands."""
     place = where.rpartition(":")[0] if isinstance(where, str) else ""
     if place and not place.endswith(".py"):
         spec = importlib.util.find_spec(place)
         place = "" if spec is None or spec.origin is None else spec.origin
-    return {"system_sha256": hashlib.sha256(Path(place).read_bytes()).hexdigest()} if Path(place).is_file() else {}
+    return {key: hashlib.sha256(Path(place).read_bytes()).hexdigest()} if Path(place).is_file() else {}

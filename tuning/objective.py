@@ -105,7 +105,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 
     def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
         trial, coordinates = case
-        metrics, status, _, _ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
+        metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         ok = (status == rollout.OK) | (status == rollout.MISSED)
         over = [
             jnp.where(ok, getattr(metrics, name) / limit, FAILED) - 1.0

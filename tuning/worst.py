@@ -83,7 +83,7 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     first = int(np.argmax(best))
     found = {**coordinates, **_moved(problem.dispersion, coordinates, jnp.asarray(best_y), moved)}
     one = {name: v[first] for name, v in found.items()}
-    metrics, code, _, values = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
+    metrics, code, _, values, _ = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
     ratios = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
     worst = int(np.argmax(ratios))
     return Hardest(
@@ -120,7 +120,7 @@ def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str,
 
 
 @jax.jit
-def _fly(parts, dispersion, seed, trial, coordinates) -> tuple:
+def _fly(parts, dispersion, seed, trial, coordinates) -> montecarlo.Flown:
     return montecarlo.one(parts, dispersion, seed, trial, coordinates)
 
 
@@ -131,7 +131,7 @@ def _climb(parts, dispersion, seed, trials, coordinates, limits, y, moved, names
     def values(y: jax.Array) -> jax.Array:
         def fly(case: tuple) -> jax.Array:
             trial, own = case
-            metrics, status, _, _ = montecarlo.one(parts, dispersion, seed, trial, own)
+            metrics, status, *_ = montecarlo.one(parts, dispersion, seed, trial, own)
             ok = (status == rollout.OK) | (status == rollout.MISSED)
             ratios = jnp.stack([getattr(metrics, name) for name in names]) / limits
             return jnp.where(ok, jnp.max(ratios), FAILED)

@@ -1,0 +1,151 @@
+"""A Monte Carlo campaign: trials flown part by part, each part written as it is done; what is there is not flown again.
+
+What a trial is does not depend on the parts, so that shards, clusters and interrupted runs give the same rows.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+
+from ptsmc_jax import lanes, montecarlo, rollout
+from ptsmc_jax.dispersions import Dispersion
+from ptsmc_jax.montecarlo import OwnMetrics
+from ptsmc_jax.rollout import Parts
+from ptsmc_jax.rows import Part, Rows
+from ptsmc_jax.scenario import Study
+
+PART = 4096  # trials in one part
+WAITING = 2  # parts that may wait to be written while the next one is flown
+
+Wanted = tuple[int, int]  # first trial and count of a part to fly
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What is flown: a scenario's trials under one seed."""
+
+    ready: Study
+    seed: int
+    own: OwnMetrics | None = None  # metrics of one's own
+
+    def fly(self, first: int, count: int) -> pl.DataFrame:
+        """Rows of the trials from `first` on."""
+        trials = np.arange(first, first + count, dtype=np.uint32)
+        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, trials, own=self.own)
+        named = [rollout.STATUS[int(code)] for code in flown.status]
+        heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
+        numbers = {
+            "bad_time": flown.bad_time,
+            **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
+            **flown.drawn,
+            **flown.own,
+        }
+        return pl.DataFrame({"trial": trials, **heading, **numbers}).with_columns(pl.col(pl.Float64).fill_nan(None))
+
+    def draw(self, first: int, count: int) -> pl.DataFrame:
+        """What the trials from `first` on would fly with."""
+        trials = np.arange(first, first + count, dtype=np.uint32)
+        padded = np.resize(trials, PART)
+        drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), padded)
+        return pl.DataFrame({"trial": trials, **{name: np.asarray(v)[:count] for name, v in drawn.items()}})
+
+    def own_names(self) -> list[str]:
+        """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
+        if self.own is None:
+            return []
+        found = jax.eval_shape(
+            lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=self.own)
+        )
+        if not isinstance(found.own, dict) or not found.own or not all(isinstance(name, str) for name in found.own):
+            raise ValueError(f"it returns {type(found.own).__name__}, but must return named numbers, a dict")
+        for name, value in found.own.items():
+            if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
+                raise ValueError(f"its {name} is no single number")
+            if name in {"trial", "status", "reason", "bad_time", *found.metrics._fields, *found.drawn}:
+                raise ValueError(f"its {name} has the name of a column that the rows have already")
+        return list(found.own)
+
+
+@jax.jit
+def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> dict[str, jax.Array]:
+    return lanes.vmap(lambda trial: montecarlo.values(dispersion, dispersion.apply(parts, seed, trial), seed, trial))(
+        trials
+    )
+
+
+def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
+    """Parts that are not there yet, of a campaign of so many trials; shard (i, n): of every n-th part from the i-th."""
+    there = {part.first: part.count for part in parts}
+    every = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
+    return [part for part in every[shard[0] - 1 :: shard[1]] if there.get(part[0], 0) < part[1]]
+
+
+@dataclass
+class Tally:
+    """Where a campaign stands."""
+
+    done: int  # trials
+    total: int
+    failed: int  # that did not end well
+
+
+def tally(parts: list[Part], total: int) -> Tally:
+    """Where a campaign with these parts stands."""
+    failed = sum(_failed(pl.read_parquet(part.path, columns=["status"])) for part in parts)
+    return Tally(sum(part.count for part in parts), total, failed)
+
+
+def _failed(frame: pl.DataFrame) -> int:
+    return int((frame["status"] != "ok").sum())
+
+
+def here(make: Callable[[int, int], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
+    """Make the wanted parts on this machine, and write each while the next one is made.
+
+    Yields each part that is on the disk, and how many of its trials did not end well. make: first trial, count -> rows.
+    """
+    writing: deque[tuple[Any, int]] = deque()
+    with ThreadPoolExecutor(1) as writer:
+        for first, count in wanted:
+            frame = make(first, count)
+            bad = _failed(frame) if "status" in frame.columns else 0
+            writing.append((writer.submit(rows.write, first, frame), bad))
+            while writing and (len(writing) > WAITING or writing[0][0].done()):
+                done, bad = writing.popleft()
+                yield done.result(), bad
+        for done, bad in writing:
+            yield done.result(), bad
+
+
+def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
+    """Tell of each part as it lands."""
+    report(standing)
+    for part, failed in parts:
+        standing.done += part.count
+        standing.failed += failed
+        report(standing)
+
+
+def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
+    ready = campaign.ready
+    t, error, lasts = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), jnp.asarray(trials))
+    kept = np.asarray(lasts)[0]
+    return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
+
+
+@jax.jit
+def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> tuple:
+    def one(trial: jax.Array) -> tuple:
+        log = rollout.simulate(dispersion.apply(parts, seed, trial), seed, trial, record=True).log
+        assert log is not None
+        return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.lasts
+
+    return montecarlo.blocks(one, trials)

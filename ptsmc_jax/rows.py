@@ -1,0 +1,111 @@
+"""The rows of a campaign: Parquet parts that are whole or not there, each known by the digest in its name.
+
+A part holds the trials from its first to its last. The digest is keyed by what the campaign is, so that a part of
+another campaign, a cut one and a changed one are all told from a whole one, and a part needs no second file beside it.
+"""
+
+import hashlib
+import io
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+FOLDER = "trials"
+_NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
+_MAKING = ".making-"  # how the name of a file begins that is being written
+
+
+@dataclass(frozen=True, order=True)
+class Part:
+    """A whole part."""
+
+    first: int  # trial
+    count: int
+    path: Path
+
+    @property
+    def end(self) -> int:
+        """The first trial beyond it."""
+        return self.first + self.count
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The parts in a folder that belong to one campaign."""
+
+    folder: Path
+    key: bytes  # see `key_of`
+
+    def write(self, first: int, frame: pl.DataFrame) -> Part:
+        """Write a part as a whole: into a file beside it, which is moved into place when it is on the disk."""
+        return self.put(first, frame.height, encoded(frame))
+
+    def put(self, first: int, count: int, content: bytes) -> Part:
+        """The same from a file's content; raises OSError where it does not fit on the disk."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(content)}.parquet"
+        handle, name = tempfile.mkstemp(prefix=_MAKING, dir=self.folder)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(name, 0o644)
+            os.replace(name, path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        return Part(first, count, path)
+
+    def parts(self) -> tuple[list[Part], list[Path]]:
+        """Whole parts in order, none of them inside another; and files that are damaged or of another campaign."""
+        whole, broken = [], []
+        for path in sorted(self.folder.glob("*.parquet")):
+            named = _NAME.fullmatch(path.name)
+            if named is None or self._digest(path.read_bytes()) != named[3]:
+                broken.append(path)
+                continue
+            whole.append(Part(int(named[1]), int(named[2]) - int(named[1]) + 1, path))
+        kept: list[Part] = []
+        for part in sorted(whole, key=lambda p: (p.first, -p.count)):
+            if not kept or part.first >= kept[-1].end:
+                kept.append(part)
+        return kept, broken
+
+    def tidy(self) -> None:
+        """Remove what a killed process left unfinished, and parts whose trials stand in a longer one."""
+        for path in self.folder.glob(f"{_MAKING}*"):
+            path.unlink(missing_ok=True)
+        kept = {part.path for part in self.parts()[0]}
+        for path in self.folder.glob("*.parquet"):
+            if path not in kept and _NAME.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+
+    def _digest(self, content: bytes) -> str:
+        return hashlib.blake2b(content, digest_size=16, key=self.key).hexdigest()
+
+
+def key_of(scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bytes:
+    """What tells one campaign's parts from another's: scenario, seed and what else its rows depend on."""
+    text = json.dumps([scenario, told], sort_keys=True, default=lambda value: f"<{type(value).__name__}>")
+    return hashlib.sha256(text.encode()).digest()
+
+
+def encoded(frame: pl.DataFrame) -> bytes:
+    """A table as the content of a Parquet file."""
+    buffer = io.BytesIO()
+    frame.write_parquet(buffer, compression="zstd", compression_level=1)
+    return buffer.getvalue()
+
+
+def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.DataFrame:
+    """The rows of these parts, in order; columns: those wanted, all if None."""
+    wanted = None if columns is None else list(columns)
+    return pl.concat([pl.read_parquet(part.path, columns=wanted) for part in parts], rechunk=True)

@@ -1,0 +1,87 @@
+"""Statistics of a campaign: shares and quantiles with intervals, and which inputs drive a metric."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy import stats
+
+SOBOL_BINS = 32  # of an input, by equal shares of the trials
+
+
+def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
+    """Two-sided interval of a share: Clopper and Pearson, Biometrika 26 (1934); never less likely than it says."""
+    outside = (1.0 - confidence) / 2.0
+    low = stats.beta.ppf(outside, successes, trials - successes + 1) if successes > 0 else 0.0
+    high = stats.beta.ppf(1.0 - outside, successes + 1, trials - successes) if successes < trials else 1.0
+    return float(low), float(high)
+
+
+def share_bound(successes: int, trials: int, confidence: float) -> float:
+    """One-sided lower bound of a share: Clopper and Pearson."""
+    return float(stats.beta.ppf(1.0 - confidence, successes, trials - successes + 1)) if successes > 0 else 0.0
+
+
+def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:
+    """Two-sided interval of a quantile between two order statistics, whatever the distribution.
+
+    ordered: (n,) ascending, infinite where a trial has no value. The count of values below the quantile is binomial:
+    the l-th smallest lies above it with a probability of P(B < l) (David and Nagaraja, Order Statistics, 2003, 7.1).
+    Infinite ends where so few trials bound it on that side by nothing.
+    """
+    n, outside = ordered.size, (1.0 - confidence) / 2.0
+    low = int(stats.binom.ppf(outside, n, quantile))  # the largest l with P(B < l) < outside
+    high = int(stats.binom.isf(outside, n, quantile)) + 1  # the smallest u with P(B >= u) <= outside
+    below = float(ordered[low - 1]) if low >= 1 else -np.inf
+    return below, float(ordered[high - 1]) if high <= n else np.inf
+
+
+def value_at(ordered: np.ndarray, quantile: float) -> float:
+    """The quantile of a sample: the smallest value that this share of it does not exceed."""
+    return float(ordered[max(0, int(np.ceil(quantile * ordered.size - 1e-9)) - 1)])
+
+
+def drivers(inputs: Mapping[str, np.ndarray], metric: np.ndarray) -> dict[str, dict[str, float]]:
+    """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
+
+    The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
+    Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,
+    over its variance, less what bins of unrelated numbers would show. Of ranks, so that a long tail does not decide.
+    (trials,) each; empty where the metric or every input has one value only.
+    """
+    if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
+        return {}
+    rank = stats.rankdata(metric)
+    rank = (rank - rank.mean()) / rank.std()
+    found = {}
+    for name, values in inputs.items():
+        if np.ptp(values) == 0.0:
+            continue
+        own = stats.rankdata(values)
+        correlation = float(np.mean((own - own.mean()) / own.std() * rank))
+        order = np.argsort(own, kind="stable")
+        bins = np.array_split(rank[order], SOBOL_BINS)
+        between = sum(part.size * part.mean() ** 2 for part in bins) / rank.size
+        within = 1.0 - between
+        by_chance = (SOBOL_BINS - 1) / (rank.size - SOBOL_BINS) * within
+        found[name] = {"rank_correlation": correlation, "first_order": max(0.0, float(between - by_chance))}
+    return found
+
+
+def fewest_for(failures: int, quantile: float, confidence: float) -> int:
+    """The fewest trials that show a quantile with this one-sided confidence where so many of them fail."""
+    low, high = failures + 1, failures + 1
+    while share_bound(high - failures, high, confidence) < quantile:
+        high *= 2
+    while low < high:
+        middle = (low + high) // 2
+        if share_bound(middle - failures, middle, confidence) >= quantile:
+            high = middle
+        else:
+            low = middle + 1
+    return high
+
+
+def most_extreme(values: Sequence[float], failed: Sequence[bool], count: int) -> np.ndarray:
+    """Indices of the worst trials: failed ones first, then those without a value, then by value, largest first."""
+    values_, failed_ = np.asarray(values, dtype=float), np.asarray(failed, dtype=bool)
+    return np.lexsort((-np.nan_to_num(values_, nan=np.inf), ~np.isnan(values_), ~failed_))[:count]
