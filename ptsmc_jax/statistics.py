@@ -1,6 +1,6 @@
 """Statistics of a campaign: shares and quantiles with intervals, and which inputs drive a metric."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import stats
@@ -81,7 +81,6 @@ def fewest_for(failures: int, quantile: float, confidence: float) -> int:
     return high
 
 
-def most_extreme(values: Sequence[float], failed: Sequence[bool], count: int) -> np.ndarray:
+def most_extreme(values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
     """Indices of the worst trials: failed ones first, then those without a value, then by value, largest first."""
-    values_, failed_ = np.asarray(values, dtype=float), np.asarray(failed, dtype=bool)
-    return np.lexsort((-np.nan_to_num(values_, nan=np.inf), ~np.isnan(values_), ~failed_))[:count]
+    return np.lexsort((-np.nan_to_num(values, nan=np.inf), ~np.isnan(values), ~failed))[:count]

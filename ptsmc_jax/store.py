@@ -70,12 +70,26 @@ def end(folder: Path) -> None:
 
 
 def _same(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+    return difference(folder, scenario, told) is None
+
+
+def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> str | None:
+    """What tells the run in the folder from this one, in words; None: nothing does."""
     try:
         made = json.loads((folder / "versions.json").read_text())
         known = tomllib.loads((folder / "scenario.toml").read_text())
     except (OSError, ValueError):
-        return False
-    return known == json.loads(json.dumps(_named(scenario))) and all(made.get(k) == v for k, v in told.items())
+        return "something else"
+    wanted = json.loads(json.dumps(_named(scenario)))
+    for name, value in told.items():
+        if made.get(name) != value:
+            return f"a run with {name} {made.get(name)}, not {value}"
+    for table in dict.fromkeys((*known, *wanted)):
+        for key in dict.fromkeys((*known.get(table, {}), *wanted.get(table, {}))):
+            old, new = (tables.get(table, {}).get(key, "absent") for tables in (known, wanted))
+            if old != new:
+                return f"a run of another scenario: {table}.{key} is {old} there, and {new} here"
+    return None
 
 
 def check(folder: Path, force: bool) -> None:
@@ -99,8 +113,11 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
         fill(making)
         making.chmod(0o755)
         if not folder.exists():
-            making.rename(folder)
-            return
+            try:
+                making.rename(folder)
+                return
+            except OSError:  # another process was first, with the same run: shards begin at once
+                pass
         for path in sorted(making.rglob("*")):
             if path.is_file():
                 target = folder / path.relative_to(making)
@@ -115,12 +132,19 @@ def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
     text, before = tomli_w.dumps(_named(tables)), ""
     while text != before:  # innermost arrays first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
-    path.write_text(text, encoding="utf-8")
+    _write(path, text)
 
 
 def write_json(path: Path, value: Any) -> None:
     """A JSON file; numbers that are not finite become null."""
-    path.write_text(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    _write(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    """A text file that is whole or not there."""
+    making = path.with_name(f".{path.name}-{os.getpid()}")
+    making.write_text(text, encoding="utf-8")
+    os.replace(making, path)
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

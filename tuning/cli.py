@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, CycloptsError, Parameter
 
 import ptsmc_jax
-from tuning import show
+from tuning import campaign_commands, show
+from tuning.options import INTERRUPTED, Figures, Force, Out, Quiet, ScenarioFile, Seed, UsageError, prepare, whole
 
 if TYPE_CHECKING:
     from ptsmc_jax.tables import Scenario
@@ -21,21 +22,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
-ScenarioFile = Annotated[
-    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
-]
-Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME.")]
-Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
-Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
-Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
-Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
-
-
-_STATUS = {"met": 0, "not met": 1, "interrupted": 130}  # of the exit
-
-
-class UsageError(ValueError):
-    """An option that cannot be followed. Its text is one sentence."""
+_STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
 
 
 @app.command
@@ -56,9 +43,9 @@ def simulate(
 
     Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
     """
-    key = _whole("--seed", seed)
-    number = None if trial is None else _whole("--trial", trial)
-    loaded, folder = _prepare(scenario, "simulate", out)
+    key = whole("--seed", seed)
+    number = None if trial is None else whole("--trial", trial)
+    loaded, folder = prepare(scenario, "simulate", out)
     from ptsmc_jax import store
 
     store.check(folder, force)
@@ -113,8 +100,8 @@ def map_(
 
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
-    key, count = _whole("--seed", seed), _whole("--trials", trials, 1, 1_000_000)
-    loaded, folder = _prepare(scenario, "map", out)
+    key, count = whole("--seed", seed), whole("--trials", trials, 1, 1_000_000)
+    loaded, folder = prepare(scenario, "map", out)
     from ptsmc_jax import store
 
     store.check(folder, force)
@@ -155,8 +142,8 @@ def tune(
 
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
     """
-    key = _whole("--seed", seed)
-    loaded, folder = _prepare(scenario, "tune", out)
+    key = whole("--seed", seed)
+    loaded, folder = prepare(scenario, "tune", out)
     from tuning import report, results
 
     loaded = _with_tune(loaded)
@@ -190,8 +177,8 @@ def pareto(
     Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
     interrupted.
     """
-    key, count = _whole("--seed", seed), _whole("--points", points, 3, 100)
-    loaded, folder = _prepare(scenario, "pareto", out)
+    key, count = whole("--seed", seed), whole("--points", points, 3, 100)
+    loaded, folder = prepare(scenario, "pareto", out)
     from tuning import pareto as fronts
 
     loaded = _with_tune(loaded)
@@ -204,6 +191,15 @@ def pareto(
         summary=lambda found: fronts.summary(found, loaded),
         shown=show.front,
     )  # fmt: skip
+
+
+for _command in (
+    campaign_commands.montecarlo,
+    campaign_commands.summarize,
+    campaign_commands.worst,
+    campaign_commands.replay,
+):
+    app.command(_command)
 
 
 def main() -> None:
@@ -219,7 +215,7 @@ def main() -> None:
         _fail(str(error))
     except KeyboardInterrupt:
         print("ptsmc: interrupted; nothing was written", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except OSError as error:
         _fail(f"{error.strerror or error}: {error.filename}")
     sys.exit(status if isinstance(status, int) else 0)
@@ -235,26 +231,6 @@ def _expected(error: ValueError) -> bool:
 def _fail(sentence: str) -> None:
     print(f"ptsmc: {sentence}", file=sys.stderr)
     sys.exit(2)
-
-
-def _whole(option: str, value: str, least: int = 0, most: int = 2**32 - 1) -> int:
-    if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
-        raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
-    return int(value)
-
-
-def _prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Scenario, Path]":
-    """The checked scenario and the folder for the results; the backend is configured on the way."""
-    from ptsmc_jax import schema
-
-    raw = schema.load(scenario) if scenario is not None else {}
-    from ptsmc_jax.configure import configure
-
-    configure()
-    from ptsmc_jax.scenario import from_tables
-
-    name = scenario.stem if scenario is not None else "default"
-    return from_tables(raw), out if out is not None else Path("out") / f"{command}-{name}"
 
 
 def _with_tune(scenario: "Scenario") -> "Scenario":

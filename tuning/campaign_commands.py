@@ -1,0 +1,208 @@
+"""The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tuning import show, show_campaign
+from tuning.options import (
+    INTERRUPTED,
+    Figures,
+    Force,
+    Out,
+    Quiet,
+    ScenarioFile,
+    Seed,
+    UsageError,
+    between,
+    prepare,
+    whole,
+)
+
+MOST = 2**32  # trials: their numbers have 32 bits
+
+CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
+Certificate = Annotated[Path | None, Parameter(help="TLS certificate file of the cluster.")]
+
+
+def montecarlo(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    trials: Annotated[str, Parameter(help="Trials, a whole number from 1 to 4294967296.")] = "10000",
+    seed: Seed = "0",
+    out: Out = None,
+    until_confident: Annotated[
+        str | None,
+        Parameter(help="Stop once every requirement's share is known to within this width, a number between 0 and 1."),
+    ] = None,
+    metrics: Annotated[
+        str | None, Parameter(help="FILE.py:NAME of a function that adds metrics of your own to the rows.")
+    ] = None,
+    shard: Annotated[
+        str, Parameter(help="I/N: fly the I-th of N shares only, for batch queues; they may share a folder.")
+    ] = "1/1",
+    cluster: Annotated[
+        str | None, Parameter(help="Fly on a Dask cluster: address or scheduler file; or local:N, N processes here.")
+    ] = None,
+    tls_ca: Certificate = None,
+    tls_cert: Certificate = None,
+    tls_key: Certificate = None,
+    dry_run: Annotated[
+        bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
+    ] = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly a campaign: many trials of a scenario, every one counted, kept and replayable.
+
+    Interrupted or killed, the same command goes on from there; with more trials it adds to what is there.
+
+    Exit status: 0 done and every requirement met (without any: no trial failed), 1 done but not so, 2 bad input or a
+    full disk, 130 interrupted.
+    """
+    count, key = whole("--trials", trials, 1, MOST), whole("--seed", seed)
+    width = None if until_confident is None else between("--until-confident", until_confident, 0.0, 1.0)
+    share = _shard(shard)
+    tls = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
+    tls = {name: str(path) for name, path in tls.items() if path is not None}
+    if tls and cluster is None:
+        raise UsageError("--tls-ca, --tls-cert and --tls-key go with --cluster only")
+    if width is not None and (share != (1, 1) or dry_run):
+        raise UsageError("--until-confident looks at all rows, and does not go with --shard or --dry-run")
+    if cluster is not None and (share != (1, 1) or dry_run):
+        raise UsageError("--cluster does not go with --shard or --dry-run")
+    loaded, path = prepare(scenario, "montecarlo", out)
+    if width is not None and not loaded.requirements:
+        raise UsageError("--until-confident needs [requirements] in the scenario, whose shares it looks at")
+    from tuning import campaign_folder, campaign_summary
+
+    folder = campaign_folder.Folder(path, loaded, key, count, metrics)
+    _ = folder.campaign  # what it refuses, it refuses before anything is written
+    if cluster is not None:
+        from ptsmc_jax import cluster as clusters
+
+        elsewhere = clusters.connected(cluster, tls)
+    else:
+        elsewhere = None
+    campaign_folder.begin(folder, force)
+    try:
+        with show_campaign.Progress(quiet) as told:
+            if dry_run:
+                campaign_folder.write_plan(folder, told)
+            elif width is not None:
+                stopped = campaign_summary.until_confident(
+                    folder, width, lambda first: campaign_folder.fly(folder, share, told, elsewhere, first)
+                )
+                folder = campaign_folder.settle(folder, stopped)
+            else:
+                campaign_folder.fly(folder, share, told, elsewhere)
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        if elsewhere is not None:
+            elsewhere.close()
+    if dry_run or share != (1, 1):
+        if not quiet:
+            show_campaign.share_done(folder, share, planned=dry_run)
+        return 0
+    return _summarised(folder, quiet, figures)
+
+
+def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
+    """Verdicts, quantiles with intervals and figures of a campaign, from its rows.
+
+    Exit status: 0 every requirement met (without any: no trial failed), 1 not so or not all trials flown yet, 2 bad
+    input, among it rows that are damaged.
+    """
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from tuning import campaign_folder
+
+    return _summarised(campaign_folder.opened(folder), quiet, figures)
+
+
+def worst(
+    folder: CampaignFolder,
+    /,
+    *,
+    by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
+    n: Annotated[str, Parameter(name=["--n", "-n"], help="Trials, a whole number from 1 to 10000.")] = "5",
+    quiet: Quiet = False,
+) -> int:
+    """The worst trials of a campaign, failed ones first; leaves worst.csv in its folder.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    count = whole("--n", n, 1, 10_000)
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from ptsmc_jax import store
+    from tuning import campaign_folder, campaign_summary
+
+    frame = campaign_summary.worst(campaign_folder.opened(folder), by, count)
+    store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
+    if not quiet:
+        show_campaign.worst(frame, by, folder)
+    return 0
+
+
+def replay(
+    folder: CampaignFolder,
+    /,
+    *,
+    trial: Annotated[str, Parameter(help="Number of the trial.")],
+    out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly one trial of a campaign again, with its whole history, and compare it with its row.
+
+    Exit status: 0 the run equals its row to 1e-12 (or has none yet), 1 it does not, 2 bad input.
+    """
+    number = whole("--trial", trial)
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from ptsmc_jax import store
+    from tuning import campaign_folder, campaign_summary, single
+
+    opened = campaign_folder.opened(folder)
+    if number >= opened.trials:
+        raise UsageError(f"--trial is {number}, but must be a whole number from 0 to {opened.trials - 1}")
+    place = out if out is not None else folder / "replay" / str(number)
+    store.check(place, force or out is None)  # a replay of the same trial is the same
+    run, off = campaign_summary.replay(opened, number)
+    store.write(place, lambda making: single.write(making, opened.scenario, run, opened.seed, number, figures))
+    if not quiet:
+        show.run(run, place)
+        show_campaign.replayed(off)
+    return 0 if off is None or off <= campaign_summary.SAME else 1
+
+
+def _summarised(folder, quiet: bool, figures: bool) -> int:
+    from tuning import campaign_summary
+
+    found = campaign_summary.summarise(folder)
+    campaign_summary.write_summary(folder, found, figures)
+    if not quiet:
+        show_campaign.campaign(found, folder.path)
+    return 0 if found["status"] == "met" else 1
+
+
+def _shard(value: str) -> tuple[int, int]:
+    number, _, of = value.partition("/")
+    try:
+        share = int(number), int(of)
+    except ValueError:
+        share = (0, 0)
+    if not 1 <= share[0] <= share[1]:
+        raise UsageError(f"--shard is {value}, but must be I/N with I from 1 to N")
+    return share

@@ -1,0 +1,178 @@
+"""Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ptsmc_jax import campaign as flying
+from ptsmc_jax import rows, scenario, schema, store, systems
+from ptsmc_jax.campaign import Campaign, Tally, Wanted
+from ptsmc_jax.rows import Part, Rows
+from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.store import RefusedError
+from ptsmc_jax.tables import Scenario
+
+OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A campaign and where it is kept."""
+
+    path: Path
+    scenario: Scenario
+    seed: int
+    trials: int  # that it is to have
+    own: str | None = None  # where the function stands that makes metrics of one's own
+
+    @cached_property
+    def told(self) -> dict[str, Any]:
+        """By what a campaign is known again."""
+        more = {} if self.own is None else {"metrics": self.own, **systems.source(self.own, "metrics_sha256")}
+        system = systems.source(getattr(self.scenario.plant, "system", None))
+        return {"command": "montecarlo", "seed": self.seed, **more, **system}
+
+    @cached_property
+    def rows(self) -> Rows:
+        """Its rows."""
+        return Rows(self.path / rows.FOLDER, self._key)
+
+    @cached_property
+    def plan(self) -> Rows:
+        """What its trials fly with, written without flying them."""
+        return Rows(self.path / "plan", self._key)
+
+    @property
+    def _key(self) -> bytes:
+        return rows.key_of(schema.dump(self.scenario), self.told)
+
+    @cached_property
+    def campaign(self) -> Campaign:
+        """What is flown; raises ScenarioError where the metrics of one's own are none."""
+        if self.own is not None:
+            try:
+                own: Any = systems.item(self.own, OWN)
+                if not isinstance(own, Callable):
+                    raise ValueError(f"it is a {type(own).__name__}; allowed is {OWN}")
+                made = Campaign(scenario.study(self.scenario), self.seed, own)
+                made.own_names()
+                return made
+            except ValueError as error:
+                raise ScenarioError(f"--metrics is {self.own}: {error}") from None
+        return Campaign(scenario.study(self.scenario), self.seed)
+
+    def recipe(self) -> tuple[Callable, str]:
+        """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
+        return made_again, str(self.path.resolve())
+
+    def whole_parts(self) -> list[Part]:
+        """Its parts; raises RefusedError where one is damaged, or there is none."""
+        parts, broken = self.rows.parts()
+        if broken:
+            raise RefusedError(
+                f"{broken[0]} is damaged or of another campaign; "
+                "`ptsmc montecarlo` with the same options flies it again"
+            )
+        if not parts:
+            raise RefusedError(f"{self.path} holds no trials yet; `ptsmc montecarlo` flies them")
+        return parts
+
+
+def begin(wanted: Folder, force: bool) -> None:
+    """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
+    tables, path = schema.dump(wanted.scenario), wanted.path
+    versions = store.versions(**wanted.told, trials=wanted.trials)
+    if force and path.is_dir():
+        for kept in (wanted.rows, wanted.plan):
+            for file in kept.folder.glob("*.parquet"):
+                file.unlink()
+    else:
+        store.check(path, force=True)
+        there = path.is_dir() and any(path.iterdir())
+        known = {name: versions[name] for name in (*wanted.told, *store.PACKAGES)}
+        other = store.difference(path, tables, known) if there else None
+        if other is not None:
+            raise RefusedError(
+                f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew"
+            )
+        if there:
+            before = opened(path)
+            if before.trials > wanted.trials:
+                raise RefusedError(
+                    f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
+                )
+            if before.trials == wanted.trials:
+                return
+
+    def fill(making: Path) -> None:
+        store.write_toml(making / "scenario.toml", tables)
+        store.write_json(making / "versions.json", versions)
+
+    store.write(path, fill)
+
+
+def opened(path: Path) -> Folder:
+    """The campaign of a folder; raises RefusedError where there is none."""
+    try:
+        told = json.loads((path / "versions.json").read_text())
+        if told["command"] != "montecarlo":
+            raise RefusedError(
+                f"{path} holds results of `ptsmc {told['command']}`, but must be one of `ptsmc montecarlo`"
+            )
+        return Folder(path, scenario.read(path / "scenario.toml"), told["seed"], told["trials"], told.get("metrics"))
+    except (OSError, ValueError, KeyError) as error:
+        if isinstance(error, RefusedError):
+            raise
+        raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
+
+
+def made_again(path: str) -> tuple[Campaign, Rows]:
+    """Campaign and rows of a folder, on a worker that shares it."""
+    folder = opened(Path(path))
+    return folder.campaign, folder.rows
+
+
+def fly(
+    folder: Folder,
+    shard: tuple[int, int],
+    report: Callable[[Tally], None],
+    elsewhere: Callable[[Folder, list[Wanted]], Iterator[tuple[Part, int]]] | None = None,
+    trials: int | None = None,
+) -> None:
+    """Fly what is missing of the first `trials` trials (all, if None).
+
+    What is damaged is named, set aside and flown again. elsewhere: flies parts on other machines.
+    """
+    trials = folder.trials if trials is None else trials
+    for path in folder.rows.parts()[1]:
+        aside = path.with_name(path.name + ".damaged")
+        os.replace(path, aside)
+        print(f"ptsmc: {path} is damaged and is flown again; it is kept as {aside.name}", file=sys.stderr)
+    alone = shard == (1, 1) and elsewhere is None
+    if alone:  # others may be writing otherwise
+        folder.rows.tidy()
+    parts, _ = folder.rows.parts()
+    wanted = flying.missing(parts, trials, shard)
+    made = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
+    flying.follow(made, flying.tally(parts, trials), report)
+    if alone:
+        folder.rows.tidy()
+
+
+def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
+    """Write what each trial flies with, without flying it."""
+    folder.plan.tidy()
+    parts, _ = folder.plan.parts()
+    made = flying.here(folder.campaign.draw, folder.plan, flying.missing(parts, folder.trials))
+    flying.follow(made, Tally(sum(part.count for part in parts), folder.trials, 0), report)
+
+
+def settle(folder: Folder, trials: int) -> Folder:
+    """The campaign as one of so many trials."""
+    store.write_json(folder.path / "versions.json", store.versions(**folder.told, trials=trials))
+    return opened(folder.path)

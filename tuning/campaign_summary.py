@@ -1,0 +1,209 @@
+"""What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ptsmc_jax import campaign as flying
+from ptsmc_jax import campaign_plots as plots
+from ptsmc_jax import drawing, metrics, rows, runs, schema, statistics, store
+from ptsmc_jax.requirements import Requirement, Verdict
+from ptsmc_jax.rollout import FINISHED, STATUS
+from ptsmc_jax.store import RefusedError
+from tuning.campaign_folder import Folder
+
+SAME = 1e-12  # how far a replayed run may be off its row, relative
+CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
+QUANTILES = (0.5, 0.9, 0.99, 0.9973)
+SEARCHED = 100_000  # trials by which it is judged what drives a metric
+DRAWN = 1000  # trials whose histories are drawn
+POINTS = 5000  # trials in a figure of points
+
+
+def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
+    """Fly ever more trials until every requirement's share is known to within `width`; returns how many.
+
+    Looked at after each doubling. The intervals are those of a campaign whose size was fixed beforehand: looking
+    often, and stopping by what is seen, makes them a little too sure.
+    """
+    count = min(flying.PART, folder.trials)
+    while True:
+        fly_first(count)
+        widths = [high - low for low, high in (v["share_interval"] for v in judged(folder, first=count)[1])]
+        if count == folder.trials or all(w <= width for w in widths):
+            return count
+        count = min(2 * count, folder.trials)
+
+
+def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
+    """Verdicts over the trials (the first so many), and what `summary.json` says of each."""
+    wanted = tuple(folder.campaign.ready.requirements)
+    names = dict.fromkeys(r.metric for r in wanted)
+    frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
+    finished = _finished(frame)
+    verdicts = [r.verdict(frame[r.metric].to_numpy(), finished) for r in wanted]
+    return verdicts, [_told(v, r) for v, r in zip(verdicts, wanted, strict=True)]
+
+
+def _finished(frame: pl.DataFrame) -> np.ndarray:
+    return frame["status"].is_in([STATUS[code][0] for code in FINISHED]).to_numpy()
+
+
+def _told(verdict: Verdict, wanted: Requirement) -> dict[str, Any]:
+    within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
+    told = {
+        **msgspec.to_builtins(verdict),
+        "met": verdict.met,
+        "share": within / verdict.trials,
+        "share_interval": statistics.share_interval(within, verdict.trials, CONFIDENCE),
+        "share_bound": statistics.share_bound(within, verdict.trials, confidence),
+    }
+    if wanted.quantile is not None and wanted.confidence is not None:
+        told["fewest_trials"] = statistics.fewest_for(verdict.failures, wanted.quantile, wanted.confidence)
+    return told
+
+
+def summarise(folder: Folder) -> dict[str, Any]:
+    """What `summary.json` says."""
+    parts = folder.whole_parts()
+    _, told = judged(folder)
+    head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
+    counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
+    finished, failed = _finished(head), head.filter(pl.col("status") != "ok")
+    reasons = [
+        {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
+        for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
+    ]
+    found, drivers = {}, {}
+    names = list(pl.read_parquet_schema(parts[0].path))
+    drawn = names[names.index("initial_angle") :]
+    own = folder.campaign.own_names()
+    drawn = [name for name in drawn if name not in own]
+    inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
+    for name in (*folder.campaign.ready.catalogue, *own):
+        values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
+        found[name] = _of_metric(values, finished)
+        driven = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
+        of = {key: inputs[key].to_numpy()[driven] for key in drawn}
+        drivers[name] = statistics.drivers(of, values[:SEARCHED][driven]) if driven.sum() > 1 else {}
+    done = int(head.height)
+    met = all(v["met"] for v in told) if told else counts["ok"] == done
+    return {
+        "status": "unfinished" if done < folder.trials else "met" if met else "not met",
+        "plant": folder.scenario.plant.kind,
+        "seed": folder.seed,
+        "trials": folder.trials,
+        "flown": done,
+        "counts": counts,
+        "reasons": reasons,
+        "interval_confidence": CONFIDENCE,
+        "verdicts": told,
+        "quantiles": found,
+        "drivers": drivers,
+    }
+
+
+def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
+    """Statistics of a metric: mean, RMS and largest of the trials that have it, quantiles over all trials.
+
+    In the quantiles a trial without a value counts as beyond all others: it is not left out.
+    """
+    has = finished & np.isfinite(values)
+    known, ordered = values[has], np.sort(np.where(has, values, np.inf))
+    told: dict[str, Any] = {"without_value": int(values.size - known.size)}
+    if known.size:
+        told |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
+    for quantile in QUANTILES:
+        low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
+        told[str(quantile)] = {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
+    return told
+
+
+def write_summary(folder: Folder, found: dict[str, Any], figures: bool) -> None:
+    """Write the summary and the figures into the campaign's folder."""
+
+    def fill(making: Path) -> None:
+        store.write_json(making / "summary.json", found)
+        if figures:
+            drawing.save(_figures(folder, found), making / "figures")
+
+    store.write(folder.path, fill)
+
+
+def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
+    """The rows of the worst trials by a metric, failed ones first."""
+    parts = folder.whole_parts()
+    names = list(pl.read_parquet_schema(parts[0].path))
+    allowed = [name for name in names if name not in ("trial", "status", "reason", "bad_time")]
+    if by not in allowed:
+        raise RefusedError(
+            f"--by is {by}, which the rows do not have; the nearest one is {schema.nearest(by, allowed)}"
+        )
+    frame = rows.read(parts, [by, "status"]).head(folder.trials)
+    failed = ~_finished(frame)
+    chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)
+    return rows.read(parts).head(folder.trials)[chosen]
+
+
+def replay(folder: Folder, trial: int) -> tuple[runs.Run, float | None]:
+    """A trial's run in full, and how far its metrics are off its row's, relative; None: it has no row."""
+    run = runs.fly(folder.campaign.ready, folder.seed, trial)
+    there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
+    if not there:
+        return run, None
+    row = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial).row(0, named=True)
+    off = 0.0
+    for name, value in run.metrics.items():
+        kept = np.nan if row[name] is None else row[name]
+        if not (np.isnan(value) and np.isnan(kept)):
+            off = max(off, abs(value - kept) / max(abs(kept), 1e-300)) if value != kept else off
+    return run, off if row["status"] == run.status else np.inf
+
+
+def _figures(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
+    parts, ready, kind = folder.whole_parts(), folder.campaign.ready, folder.scenario.plant.kind
+    limits = {r.metric: r.limit for r in ready.requirements}
+    names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
+    finished = _finished(frame)
+    made: dict[str, Any] = {}
+    shown = np.arange(min(DRAWN, frame.height))
+    t, error = flying.history(folder.campaign, shown.astype(np.uint32))
+    window = frame["window_error"].to_numpy()
+    if finished.any():
+        hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+        _, course = flying.history(folder.campaign, np.asarray([frame["trial"][hardest]], dtype=np.uint32))
+        made["fan"] = plots.fan(
+            t, error[finished[: shown.size]], (hardest, course[0]), ready.scenario.controller.t_f, kind
+        )
+        units = {name: metrics.CATALOGUES[kind].get(name, ("",))[0] for name in names}
+        made["distributions"] = plots.distributions(
+            {
+                name: (units[name], np.where(finished, frame[name].to_numpy(), np.nan), limits.get(name))
+                for name in names
+            }
+        )
+    outcome = frame["status"].to_numpy().astype(object)
+    for metric, limit in limits.items():
+        outcome[(outcome == "ok") & ~(frame[metric].to_numpy() <= limit)] = plots.BEYOND
+    totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
+    bad, good = np.flatnonzero(outcome != "ok")[: POINTS // 2], np.flatnonzero(outcome == "ok")
+    some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
+    made["torque_by_angle"] = plots.torque_by_angle(
+        frame["initial_angle"].to_numpy()[some],
+        frame["peak_torque"].to_numpy()[some],
+        outcome[some],
+        totals,
+        limits.get("peak_torque"),
+        kind,
+    )
+    driving = sorted(found["drivers"].get("window_error", {}).items(), key=lambda item: -item[1]["first_order"])
+    varied = [name for name, _ in driving][:4]
+    if len(varied) >= 2:
+        inputs = rows.read(parts, varied)[some]
+        made["inputs"] = plots.pairs({name: inputs[name].to_numpy() for name in varied}, outcome[some], totals)
+    return made

@@ -1,0 +1,56 @@
+"""What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from ptsmc_jax.tables import Scenario
+
+ScenarioFile = Annotated[
+    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
+]
+Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME.")]
+Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
+Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
+Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
+Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
+
+INTERRUPTED = 130  # exit status
+
+
+class UsageError(ValueError):
+    """An option that cannot be followed. Its text is one sentence."""
+
+
+def whole(option: str, value: str, least: int = 0, most: int = 2**32 - 1) -> int:
+    """A whole number."""
+    if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
+        raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
+    return int(value)
+
+
+def between(option: str, value: str, least: float, most: float) -> float:
+    """A number between two others."""
+    try:
+        found = float(value)
+    except ValueError:
+        found = float("nan")
+    if not least < found < most:
+        raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
+    return found
+
+
+def prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Scenario, Path]":
+    """The checked scenario and the folder for the results; the backend is configured on the way."""
+    from ptsmc_jax import schema
+
+    raw = schema.load(scenario) if scenario is not None else {}
+    from ptsmc_jax.configure import configure
+
+    configure()
+    from ptsmc_jax.scenario import from_tables
+
+    name = scenario.stem if scenario is not None else "default"
+    return from_tables(raw), out if out is not None else Path("out") / f"{command}-{name}"

@@ -1,0 +1,135 @@
+"""What the commands of a campaign print."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from ptsmc_jax.requirements import verdict_text
+
+WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
+
+
+class Progress:
+    """A progress bar on the error stream: trials, trials a second, failures so far, time left; silent if told to be."""
+
+    def __init__(self, quiet: bool):
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(20),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._task = self._bar.add_task("compiling", total=None)
+        self._started: tuple[float, int] | None = None
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, standing: Any) -> None:
+        """standing: a `campaign.Tally`."""
+        now = time.monotonic()
+        if self._started is None:
+            self._started = now, standing.done
+        since, before = self._started
+        rate = (standing.done - before) / (now - since) if standing.done > before else 0.0
+        text = f"{standing.done} of {standing.total} trials"
+        text += f", {rate:,.0f} a second" if rate else ""
+        text += f", {standing.failed} failed or missed" if standing.failed else ""
+        self._bar.update(self._task, completed=standing.done, total=standing.total, description=text)
+
+
+def campaign(found: dict[str, Any], folder: Path) -> None:
+    """Counts, quantiles and verdicts, as `summary.json` says."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from ptsmc_jax.metrics import CATALOGUES
+
+    console = Console(highlight=False)
+    if found["status"] == "unfinished":
+        console.print(f"NOT finished: {found['flown']} of {found['trials']} trials are flown", soft_wrap=True)
+    counts = ", ".join(f"{count} {status}" for status, count in found["counts"].items() if count)
+    console.print(f"{found['flown']} trials of seed {found['seed']}: {counts}", soft_wrap=True)
+    for reason in found["reasons"]:
+        first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
+        console.print(f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}", soft_wrap=True)
+    table = Table("", "median", "99.73 %", "95 % interval", "largest", "unit", box=None, pad_edge=False)
+    for name, told in found["quantiles"].items():
+        far = told["0.9973"]
+        between = f"{_number(far['low'])}..{_number(far['high'])}"
+        cells = (told["0.5"]["value"], far["value"])
+        unit = CATALOGUES[found["plant"]].get(name, ("",))[0]
+        table.add_row(name, *(_number(v) for v in cells), between, _number(told.get("max")), unit)
+    console.print(table)
+    for verdict in found["verdicts"]:
+        console.print(_verdict(verdict), soft_wrap=True)
+    for name in dict.fromkeys(("window_error", *(v["metric"] for v in found["verdicts"]))):
+        driven = [item for item in found["drivers"].get(name, {}).items() if max(map(abs, item[1].values())) >= WEAK]
+        driven = sorted(driven, key=lambda item: -max(map(abs, item[1].values())))[:3]
+        if driven:
+            said = (f"{key} {d['rank_correlation']:+.2f} ({100 * d['first_order']:.0f} %)" for key, d in driven)
+            text = f"{name} goes with {', '.join(said)}: rank correlation (share of the variance)"
+            console.print(text, soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)
+
+
+def _number(value: float | None) -> str:
+    if value is None or value != value:
+        return "-"
+    return "none" if value in (float("inf"), float("-inf")) else f"{value:.3g}"
+
+
+def _verdict(told: dict[str, Any]) -> str:
+    fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
+    text = verdict_text(**{field: told[field] for field in fields})
+    low, high = told["share_interval"]
+    text += f"; within it {100 * told['share']:.6g} % (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
+    if told["quantile"] is not None and told["confidence"] is not None:
+        text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
+        text += f"; with so many failures {told['fewest_trials']} trials would do"
+    return text
+
+
+def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
+    """A share of a campaign, or its plan, is done."""
+    if planned:
+        print(f"plan of {folder.trials} trials in {folder.plan.folder}; nothing was flown")
+        return
+    parts, _ = folder.rows.parts()
+    there = sum(part.count for part in parts)
+    print(f"shard {share[0]}/{share[1]} done: {there} of {folder.trials} trials are in {folder.path}")
+    print("when all are there, in this folder or gathered into one: ptsmc summarize DIR")
+
+
+def worst(frame: Any, by: str, folder: Path) -> None:
+    """The worst trials."""
+    from rich.console import Console
+    from rich.table import Table
+
+    wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
+    names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
+    table = Table(*names, box=None, pad_edge=False)
+    for row in frame.select(names).iter_rows():
+        table.add_row(*("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
+    console = Console(highlight=False)
+    console.print(table)
+    one = f"ptsmc replay {folder} --trial {frame['trial'][0]}"
+    console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
+
+
+def replayed(off: float | None) -> None:
+    """How far a replayed run is off its row."""
+    if off is None:
+        print("the campaign has no row of this trial yet")
+    else:
+        print("equal to its row, to the last digit" if off == 0.0 else f"off its row by {off:.1e} at most, relative")
