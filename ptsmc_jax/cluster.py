@@ -36,7 +36,7 @@ class Cluster:
         recipe, rows = folder.recipe(), folder.rows
         futures = [self._client.submit(_fly, recipe, *part, pure=False, retries=0) for part in wanted]
         try:
-            for future in as_completed(futures):
+            for future in as_completed(futures, loop=self._client.loop):
                 error = future.exception()
                 if error is not None:
                     raise RefusedError(f"a worker of the cluster failed: {_sentence(error)}")

@@ -50,7 +50,7 @@ class Rows:
     def put(self, first: int, count: int, content: bytes) -> Part:
         """The same from a file's content; raises OSError where it does not fit on the disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(content)}.parquet"
+        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
         handle, name = tempfile.mkstemp(prefix=_MAKING, dir=self.folder)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -69,10 +69,11 @@ class Rows:
         whole, broken = [], []
         for path in sorted(self.folder.glob("*.parquet")):
             named = _NAME.fullmatch(path.name)
-            if named is None or self._digest(path.read_bytes()) != named[3]:
+            first, count = (int(named[1]), int(named[2]) - int(named[1]) + 1) if named else (0, 0)
+            if named is None or self._digest(first, count, path.read_bytes()) != named[3]:
                 broken.append(path)
                 continue
-            whole.append(Part(int(named[1]), int(named[2]) - int(named[1]) + 1, path))
+            whole.append(Part(first, count, path))
         kept: list[Part] = []
         for part in sorted(whole, key=lambda p: (p.first, -p.count)):
             if not kept or part.first >= kept[-1].end:
@@ -88,8 +89,10 @@ class Rows:
             if path not in kept and _NAME.fullmatch(path.name):
                 path.unlink(missing_ok=True)
 
-    def _digest(self, content: bytes) -> str:
-        return hashlib.blake2b(content, digest_size=16, key=self.key).hexdigest()
+    def _digest(self, first: int, count: int, content: bytes) -> str:
+        found = hashlib.blake2b(content, digest_size=16, key=self.key)
+        found.update(f"{first}+{count}".encode())
+        return found.hexdigest()
 
 
 def key_of(scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bytes:

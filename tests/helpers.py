@@ -8,6 +8,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import polars as pl
+from polars.testing import assert_frame_equal
 
 from ptsmc_jax import clock, controllers, observers, plants, sensors, signals
 from ptsmc_jax.rollout import Parts
@@ -178,3 +180,11 @@ def small_search(monkeypatch, fresh=40):
         *((optimise, name, value) for name, value in small.items()),
     ):
         monkeypatch.setattr(module, name, value)
+
+
+def same(one, other):
+    """Whole numbers and words the same, others to 1e-12 of their size, as every way to fly must give them."""
+    assert one.columns == other.columns
+    assert_frame_equal(one.select(pl.exclude(pl.Float64)), other.select(pl.exclude(pl.Float64)))
+    for name in one.select(pl.col(pl.Float64)).columns:
+        np.testing.assert_allclose(one[name].to_numpy(), other[name].to_numpy(), rtol=1e-12, atol=1e-300, err_msg=name)

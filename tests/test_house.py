@@ -43,8 +43,9 @@ FLOORS = {
         pace
         scenario
         montecarlo runs
-        store remark_2 drawing
-        plotting study_plots
+        store remark_2 drawing rows statistics
+        plotting study_plots campaign_plots campaign
+        cluster
         paper
         slips
     """,
@@ -57,8 +58,10 @@ FLOORS = {
         optimise
         evolution
         report single reproduction mapping
-        results pareto
-        show
+        results pareto campaign_folder
+        campaign_summary
+        show show_campaign options
+        campaign_commands
         cli table
     """,
 }

@@ -4,8 +4,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ptsmc_jax.requirements import verdict_text
-
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
 
@@ -90,6 +88,8 @@ def _number(value: float | None) -> str:
 
 
 def _verdict(told: dict[str, Any]) -> str:
+    from ptsmc_jax.requirements import verdict_text
+
     fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
     text = verdict_text(**{field: told[field] for field in fields})
     low, high = told["share_interval"]

@@ -1,0 +1,174 @@
+import tomllib
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax import campaign, montecarlo, rows, runs, scenario
+from tests.helpers import SHORT, same
+
+TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
+
+
+@pytest.fixture(scope="module")
+def flown():
+    made = campaign.Campaign(scenario.study(scenario.from_tables(TABLES)), 3)
+    return made, made.fly(0, 300)
+
+
+def test_a_row_says_everything_of_its_trial(flown):
+    made, frame = flown
+    assert frame.columns[:4] == ["trial", "status", "reason", "bad_time"]
+    assert frame.columns[4 : 4 + len(made.ready.catalogue)] == list(made.ready.catalogue)
+    assert frame.columns[4 + len(made.ready.catalogue) :] == [
+        "initial_angle", *(f"initial_q{k}" for k in range(1, 5)), *(f"initial_w{k}" for k in range(1, 4))
+    ]  # fmt: skip
+    assert frame["trial"].to_list() == list(range(300))
+    assert frame["bad_time"].null_count() == 300
+    run = runs.fly(made.ready, 3, 250)
+    for name, value in run.metrics.items():
+        row = frame[name][250]
+        assert row is None if np.isnan(value) else row == pytest.approx(value, rel=1e-12), name
+
+
+@pytest.mark.parametrize(("first", "count"), [(0, 1), (7, 63), (44, 256)])
+def test_rows_do_not_depend_on_the_parts(flown, first, count):
+    made, frame = flown
+    same(made.fly(first, count), frame[first : first + count])
+
+
+@pytest.mark.parametrize(("block", "capacity", "devices"), [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)])
+def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, capacity, devices):
+    made, frame = flown
+    monkeypatch.setattr(montecarlo, "CAPACITY", capacity)
+    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=block))
+    found = jax.local_devices()[:devices]
+    monkeypatch.setattr(jax, "local_devices", lambda: found)
+    same(made.fly(0, 300), frame)
+
+
+def test_the_plan_is_what_is_flown(flown):
+    made, frame = flown
+    plan = made.draw(0, 300)
+    assert plan.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
+    same(plan, frame.select(plan.columns))
+
+
+def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
+    """Gains beyond what the period allows: a third of the trials comes upon the law's singularity, or tumbles."""
+    wild = scenario.replace(scenario.from_tables(TABLES), controller__eta=8.75, controller__delta=0.1)
+    made = campaign.Campaign(scenario.study(wild), 0)
+    frame = made.fly(0, 600)
+    bad = frame.filter(pl.col("status").is_in(["diverged", "singular"]))
+    assert 0.2 < bad.height / 600 < 0.5
+    assert {"singular", "diverged"} == set(bad["status"])
+    assert bad["bad_time"].null_count() == 0
+    assert bad["bad_time"].is_between(0.0, 6.5).all()
+    assert "" not in set(bad["reason"])
+    good = frame.filter(~pl.col("status").is_in(["diverged", "singular"]))
+    alone = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, good["trial"].to_numpy())
+    for name in made.ready.catalogue:
+        got = getattr(alone.metrics, name)
+        np.testing.assert_array_equal(np.isnan(got), good[name].is_null().to_numpy())
+        known = ~np.isnan(got)
+        # the loop is unstable there: what rounding differs by grows with it, but the same program flies both
+        np.testing.assert_array_equal(got[known], good[name].to_numpy()[known], err_msg=name)
+
+
+def test_what_is_missing():
+    part, nowhere = rows.Part, Path()
+    full = campaign.PART
+    assert campaign.missing([], 10) == [(0, 10)]
+    assert campaign.missing([], 2 * full + 1) == [(0, full), (full, full), (2 * full, 1)]
+    there = [part(0, full, nowhere), part(2 * full, 1, nowhere)]
+    assert campaign.missing(there, 2 * full + 1) == [(full, full)]
+    assert campaign.missing(there, 3 * full) == [(full, full), (2 * full, full)]  # more trials: its last part again
+    shares = [campaign.missing([], 7 * full, (k, 3)) for k in (1, 2, 3)]
+    assert sorted(chain(*shares)) == campaign.missing([], 7 * full)
+    assert [len(share) for share in shares] == [3, 2, 2]
+
+
+def test_parts_are_written_while_others_are_flown(flown, tmp_path, monkeypatch):
+    made, frame = flown
+    monkeypatch.setattr(campaign, "PART", 100)
+    kept = rows.Rows(tmp_path / "trials", b"k")
+    seen = []
+    campaign.follow(
+        campaign.here(made.fly, kept, campaign.missing([], 300)),
+        campaign.tally([], 300),
+        lambda standing: seen.append((standing.done, standing.total, standing.failed)),
+    )
+    assert seen == [(0, 300, 0), (100, 300, 0), (200, 300, 0), (300, 300, 0)]
+    same(rows.read(kept.parts()[0]), frame)
+
+
+def test_what_was_flown_is_kept_when_a_part_fails(flown, tmp_path, monkeypatch):
+    made, _ = flown
+    monkeypatch.setattr(campaign, "PART", 100)
+    kept = rows.Rows(tmp_path / "trials", b"k")
+
+    def make(first, count):
+        if first == 200:
+            raise KeyboardInterrupt
+        return made.fly(first, count)
+
+    with pytest.raises(KeyboardInterrupt):
+        campaign.follow(campaign.here(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None)
+    assert [part.first for part in kept.parts()[0]] == [0, 100]
+
+
+def test_failures_are_tallied(flown, tmp_path):
+    _, frame = flown
+    kept = rows.Rows(tmp_path / "trials", b"k")
+    worse = frame.with_columns(
+        status=pl.when(pl.col("trial") % 3 == 0).then(pl.lit("diverged")).otherwise(pl.col("status"))
+    )
+    kept.write(0, worse)
+    assert campaign.tally(kept.parts()[0], 900) == campaign.Tally(300, 900, 100)
+
+
+def overshoot(result, parts):
+    error = jnp.sqrt(jnp.sum(result.log.error**2, axis=-1))
+    late = result.log.t > parts.controller.t_f
+    return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.lasts)}
+
+
+def test_metrics_of_ones_own_stand_in_the_rows(flown):
+    made, frame = flown
+    own = replace(made, own=overshoot)
+    assert own.own_names() == ["overshoot", "rows"]
+    more = own.fly(0, 100)
+    same(more.drop("overshoot", "rows"), frame[:100])
+    log = runs.fly(made.ready, 3, 42).log
+    after = np.linalg.norm(log.error, axis=1)[log.t > 5.0].max()
+    assert more["overshoot"][42] == pytest.approx(after, rel=1e-12)
+    assert more["rows"][42] == len(log.t)
+
+
+@pytest.mark.parametrize(
+    ("made_of", "said"),
+    [
+        (lambda result, parts: jnp.zeros(()), "named numbers"),
+        (lambda result, parts: {"x": result.log.t}, "its x is no single number"),
+        (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
+        (lambda result, parts: {}, "named numbers"),
+    ],
+)
+def test_metrics_that_no_row_can_hold_are_refused(flown, made_of, said):
+    with pytest.raises(ValueError, match=said):
+        replace(flown[0], own=made_of).own_names()
+
+
+def test_histories_are_those_of_the_runs(flown):
+    made, _ = flown
+    t, error = campaign.history(made, np.array([3, 250], dtype=np.uint32))
+    for k, trial in enumerate((3, 250)):
+        log = runs.fly(made.ready, 3, trial).log
+        np.testing.assert_allclose(t, log.t, rtol=1e-14)
+        np.testing.assert_allclose(error[k], np.linalg.norm(log.error, axis=1), rtol=1e-9)

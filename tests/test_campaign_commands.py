@@ -1,0 +1,310 @@
+"""`ptsmc montecarlo`, `summarize`, `worst` and `replay` as a user calls them."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax import campaign
+from tests.helpers import same
+
+FOLDER = "out/montecarlo-s"
+OVERSHOOT = """
+import jax.numpy as jnp
+
+def overshoot(result, parts):
+    error = jnp.sqrt(jnp.sum(result.log.error ** 2, axis=-1))
+    return {"overshoot": jnp.max(jnp.where(result.log.t > parts.controller.t_f, error, 0.0))}
+
+nothing = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small_parts(monkeypatch):
+    monkeypatch.setattr(campaign, "PART", 100)
+
+
+def rows_of(folder):
+    return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture
+def flown(command, tmp_path):
+    """A campaign of 250 trials that meets its requirement."""
+    assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet") == (0, "", "")
+    return tmp_path / FOLDER
+
+
+def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
+    folder = tmp_path / FOLDER
+    assert code == 0
+    assert "250 trials of seed 3: 250 ok" in said
+    assert "peak_torque at most 30 N m: worst" in said
+    assert "within it 100 % (95 %: 98.5353 to 100 %)" in said  # 0.025^(1/250)
+    names = {"scenario.toml", "versions.json", "summary.json", "trials", "figures"}
+    assert {path.name for path in folder.iterdir()} == names
+    assert [path.name[:21] for path in sorted((folder / "trials").iterdir())] == [
+        "0000000000-0000000099", "0000000100-0000000199", "0000000200-0000000249"
+    ]  # fmt: skip
+    figures = {path.name for path in (folder / "figures").iterdir()}
+    assert figures == {"fan.png", "distributions.png", "torque_by_angle.png", "inputs.png"}
+    found, rows = summary(folder), rows_of(folder)
+    assert (found["status"], found["flown"], found["counts"]["ok"]) == ("met", 250, 250)
+    errors = rows["window_error"].to_numpy()
+    told = found["quantiles"]["window_error"]
+    np.testing.assert_allclose([told["mean"], told["rms"], told["max"]],
+                               [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
+    assert told["0.9"]["value"] == np.sort(errors)[224]
+    assert told["0.9"]["low"] < told["0.9"]["value"] < told["0.9"]["high"]
+    assert told["0.9973"]["high"] is None  # 250 trials bound it on no side
+    unsettled = rows["settling_time"].null_count()
+    assert found["quantiles"]["settling_time"]["without_value"] == unsettled
+
+
+def test_more_trials_add_to_what_is_there(command, flown):
+    before = rows_of(flown)
+    files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
+    assert command("montecarlo", "s.toml", "--trials", 420, "--seed", 3, "--no-figures", "--quiet")[0] == 0
+    after = rows_of(flown)
+    assert after["trial"].to_list() == list(range(420))
+    same(after[:250], before)
+    kept = [path for path in files if path.exists() and path.stat().st_mtime_ns == files[path]]
+    assert len(kept) == 2  # the third part was a short one
+    code, _, said = command("montecarlo", "s.toml", "--trials", 300, "--seed", 3)
+    assert (code, said.count("\n")) == (2, 1)
+    assert "--trials is 300, but must be at least 420" in said
+
+
+def test_the_same_command_again_flies_nothing(command, flown):
+    files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")
+    assert code == 0
+    assert "250 ok" in said
+    assert {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()} == files
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (["--seed", 4], "holds a run with seed 3, not 4"),
+        (["--metrics", "m.py:overshoot"], "holds a run with metrics None, not m.py:overshoot"),
+        ("eta", "holds a run of another scenario: controller.eta is 3.0 there, and 3.5 here"),
+    ],
+)
+def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path, change, said):
+    (tmp_path / "m.py").write_text(OVERSHOOT)
+    before = rows_of(flown)
+    options = ["--seed", 3]
+    if change == "eta":
+        text = (tmp_path / "s.toml").read_text()
+        (tmp_path / "s.toml").write_text(text.replace("[controller]", "[controller]\neta = 3.5"))
+    else:
+        options = change if "--seed" in change else [*options, *change]
+    code, out, error = command("montecarlo", "s.toml", "--trials", 250, *options)
+    assert (code, out) == (2, "")
+    assert said in error
+    assert error.count("\n") == 1
+    same(rows_of(flown), before)
+    assert command("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")[0] == 0
+    assert rows_of(flown)["trial"].to_list() == list(range(110))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--trials", "0"], "--trials is 0, but must be a whole number from 1 to 4294967296"),
+        (["--trials", "1e4"], "--trials is 1e4, but must be a whole number"),
+        (["--seed", "-1"], "--seed"),
+        (["--shard", "3/2"], "--shard is 3/2, but must be I/N with I from 1 to N"),
+        (["--shard", "half"], "--shard is half, but must be I/N"),
+        (["--until-confident", "2"], "--until-confident is 2, but must be a number between 0 and 1"),
+        (["--until-confident", "0.1", "--dry-run"], "does not go with --shard or --dry-run"),
+        (["--cluster", "local:2", "--shard", "1/2"], "--cluster does not go with --shard"),
+        (["--cluster", "local:none"], "--cluster is local:none, but must be local:N"),
+        (["--cluster", "there.json"], "--cluster is there.json, which is not there"),
+        (["--tls-ca", "ca.pem"], "--tls-ca, --tls-cert and --tls-key go with --cluster only"),
+        (["--metrics", "none.py:f"], "--metrics is none.py:f: the file none.py is not there"),
+        (["--metrics", "m.py:nothing"], "--metrics is m.py:nothing: it is a int; allowed is"),
+        (["--metrics", "m.py:no"], "--metrics is m.py:no: m.py has no such name; allowed is"),
+    ],
+)
+def test_bad_options_end_in_one_sentence_and_nothing_is_written(command, tmp_path, options, said):
+    (tmp_path / "m.py").write_text(OVERSHOOT)
+    code, out, error = command("montecarlo", "s.toml", *options)
+    assert (code, out) == (2, "")
+    assert said in error
+    assert error.startswith("ptsmc: ")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_width_needs_requirements(command, tmp_path):
+    text = (tmp_path / "s.toml").read_text()
+    (tmp_path / "s.toml").write_text(text.replace("[requirements]\npeak_torque = 30.0\n", ""))
+    code, _, error = command("montecarlo", "s.toml", "--until-confident", "0.1")
+    assert (code, "needs [requirements]" in error) == (2, True)
+
+
+def test_trials_until_the_share_is_known(command, tmp_path):
+    """A limit that about half of the trials keep: the width is about 4 sqrt(p (1 - p) / n), so 400 trials for 0.1."""
+    text = (tmp_path / "s.toml").read_text()
+    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 30.0", "peak_torque = 3.0"))
+    code, said, _ = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
+    found = summary(tmp_path / FOLDER)
+    assert code == 1
+    assert "NOT met" in said
+    assert found["flown"] == found["trials"] == 400
+    low, high = found["verdicts"][0]["share_interval"]
+    assert 0.0 < high - low <= 0.11
+    again = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
+    assert again[0] == 1
+    assert summary(tmp_path / FOLDER)["flown"] == 400
+
+
+def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--dry-run")
+    folder = tmp_path / FOLDER
+    assert (code, "plan of 250 trials" in said) == (0, True)
+    assert not (folder / "trials").exists()
+    plan = pl.concat([pl.read_parquet(path) for path in sorted((folder / "plan").iterdir())])
+    assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet")[0] == 0
+    same(plan, rows_of(folder).select(plan.columns))
+
+
+def test_shards_of_one_folder_or_several_make_the_campaign(command, flown, tmp_path):
+    whole, options = rows_of(flown), ["--trials", 250, "--seed", 3, "--no-figures"]
+    for k in (1, 2):
+        code, said, _ = command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", "one")
+        assert code == 0
+        assert f"shard {k}/2 done: {(200 - 50, 250)[k - 1]} of 250 trials are in one" in said
+        command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", f"part{k}", "--quiet")
+    code, said, _ = command("summarize", "part1", "--no-figures")
+    assert (code, "NOT finished: 150 of 250 trials" in said) == (1, True)
+    assert summary(tmp_path / "part1")["status"] == "unfinished"
+    for path in (tmp_path / "part2" / "trials").iterdir():  # gathered by copying
+        path.rename(tmp_path / "part1" / "trials" / path.name)
+    for folder in ("one", "part1"):
+        assert command("summarize", folder, "--no-figures", "--quiet") == (0, "", "")
+        same(rows_of(tmp_path / folder), whole)
+
+
+def test_damaged_rows_are_named_never_read_and_flown_again(command, flown):
+    whole = rows_of(flown)
+    part = sorted((flown / "trials").iterdir())[1]
+    part.write_bytes(part.read_bytes()[:-100])
+    for asked in (["summarize", FOLDER], ["worst", FOLDER]):
+        code, out, error = command(*asked)
+        assert (code, out) == (2, "")
+        assert part.name in error
+        assert "damaged" in error
+    code, _, error = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet")
+    assert code == 0
+    assert f"{part.name} is damaged and is flown again" in error
+    same(rows_of(flown), whole)
+    assert part.with_name(part.name + ".damaged").exists()  # nothing of the user's is thrown away
+
+
+def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
+    whole = rows_of(flown)
+    code, said, _ = command("worst", FOLDER, "--by", "peak_torque", "-n", 3)
+    kept = pl.read_csv(flown / "worst.csv")
+    order = whole.sort("peak_torque", descending=True)[:3]
+    assert code == 0
+    assert kept["trial"].to_list() == order["trial"].to_list()
+    assert str(order["trial"][0]) in said
+    trial = order["trial"][0]
+    code, said, _ = command("replay", FOLDER, "--trial", trial, "--no-figures")
+    assert code == 0
+    assert "its row" in said
+    made = json.loads((flown / "replay" / str(trial) / "summary.json").read_text())
+    assert made["peak_torque"] == pytest.approx(order["peak_torque"][0], rel=1e-12)
+    assert (flown / "replay" / str(trial) / "trajectory.csv").exists()
+    code, _, error = command("replay", FOLDER, "--trial", 250)
+    assert (code, "--trial is 250, but must be a whole number from 0 to 249" in error) == (2, True)
+    code, _, error = command("worst", FOLDER, "--by", "peek_torque")
+    assert (code, "near is peak_torque" in error) == (2, True)
+
+
+def test_a_replay_that_differs_from_its_row_is_told(command, flown):
+    """As if a row had been made by another version: the digest is right, the number is not."""
+    from tuning import campaign_folder
+
+    opened = campaign_folder.opened(flown)
+    first = opened.whole_parts()[0]
+    changed = pl.read_parquet(first.path).with_columns(effort=pl.col("effort") * (1 + 1e-9))
+    first.path.unlink()
+    opened.rows.write(0, changed)
+    code, said, _ = command("replay", FOLDER, "--trial", 5, "--no-figures")
+    assert (code, "off its row by 1.0e-09" in said) == (1, True)
+
+
+@pytest.mark.parametrize("asked", [["summarize"], ["worst"], ["replay", "--trial", "1"]])
+def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
+    (tmp_path / "empty").mkdir()
+    for folder in ("empty", "not-there"):
+        code, out, error = command(asked[0], folder, *asked[1:])
+        assert (code, out) == (2, "")
+        assert f"{folder} holds no campaign; allowed is a folder made by `ptsmc montecarlo`" in error
+    assert command("simulate", "s.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
+    assert "holds results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
+
+
+def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
+    (tmp_path / "m.py").write_text(OVERSHOOT)
+    code, said, _ = command(
+        "montecarlo", "s.toml", "--trials", 120, "--no-figures", "--metrics", "m.py:overshoot", "--seed", 3
+    )
+    assert (code, "overshoot" in said) == (0, True)
+    rows = rows_of(tmp_path / FOLDER)
+    assert rows.columns[-1] == "overshoot"
+    code, _, _ = command("worst", FOLDER, "--by", "overshoot", "-n", 1)
+    assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["overshoot"][0] == rows["overshoot"].max()
+
+
+def test_failures_are_counted_with_reason_and_time(command, tmp_path):
+    text = (tmp_path / "s.toml").read_text().replace("delta = 0.5", "delta = 0.1\neta = 8.75")
+    (tmp_path / "s.toml").write_text(text)
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 300)
+    found = summary(tmp_path / FOLDER)
+    assert code == 1
+    assert sum(reason["trials"] for reason in found["reasons"]) == 300 - found["counts"]["ok"]
+    for reason in found["reasons"]:
+        assert f"{reason['trials']} {reason['status']}: {reason['reason']}, the first at" in said
+        assert 0.0 <= reason["first_bad_time"] <= 6.5
+    failed = found["counts"]["diverged"] + found["counts"]["singular"]
+    assert found["verdicts"][0]["failures"] >= failed > 30
+    code, said, _ = command("worst", FOLDER, "-n", 2)
+    assert set(pl.read_csv(tmp_path / FOLDER / "worst.csv")["status"]) <= {"diverged", "singular"}
+
+
+def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_path):
+    text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", "")
+    (tmp_path / "s.toml").write_text(text)
+    assert command("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet")[0] == 0
+    (tmp_path / "s.toml").write_text(text.replace("delta = 0.5", "delta = 0.1\neta = 8.75"))
+    assert command("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet", "--out", "b")[0] == 1
+
+
+@pytest.mark.parametrize("plant", ["chain", "continuous"])
+def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
+    (tmp_path / "o.toml").write_text({
+        "chain": 'plant = { kind = "chain", order = 3 }\nloop = { mode = "sampled", period = 0.05 }\n'
+                 'controller = { delta = 0.5 }\ndispersion = { x0 = { kind = "normal" } }\n',
+        "continuous": 'controller = { t_f = 20.0, delta = 0.5 }\n'
+                      'dispersion = { attitude = { kind = "uniform" }, disturbance_phase = {} }\n',
+    }[plant])  # fmt: skip
+    code, said, _ = command("montecarlo", "o.toml", "--trials", 70)
+    assert code in (0, 1)
+    assert "70 trials of seed 0" in said
+    frame = rows_of(tmp_path / "out/montecarlo-o")
+    assert frame.height == 70
+    assert ("initial_x3" if plant == "chain" else "disturbance_phase_3") in frame.columns
+    code, said, _ = command("replay", "out/montecarlo-o", "--trial", 66, "--no-figures")
+    assert code == 0, said

@@ -1,0 +1,176 @@
+"""Campaigns in real processes: killed, interrupted, out of disk, on a cluster that loses a worker."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.helpers import SHORT, same
+
+PTSMC = [sys.executable, "-c", "from tuning.cli import main; main()"]
+COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
+PARTS, TRIALS = 40, 40 * 4096 - 1000
+# as long as it takes to be killed in
+SLOW = (
+    SHORT.replace("t_f = 5.0", "t_f = 15.0")
+    .replace("t_end = 6.5", "t_end = 20.0")
+    .replace("period = 0.1", "period = 0.02")
+)
+
+
+def environment():
+    return dict(os.environ, PYTHONPATH=str(Path(__file__).parent.parent))
+
+
+def started(folder, *options, **others):
+    return subprocess.Popen([*PTSMC, *COMMAND, *options], cwd=folder, env=environment(), text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **others)  # fmt: skip
+
+
+def ended(run, seconds=300):
+    """Exit status and errors of a process when it has ended."""
+    _, error = run.communicate(timeout=seconds)
+    return run.returncode, error
+
+
+def parts(folder, out="out/montecarlo-s"):
+    return sorted(path.name for path in (folder / out / "trials").glob("0*.parquet"))
+
+
+def rows_of(folder, out="out/montecarlo-s"):
+    return pl.concat([pl.read_parquet(folder / out / "trials" / name) for name in parts(folder, out)])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The rows of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "s.toml").write_text(SLOW)
+    run = started(folder, "--trials", str(TRIALS))
+    assert ended(run) == (0, "")
+    rows = rows_of(folder)
+    assert rows["trial"].to_list() == list(range(TRIALS))
+    return rows
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "s.toml").write_text(SLOW)
+    return tmp_path
+
+
+def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
+    """Until so many parts are there; whether the run is still going."""
+    since = time.monotonic()
+    while run.poll() is None:
+        if len(parts(folder, out)) >= count:
+            return True
+        assert time.monotonic() - since < patience
+        time.sleep(0.002)
+    return False
+
+
+def test_killed_at_twenty_moments_it_ends_with_the_same_rows(folder, whole):
+    """kill -9 a random while after the first part that a run adds, then the same command again, 20 times over."""
+    rng, killed = np.random.default_rng(0), 0
+    for _ in range(200):
+        before = len(parts(folder))
+        run = started(folder, "--trials", str(TRIALS), start_new_session=True)
+        if await_parts(folder, before + 1, run):
+            time.sleep(rng.uniform(0.0, 0.06))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+        killed += ended(run)[0] == -signal.SIGKILL
+        if killed == 20:
+            break
+        if len(parts(folder)) > PARTS - 5:  # too few left to be killed in: one part is lost for each kill to come
+            for name in parts(folder)[: PARTS - 20]:
+                (folder / "out/montecarlo-s/trials" / name).unlink()
+    assert killed == 20
+    run = started(folder, "--trials", str(TRIALS))
+    assert ended(run) == (0, "")
+    assert list((folder / "out/montecarlo-s/trials").glob(".making*")) == []
+    rows = rows_of(folder)
+    assert rows["trial"].to_list() == list(range(TRIALS))  # none is missing, none is there twice
+    same(rows, whole)
+
+
+def test_interrupted_it_keeps_what_is_flown(folder, whole):
+    run = started(folder, "--trials", str(TRIALS))
+    assert await_parts(folder, 2, run)
+    run.send_signal(signal.SIGINT)
+    code, error = ended(run)
+    assert code == 130
+    assert "interrupted; the same command goes on from here" in error
+    assert "Traceback" not in error
+    done = parts(folder)
+    assert 2 <= len(done) < PARTS
+    run = started(folder, "--trials", str(TRIALS))
+    assert ended(run) == (0, "")
+    assert set(done) <= set(parts(folder))
+    same(rows_of(folder), whole)
+
+
+def test_on_a_full_disk_it_stops_with_a_sentence_and_goes_on_later(folder, whole):
+    """A limit on the size of a file stands for the disk: no part fits."""
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000)); "
+    # the compile cache would not fit either
+    call = [sys.executable, "-c", limited + "from tuning.cli import main; main()", *COMMAND, "--trials", str(TRIALS)]
+    full = subprocess.run(call, cwd=folder, env=environment(), text=True, capture_output=True, check=False, timeout=300)
+    assert full.returncode == 2, full.stderr
+    last = full.stderr.strip().splitlines()[-1]
+    assert re.fullmatch(r"ptsmc: File too large.*", last)
+    assert "Traceback" not in full.stderr
+    assert list((folder / "out/montecarlo-s/trials").iterdir()) == []
+    run = started(folder, "--trials", str(TRIALS))
+    assert ended(run) == (0, "")
+    same(rows_of(folder), whole)
+
+
+@pytest.fixture
+def cluster(folder):
+    """A Dask scheduler and three workers on the loopback, as a user would start them; their processes."""
+
+    def dask(*options):
+        call = [sys.executable, "-m", "dask", *options, "--scheduler-file", "cluster.json"]
+        none = subprocess.DEVNULL
+        return subprocess.Popen(call, cwd=folder, env=environment(), stdout=none, stderr=none)
+
+    scheduler = dask("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    since = time.monotonic()
+    while not (folder / "cluster.json").exists():
+        assert time.monotonic() - since < 60.0
+        time.sleep(0.05)
+    workers = [dask("worker", "--no-nanny", "--nthreads", "1", "--no-dashboard") for _ in range(3)]
+    yield workers
+    for process in (*workers, scheduler):
+        process.kill()
+        process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluster):
+    run = started(folder, "--trials", str(TRIALS), "--cluster", "cluster.json")
+    assert await_parts(folder, 4, run)
+    cluster[0].kill()
+    assert ended(run) == (0, "")
+    rows = rows_of(folder)
+    assert rows["trial"].to_list() == list(range(TRIALS))
+    same(rows, whole)
+    assert [worker.poll() is None for worker in cluster] == [False, True, True]
+
+
+def test_a_cluster_that_is_not_there_is_refused(folder):
+    run = started(folder, "--trials", "100", "--cluster", "tcp://127.0.0.1:1")
+    code, error = ended(run)
+    assert code == 2
+    assert re.search(r"^ptsmc: --cluster is tcp://127.0.0.1:1, which does not answer", error, re.M)
+    assert "Traceback" not in error
+    assert not (folder / "out").exists()

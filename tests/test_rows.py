@@ -1,0 +1,79 @@
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax import rows
+
+KEY = rows.key_of({"loop": {"period": 0.1}}, {"seed": 1})
+
+
+def frame(first, count):
+    return pl.DataFrame({"trial": np.arange(first, first + count, dtype=np.uint32), "x": np.arange(count) / 7.0})
+
+
+@pytest.fixture
+def kept(tmp_path):
+    return rows.Rows(tmp_path / "trials", KEY)
+
+
+def test_what_is_written_is_read_in_order(kept):
+    for first in (100, 0, 50):
+        kept.write(first, frame(first, 50))
+    parts, broken = kept.parts()
+    assert broken == []
+    assert [(part.first, part.count, part.end) for part in parts] == [(0, 50, 50), (50, 50, 100), (100, 50, 150)]
+    assert rows.read(parts)["trial"].to_list() == list(range(150))
+    assert rows.read(parts, ["x"]).columns == ["x"]
+    assert rows.read(parts)["x"].to_list() == [k / 7.0 for k in range(50)] * 3  # to the last digit
+
+
+@pytest.mark.parametrize("harm", ["flip", "cut", "empty", "renamed", "foreign", "longer"])
+def test_a_damaged_part_is_told_from_a_whole_one(kept, harm):
+    whole, harmed = kept.write(0, frame(0, 50)), kept.write(50, frame(50, 50))
+    content = bytearray(harmed.path.read_bytes())
+    if harm == "flip":
+        content[len(content) // 2] ^= 1
+    changed = {"cut": content[:-1], "empty": b"", "longer": content + b"\0"}.get(harm, content)
+    harmed.path.write_bytes(bytes(changed))
+    if harm == "renamed":  # to stand for other trials
+        harmed.path.rename(harmed.path.with_name("0000000060-0000000109" + harmed.path.name[21:]))
+    if harm == "foreign":
+        harmed.path.unlink()
+        other = rows.Rows(kept.folder, rows.key_of({"loop": {"period": 0.1}}, {"seed": 2}))
+        other.write(50, frame(50, 50))
+    parts, broken = kept.parts()
+    assert parts == [whole]
+    assert len(broken) == 1
+
+
+def test_a_longer_part_takes_the_place_of_a_shorter_one(kept):
+    short, long = kept.write(0, frame(0, 20)), kept.write(0, frame(0, 50))
+    after = kept.write(50, frame(50, 10))
+    assert kept.parts()[0] == [long, after]
+    kept.tidy()
+    assert not short.path.exists()
+    assert kept.parts()[0] == [long, after]
+
+
+def test_what_a_killed_process_left_is_swept_up_and_never_read(kept):
+    kept.write(0, frame(0, 20))
+    (kept.folder / ".making-xyz").write_bytes(b"half")
+    assert len(kept.parts()[0]) == 1
+    kept.tidy()
+    assert [path.name[0] for path in kept.folder.iterdir()] == ["0"]
+
+
+def test_a_part_that_does_not_fit_leaves_nothing(kept, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(rows.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        kept.write(0, frame(0, 20))
+    assert list(kept.folder.iterdir()) == []
+
+
+def test_keys_tell_campaigns_apart():
+    assert rows.key_of({"a": {"b": 1}}, {"seed": 1}) == rows.key_of({"a": {"b": 1}}, {"seed": 1})
+    others = [({"a": {"b": 2}}, {"seed": 1}), ({"a": {"b": 1}}, {"seed": 2}), ({"a": {"b": 1}}, {"seed": 1, "m": "x"})]
+    assert len({rows.key_of(*o) for o in others} | {rows.key_of({"a": {"b": 1}}, {"seed": 1})}) == 4
