@@ -173,7 +173,7 @@ def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
     names = [f"{package}.{name}" for package, name in FLOOR]
     changed = python(f"""
 import importlib, json, os, warnings
-import jax
+import jax, polars  # which sets a variable of its allocator's own
 def state():
     return {{**jax.config.values, "flags": os.environ.get("XLA_FLAGS"), "environment": dict(os.environ)}}
 before, filters = state(), list(warnings.filters)
