@@ -96,15 +96,15 @@ def _sentence(error: BaseException) -> str:
 
 
 @lru_cache(maxsize=4)
-def _campaign(make: Any, told: str) -> tuple[Campaign, Rows]:
+def _campaign(make: Any, told: tuple) -> tuple[Campaign, Rows]:
     from ptsmc_jax.configure import configure
 
     with contextlib.suppress(RuntimeError):  # the worker's process has used JAX already
         configure()
-    return make(told)
+    return make(*told)
 
 
-def _fly(recipe: tuple[Any, str], first: int, count: int) -> tuple:
+def _fly(recipe: tuple[Any, tuple], first: int, count: int) -> tuple:
     """On a worker: fly a part and write it. Returns its receipt."""
     make, told = recipe
     with _one_at_a_time:

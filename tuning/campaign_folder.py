@@ -66,9 +66,9 @@ class Folder:
                 raise ScenarioError(f"--metrics is {self.own}: {error}") from None
         return Campaign(scenario.study(self.scenario), self.seed)
 
-    def recipe(self) -> tuple[Callable, str]:
+    def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
-        return made_again, str(self.path.resolve())
+        return made_again, (str(self.path.resolve()), self._key.hex())
 
     def whole_parts(self) -> list[Part]:
         """Its parts; raises RefusedError where one is damaged, or there is none."""
@@ -131,9 +131,11 @@ def opened(path: Path) -> Folder:
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
 
 
-def made_again(path: str) -> tuple[Campaign, Rows]:
-    """Campaign and rows of a folder, on a worker that shares it."""
+def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
+    """Campaign and rows of a folder, on a worker that shares it; raises RefusedError where it holds another one."""
     folder = opened(Path(path))
+    if folder.rows.key.hex() != key:
+        raise RefusedError(f"{path} holds another campaign there than here")
     return folder.campaign, folder.rows
 
 

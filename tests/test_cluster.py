@@ -1,0 +1,103 @@
+"""What is asked of Dask, without a cluster: `test_campaign_processes` has real ones."""
+
+import sys
+from concurrent.futures import Future
+from types import SimpleNamespace
+
+import distributed
+import pytest
+
+from ptsmc_jax import cluster, store
+from ptsmc_jax.rows import Rows
+from ptsmc_jax.store import RefusedError
+
+
+class FakeClient:
+    """Runs what is submitted at once; remembers how it was made."""
+
+    loop = None
+
+    def __init__(self, **options):
+        self.options, self.cancelled, self.closed = options, [], False
+        FakeClient.made = self
+
+    def submit(self, function, *arguments, **_):
+        future = Future()
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    def cancel(self, futures):
+        self.cancelled = futures
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture(autouse=True)
+def _dask(monkeypatch):
+    monkeypatch.setattr(distributed, "Client", FakeClient)
+    monkeypatch.setattr(distributed, "as_completed", lambda futures, **_: iter(futures))
+
+
+def flown_by(monkeypatch, tmp_path, receipt):
+    """A folder whose parts are flown by a worker that returns this receipt."""
+    monkeypatch.setattr(cluster, "_fly", lambda recipe, first, count: receipt(first, count))
+    return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
+
+
+def test_tls_is_passed_on_and_encryption_then_required():
+    files = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
+    found = cluster.connected("tls://10.0.0.1:8786", files)
+    security = FakeClient.made.options["security"]
+    assert FakeClient.made.options["address"] == "tls://10.0.0.1:8786"
+    assert {name: getattr(security, name) for name in files} == files
+    assert security.require_encryption is True
+    found.close()
+    assert FakeClient.made.closed
+    cluster.connected("tcp://127.0.0.1:8786", {})
+    assert FakeClient.made.options["security"] is None
+
+
+def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(distributed, "LocalCluster", lambda **options: asked.update(options) or SimpleNamespace())
+    cluster.connected("local:3", {})
+    assert (asked["host"], asked["n_workers"], asked["threads_per_worker"]) == ("127.0.0.1", 3, 1)
+
+
+def test_receipts_become_parts(monkeypatch, tmp_path):
+    here = {name: store.versions("", 0)[name] for name in store.PACKAGES}
+    (tmp_path / "p.parquet").write_bytes(b"")
+    folder = flown_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
+    found = list(cluster.connected("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
+    assert [(part.first, part.count, failed) for part, failed in found] == [(0, 10, 7), (10, 5, 7)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"jax": "0.0.1"}, "has jax 0.0.1, but here is"),
+        (None, r"a worker wrote gone.parquet, which is not in .* here: it must be shared"),
+        (ValueError("no\nroom"), "a worker of the cluster failed: no room"),
+    ],
+)
+def test_what_cannot_be_trusted_is_refused(monkeypatch, tmp_path, change, said):
+    def receipt(first, count):
+        if isinstance(change, Exception):
+            raise change
+        versions = {name: store.versions("", 0)[name] for name in store.PACKAGES} | (change or {})
+        return first, count, "gone.parquet", 0, versions
+
+    folder = flown_by(monkeypatch, tmp_path, receipt)
+    with pytest.raises(RefusedError, match=said):
+        list(cluster.connected("tcp://a:1", {})(folder, [(0, 10)]))
+    assert len(FakeClient.made.cancelled) == 1  # nothing is left running
+
+
+def test_without_dask_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(RefusedError, match=r"pip install 'ptsmc-jax\[cluster\]'"):
+        cluster.connected("tcp://a:1", {})
