@@ -46,7 +46,7 @@ def main() -> None:
     print(f"within 1 % of the better of both: {sum(near)} of {seeds}; "
           f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
     fresh = report.seed_of_judge(0)
-    paper = report.judge(gains.in_scenario(loaded, gains.of_paper(loaded)), fresh, ready.requirements)
+    paper = report.judge(gains.papers(loaded), fresh, ready.requirements)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
     tuned = report.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]

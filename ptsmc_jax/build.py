@@ -5,7 +5,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import attitude_keys, checks, controllers, dispersions, free_gains, hardware, observers, plants, signals
+from ptsmc_jax import (
+    attitude_keys,
+    baselines,
+    checks,
+    controllers,
+    dispersions,
+    free_gains,
+    hardware,
+    observers,
+    plants,
+    signals,
+)
 from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import sensors as sensing
 from ptsmc_jax import tables as t
@@ -53,8 +64,14 @@ def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
         reference = signals.Swing(q_f, vector(table.amplitude), vector(table.frequency), vector(table.phase))
     elif isinstance(table, t.SlewReference):
         reference = signals.Slew(q_f, vector(attitude_keys.turn(table)), vector(table.duration))
-    assert isinstance(scenario.controller, t.Controller)
-    multiplicative = scenario.controller.error == "multiplicative"
+    table = scenario.controller
+    if isinstance(table, t.Baseline):
+        kinds = {"pd": baselines.QuaternionPD, "terminal": baselines.Terminal, "fixed_time": baselines.FixedTime}
+        kind = kinds[scenario.controller.kind]
+        own = {name: vector(getattr(table, name)) for name in kind.free}
+        return model, kind(model=model, delta=vector(scenario.loop.period), **own), initial, reference
+    assert isinstance(table, t.Controller)
+    multiplicative = table.error == "multiplicative"
     law = controllers.PrescribedTimeMultiplicative if multiplicative else controllers.PrescribedTime
     return model, law(model, *_gains(scenario)), initial, reference
 

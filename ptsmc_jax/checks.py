@@ -242,7 +242,12 @@ def _check_devices(scenario: Scenario) -> None:
 
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
-    t_f, delta, sampled = controller.t_f, controller.delta, loop.mode == "sampled"
+    t_f, delta, sampled = controller.t_f, free_gains.hand_over(scenario), loop.mode == "sampled"
+    if isinstance(controller, tables.Baseline) and not sampled:
+        kind = schema.show(scenario.controller.kind)
+        raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
+    if isinstance(controller, tables.FixedTimeController) and not controller.gamma - 1.0 / controller.p > 1.0:
+        raise wrong("controller.gamma", controller.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / controller.p:.6g}")
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     assert loop.t_end is not None  # `resolve` filled it in

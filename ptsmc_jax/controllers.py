@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
-from ptsmc_jax.laws import Law, Motion, SecondOrder
+from ptsmc_jax.laws import Motion, Prescribed, SecondOrder
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft, System
 from ptsmc_jax.signals import Target
@@ -93,9 +93,56 @@ class PrescribedTime(_Attitude):
         return Motion(AttitudeState(q, w), attitude.t_inverse_times(q, turning), square)
 
 
+class ErrorQuaternion:
+    """Laws on the vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
+
+    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2.
+    """
+
+    model: Any  # the nominal plant
+
+    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
+        """The same attitude with the sign of q for which q_e4 >= 0."""
+        opposite = jnp.dot(x.q, target.q) < 0.0
+        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+
+    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+        """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""
+        return jnp.dot(x.q, target.q)
+
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
+
+    def relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
+        """q_e, w_e, R w_f and R w_f' - w_e x R w_f, the derivative of R w_f less what R w_f' leaves out."""
+        q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
+        back = attitude.conjugate(q_e)
+        carried = attitude.rotate(back, target.w)
+        w_e = x.w - carried
+        return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
+
+    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
+        """V [-] and its derivative [1/s]."""
+        q_e, w_e, _, _ = self.relative(x, target)
+        v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
+        return q_e[:3], v_dot
+
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T(q_e) J^-1| [1/(kg m^2)]."""
+        q_e, *_ = self.relative(x, target)
+        return numerics.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
+
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 v'' = wanted [1/s^2]."""
+        q_e, w_e, _, feedforward = self.relative(x, target)
+        turned = attitude.t_inverse_times(q_e, wanted + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PrescribedTimeMultiplicative(_Attitude):
+class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
     """The same law on the vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
 
     With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2, and
@@ -107,40 +154,6 @@ class PrescribedTimeMultiplicative(_Attitude):
     and -v lead along the same path, the short way round.
     """
 
-    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
-        """The same attitude with the sign of q for which q_e4 >= 0."""
-        opposite = jnp.dot(x.q, target.q) < 0.0
-        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
-
-    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
-        """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""
-        return jnp.dot(x.q, target.q)
-
-    def _relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
-        """q_e, w_e, R w_f and R w_f' - w_e x R w_f, the derivative of R w_f less what R w_f' leaves out."""
-        q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
-        back = attitude.conjugate(q_e)
-        carried = attitude.rotate(back, target.w)
-        w_e = x.w - carried
-        return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
-
-    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
-        """V [-] and its derivative [1/s]."""
-        q_e, w_e, _, _ = self._relative(x, target)
-        v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
-        return q_e[:3], v_dot
-
-    def influence(self, x: AttitudeState, target: Target) -> Scalar:
-        """|T(q_e) J^-1| [1/(kg m^2)]."""
-        q_e, *_ = self._relative(x, target)
-        return numerics.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
-
-    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 v'' = wanted [1/s^2]."""
-        q_e, w_e, _, feedforward = self._relative(x, target)
-        turned = attitude.t_inverse_times(q_e, wanted + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
-        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
-
     def motion(
         self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
     ) -> Motion:
@@ -150,7 +163,7 @@ class PrescribedTimeMultiplicative(_Attitude):
         q = attitude.multiply(target.q, q_e)
         carried = attitude.rotate(attitude.conjugate(q_e), target.w)
         x = AttitudeState(q, w_e + carried)
-        _, _, _, feedforward = self._relative(x, target)
+        _, _, _, feedforward = self.relative(x, target)
         turning = attitude.t_inverse_times(q_e, 2.0 * acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
         return Motion(x, feedforward + turning, square)
 
@@ -226,7 +239,7 @@ def expansion(eta: Scalar, order: int) -> list[Scalar]:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PrescribedTimeChain(Law):
+class PrescribedTimeChain(Prescribed):
     """Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
 
     For order 2 it is (24) on (6). Differences from the paper: its sums of (38), (40) and (52) run to n-1, but x_(n+1)

@@ -9,12 +9,24 @@ from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
 FINITE_TIME = tables.FiniteTimeObserver | tables.EachFiniteTimeObserver
+# what is free of the laws to compare with, if a scenario does not say
+_BASELINES: dict[str, tuple[tables.Free, ...]] = {
+    "pd": ("k_p", "k_d"),
+    "terminal": ("p", "b", "k"),
+    "fixed_time": ("a1", "b1", "a2", "b2"),
+}
+_POWERS = {"p": (1.0, 2.0), "m": (1.0, math.inf), "n": (0.0, 1.0)}  # between which they must lie
 MOST_STEPS = 200_000  # of a run
 
 
 def least_eta(scenario: Scenario) -> float:
     """What eta must exceed: 2 by Theorems 1 and 2, the order of a chain by Theorem 3."""
     return float(scenario.plant.order) if isinstance(scenario.plant, tables.ChainPlant) else 2.0
+
+
+def hand_over(scenario: Scenario) -> float:
+    """How long before t_f the law hands over [s]; a period for a law that does not."""
+    return getattr(scenario.controller, "delta", scenario.loop.period)
 
 
 def filter_bandwidth(scenario: Scenario) -> float:
@@ -36,7 +48,8 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     """The table with its defaults: gains, bounds, level."""
     free = tune.free
     if free is None:
-        free = ("eta", "delta", "observer_gain") if _has_gain(scenario) else ("eta", "delta")
+        law = _BASELINES.get(scenario.controller.kind, ("eta", "delta"))
+        free = (*law, "observer_gain") if _has_gain(scenario) else law
     bounds = {**{key: _default(scenario, tune, key, free) for key in free if key not in tune.bounds}, **tune.bounds}
     bounds = {key: bounds[key] for key in (*free, *(key for key in bounds if key not in free)) if key in bounds}
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
@@ -50,6 +63,13 @@ def check(scenario: Scenario, tune: tables.Tune) -> None:
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
     said = f"tune.free is {schema.show(free)}, but"
+    for name in free:
+        if name not in ("observer_gain", "filter_bandwidth") and not hasattr(scenario.controller, name):
+            known = [key for key in tables.FREE if hasattr(scenario.controller, key)]
+            raise ScenarioError(
+                f"{said} the law of controller.kind = {schema.show(scenario.controller.kind)} has no {name}; "
+                f"allowed is some of {', '.join(known)}, observer_gain, filter_bandwidth"
+            )
     if "observer_gain" in free and not _has_gain(scenario):
         raise ScenarioError(
             f'{said} observer.kind = "none" has no gain; allowed is observer_gain with an observer of another kind'
@@ -97,10 +117,14 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
     if name == "delta":  # below every t_f
         return shortest, tune.bounds.get("t_f", (scenario.controller.t_f,))[0], shortest > 0.0
     if name == "t_f":
-        least = max(scenario.controller.delta if "delta" not in (tune.free or ()) else shortest, _t_o(scenario))
+        least = max(hand_over(scenario) if "delta" not in (tune.free or ()) else shortest, _t_o(scenario))
         assert loop.t_end is not None
         hold = loop.t_end - scenario.controller.t_f
         return least, MOST_STEPS * loop.period - hold if loop.mode == "sampled" else math.inf, False
+    if name == "gamma":  # gamma - 1/p > 1, for every p
+        return 1.0 + 1.0 / tune.bounds.get("p", (scenario.controller.p,))[0], math.inf, False
+    if name in _POWERS:
+        return *_POWERS[name], False
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):
         least = scenario.controller.disturbance_rate_bound
         return least, math.inf, least > 0.0
@@ -108,7 +132,7 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
 
 
 def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, ...]) -> tuple[float, float]:
-    t_f, delta = scenario.controller.t_f, scenario.controller.delta
+    t_f, delta = scenario.controller.t_f, hand_over(scenario)
     if name == "eta":
         return least_eta(scenario) + 0.05, least_eta(scenario) + 6.0
     if name == "t_f":
@@ -126,7 +150,21 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         assert scenario.observer.gain is not None
         own = min(scenario.observer.gain), max(scenario.observer.gain)
         return max(scenario.controller.disturbance_rate_bound, 0.05 * own[0]), 50.0 * own[1]
-    return {"observer_gain": (0.5, 300.0), "k1": (0.1, 10.0), "sign_width": (1e-5, 1e-1)}[name]
+    if name == "gamma":
+        least = 1.0 + 1.0 / (tune.bounds.get("p") or _default(scenario, tune, "p", free))[0]
+        return least + 0.05, least + 2.0
+    return {
+        "observer_gain": (0.5, 300.0),
+        "k1": (0.1, 10.0),
+        "sign_width": (1e-5, 1e-1),
+        **dict.fromkeys(("k_p", "k"), (2.0 / t_f**2, 2000.0 / t_f**2)),
+        "k_d": (0.3 / t_f, 100.0 / t_f),
+        **dict.fromkeys(("b", "a1", "b1"), (0.01 / t_f, 100.0 / t_f)),
+        **dict.fromkeys(("a2", "b2"), (1e-4, 10.0)),
+        "p": (1.05, 1.95),
+        "m": (1.05, 3.0),
+        "n": (0.05, 0.95),
+    }[name]
 
 
 def _has_gain(scenario: Scenario) -> bool:

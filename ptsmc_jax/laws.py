@@ -1,7 +1,7 @@
 """What the paper's prescribed-time laws share: gains, phases, and the law of every second-order error motion."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -30,20 +30,13 @@ class Motion(NamedTuple):
     clearance: Array  # how far from a singularity, positive on this side of it
 
 
-@dataclass(frozen=True)
 class Law:
-    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
-
-    The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
-    enough, and with delta > 0 V(t_f) is only small.
-    """
+    """What the rollout asks of a law, and what it needs no law of its own to say."""
 
     model: Any  # the nominal plant
-    t_f: Leaf  # prescribed time [s]
-    eta: Leaf  # eta > 2, and greater than the order of a chain [-]
-    delta: Leaf  # hand-over this long before t_f, Remark 1 [s]
-    k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
-    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
+    t_f: Leaf  # prescribed time, or when the error is judged [s]
+    delta: Leaf  # hand-over this long before t_f [s]
+    free: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
 
     @property
     def hand_over(self) -> Scalar:
@@ -73,6 +66,31 @@ class Law:
         """Order n of the error's motion: 2, or that of a chain."""
         return 2
 
+    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
+        """What is driven to zero, (m,), and its derivative."""
+        raise NotImplementedError
+
+    def angle(self, x: Any, target: Any) -> Scalar:
+        """What settles: the angle to the reference [rad], for other plants |x_1|."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Prescribed(Law):
+    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
+
+    The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
+    enough, and with delta > 0 V(t_f) is only small.
+    """
+
+    model: Any
+    t_f: Leaf
+    eta: Leaf  # eta > 2, and greater than the order of a chain [-]
+    delta: Leaf
+    k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
+    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
+    free: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "t_f")
+
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
 
@@ -89,17 +107,9 @@ class Law:
         """Fastest decay after the hand-over [1/s]."""
         raise NotImplementedError
 
-    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
-        """What is driven to zero, (m,), and its derivative."""
-        raise NotImplementedError
-
-    def angle(self, x: Any, target: Any) -> Scalar:
-        """What settles: the angle to the reference [rad], for other plants |x_1|."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True)
-class SecondOrder(Law):
+class SecondOrder(Prescribed):
     """The law of an error vector eps whose second derivative the input sets: (29), of which (57) and (60) are a case.
 
     s = tau eps' + eta eps and 2 eps'' = -2 (eta-1) eps'/tau - 2 eta s/tau^2 - N K2 sign(s) before the hand-over (26),

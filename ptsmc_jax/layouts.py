@@ -7,9 +7,8 @@ from typing import Any
 from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import tables as t
 
-# A table is a struct, or one for each kind, the default first; a kind without a struct is not available yet.
-Kinds = dict[str, type[t.Table] | None]
-_LAWS: Kinds = {"pd": None, "terminal": None, "fixed_time": None}
+# A table is a struct, or one for each kind, the default first.
+Kinds = dict[str, type[t.Table]]
 _STATE_OBSERVERS: Kinds = {
     "nonlinear": t.EachNonlinearObserver,
     "finite_time": t.EachFiniteTimeObserver,
@@ -46,7 +45,12 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
             "random_walk": t.RandomWalk,
             "sum": t.SumDisturbance,
         },
-        "controller": {"prescribed_time": t.Controller, **_LAWS},
+        "controller": {
+            "prescribed_time": t.Controller,
+            "pd": t.PDController,
+            "terminal": t.TerminalController,
+            "fixed_time": t.FixedTimeController,
+        },
         "observer": {
             "nonlinear": t.NonlinearObserver,
             "none": t.NoObserver,
@@ -63,14 +67,14 @@ TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the pl
     "chain": {
         "plant": t.ChainPlant,
         "disturbance": {"sinusoid": t.EachSinusoid, "none": t.NoDisturbance, **_STATE_DISTURBANCES},
-        "controller": {"prescribed_time": t.ChainController, **_LAWS},
+        "controller": {"prescribed_time": t.ChainController},
         "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
         **_STATE_LOOP,
     },
     "system": {
         "plant": t.SystemPlant,
         "disturbance": {"none": t.NoDisturbance, **_STATE_DISTURBANCES},
-        "controller": {"prescribed_time": t.SystemController, **_LAWS},
+        "controller": {"prescribed_time": t.SystemController},
         "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
         **_STATE_LOOP,
     },

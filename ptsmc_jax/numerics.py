@@ -56,6 +56,13 @@ def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
     return jnp.where(at_zero, 0.0, x / jnp.sqrt(jnp.sqrt(jnp.where(at_zero, 1.0, square))))
 
 
+def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
+    """sign(x) |x|^power, power > 0; its slopes at 0, infinite for a power below 1, are set to 0."""
+    at_zero = x == 0.0
+    size = jnp.where(at_zero, 1.0, jnp.abs(x))
+    return jnp.where(at_zero, 0.0, jnp.sign(x) * size**power)
+
+
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
     """B + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)

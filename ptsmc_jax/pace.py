@@ -13,7 +13,7 @@ import numpy as np
 from ptsmc_jax import attitude_keys, build, checks, clock, observers, theory
 from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import tables as t
-from ptsmc_jax.free_gains import MOST_STEPS
+from ptsmc_jax.free_gains import MOST_STEPS, hand_over
 from ptsmc_jax.laws import SecondOrder
 from ptsmc_jax.plants import System
 from ptsmc_jax.rollout import Parts
@@ -42,8 +42,9 @@ class Reach:
 def reach_of(scenario: Scenario) -> Reach:
     """The reach of a scenario's own gains: none beyond them."""
     table = scenario.controller
-    gains = getattr(scenario.observer, "gain", (0.0,))
-    return Reach(table.t_f, table.t_f, table.delta, table.delta, min(gains), max(gains), table.k1, table.sign_width)
+    gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
+    k1, width = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0)
+    return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width)
 
 
 def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
@@ -76,8 +77,20 @@ def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
     if scenario.initial is not None:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
-        found["controller.eta"] = 2.0 * scenario.controller.eta / reach.smallest_t_f  # of the slew
+        key, rate = _slew(scenario.controller, reach.smallest_t_f)
+        found[key] = rate
     return found
+
+
+def _slew(law: Any, t_f: float) -> tuple[str, float]:
+    """How fast a law turns the body [rad/s], at most, by the key that says so; on their surfaces the baselines."""
+    if isinstance(law, t.PDController):  # all of the potential energy of its spring
+        return "controller.k_p", 2.0 * math.sqrt(law.k_p)
+    if isinstance(law, t.TerminalController):
+        return "controller.b", 2.0 * law.b ** (1.0 / law.p)
+    if isinstance(law, t.FixedTimeController):
+        return "controller.a1", 2.0 * (law.a1 + law.b1)
+    return "controller.eta", 2.0 * law.eta / t_f
 
 
 def _spread(scenario: Scenario) -> float:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import theory
 from ptsmc_jax.controllers import PrescribedTime
 from ptsmc_jax.drawing import RC, STYLES, TIME, figure_of
+from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.remark_2 import Measured
 from ptsmc_jax.rollout import Log, Parts
@@ -22,12 +23,9 @@ from ptsmc_jax.rollout import Log, Parts
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
-    figures = {
-        "error": error(parts, log),
-        "sliding": sliding(parts, log),
-        "convergence": convergence(parts, log),
-        "torque": torque(parts, log, limit),
-    }
+    figures = {"error": error(parts, log), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
+    if isinstance(parts.controller, Prescribed):
+        figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
     if isinstance(parts.plant, Spacecraft):
@@ -61,8 +59,9 @@ def error(parts: Parts, log: Log) -> Figure:
     figure, axes = figure_of("Error", symbol)
     size = np.linalg.norm(log.error, axis=1)
     axes.semilogy(log.t, np.maximum(size, 1e-16), color=STYLES[0][0], label="flown")
-    before = log.t[log.t < float(parts.controller.hand_over)]
-    axes.plot(before, theory.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
+    if isinstance(parts.controller, Prescribed):
+        before = log.t[log.t < float(parts.controller.hand_over)]
+        axes.plot(before, theory.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _mark(axes, parts)
@@ -85,9 +84,10 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     figure, axes = figure_of(title or ("Control torque" if unit else "Control"), label)
     held = not hasattr(parts.clock, "max_step")
     _components(axes, log.t, log.u, "u", drawstyle="steps-post" if held else "default")
-    t, u, _ = (np.asarray(v) for v in theory.exact_path(parts))
-    axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
-    axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+    if isinstance(parts.controller, Prescribed):
+        t, u, _ = (np.asarray(v) for v in theory.exact_path(parts))
+        axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+        axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
     row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
     peak = log.commanded[row, column]
     marked = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
@@ -105,8 +105,9 @@ def sliding(parts: Parts, log: Log) -> Figure:
     """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
     figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
     _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
-    before = log.t[log.t < float(parts.controller.hand_over)]
-    axes.plot(before, theory.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
+    if isinstance(parts.controller, Prescribed):
+        before = log.t[log.t < float(parts.controller.hand_over)]
+        axes.plot(before, theory.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
     axes.set_yscale("log")
     _mark(axes, parts)
     axes.legend()

@@ -15,7 +15,6 @@ from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.draws import Whole
 from ptsmc_jax.hardware import Actuators
-from ptsmc_jax.laws import Law
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
@@ -47,7 +46,7 @@ class Parts:
     plant: Plant
     disturbance: Any  # callable: t [s], true state -> (m,) [N m]
     reference: Any  # callable: t [s] -> what the law is to reach, a Target for spacecraft
-    controller: Law
+    controller: Any  # laws.Law
     observer: Any  # observers.Observer
     sensors: Any  # sensors.Sensor, or None: the law sees the true state
     clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled

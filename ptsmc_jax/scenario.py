@@ -24,6 +24,7 @@ from ptsmc_jax import (
     theory,
 )
 from ptsmc_jax import tables as t
+from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.plants import System
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import SINGULAR_CLEARANCE, Parts
@@ -149,11 +150,15 @@ def _check_reference(scenario: Scenario, parts: Parts) -> None:
 def _check_start(scenario: Scenario, parts: Parts) -> None:
     """Refuse an initial attitude from which the law meets its singularity on the way."""
     assert scenario.initial is not None
-    additive = isinstance(parts.controller, controllers.PrescribedTime)
+    additive, law = isinstance(parts.controller, controllers.PrescribedTime), parts.controller
     singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {schema.show(value)}"
-    times, _, square = (np.asarray(v) for v in _path(parts))
+    if isinstance(law, Prescribed):
+        times, _, square = (np.asarray(v) for v in _path(parts))
+    else:  # of the others only the start is known
+        target = parts.reference(jnp.zeros_like(parts.t_end))
+        times, square = np.zeros(1), np.square([float(law.clearance(law.align(parts.initial, target), target))])
     if square[0] < SINGULAR_CLEARANCE**2:
         raise ScenarioError(f"{said}, but lies at {singular}; allowed is {name} of at least {SINGULAR_CLEARANCE}")
     if square.min() < SINGULAR_CLEARANCE**2:

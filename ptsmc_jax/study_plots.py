@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from ptsmc_jax.drawing import RC, STYLES, edges, figure_of, plain_ticks
 from ptsmc_jax.metrics import CATALOGUES
 
+MARKERS = ("o", "^", "s", "D", "v")
+
 
 def tuning_history(
     gains: Mapping[str, tuple[str, np.ndarray]],
@@ -97,9 +99,8 @@ def tradeoff(
     """
     error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
-    markers = ("o", "^", "s", "D")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
-    for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), STYLES, markers, strict=False):
+    for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), STYLES, MARKERS, strict=False):
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
         axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
         text = f"{label}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
@@ -108,6 +109,21 @@ def tradeoff(
         axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
     axes.set_xlabel(f"window error [{error_unit}]")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19))
+    return figure
+
+
+def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float, unit: str = "s") -> Figure:
+    """When each trial settles against where it starts; label -> (initial angles [deg], settling times, NaN: never)."""
+    figure, axes = figure_of("When it settles, by where it starts", f"settling time [{unit}]")
+    for (label, (angle, time)), (colour, _), marker in zip(sets.items(), STYLES, MARKERS, strict=True):
+        known = np.isfinite(time)
+        said = f"{label}: {int((~known).sum())} never" if np.any(~known) else label
+        axes.plot(angle[known], time[known], marker, ms=3.5, alpha=0.5, color=colour, mew=0, label=said)
+    axes.axhline(t_f, color="0.3", lw=0.9, ls=":")
+    axes.annotate("$t_f$", (1.0, t_f), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
+                  va="center")  # fmt: skip
+    axes.set_xlabel("initial angle [deg]")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19), ncols=2, fontsize=9, markerscale=2.0)
     return figure
 
 

@@ -167,6 +167,47 @@ class Controller(Table, frozen=True):
     initial_estimate_error: NotNegative = 0.0
 
 
+class Baseline(Table, frozen=True):
+    """What the laws to compare with have besides their gains; t_f is when they are judged."""
+
+    t_f: Positive = 30.0
+    disturbance_rate_bound: NotNegative = 1e-3
+    disturbance_bound: NotNegative = 0.01
+    initial_estimate_error: NotNegative = 0.0
+
+
+class PDController(Baseline, frozen=True):
+    kind: Literal["pd"] = "pd"
+    k_p: Positive = 0.2
+    k_d: Positive = 0.6
+
+
+Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
+
+
+class TerminalController(Baseline, frozen=True):
+    kind: Literal["terminal"] = "terminal"
+    p: Power = 1.3
+    b: Positive = 0.1
+    k: Positive = 0.1
+    sign_width: NotNegative = 1e-3
+
+
+class FixedTimeController(Baseline, frozen=True):
+    """gamma - 1/p must be greater than 1."""
+
+    kind: Literal["fixed_time"] = "fixed_time"
+    a1: Positive = 0.1
+    b1: Positive = 0.2
+    a2: Positive = 1.0
+    b2: Positive = 1.0
+    p: Power = 1.25
+    gamma: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
+    m: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 1.5
+    n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
+    sign_width: NotNegative = 1e-3
+
+
 class SystemController(Table, frozen=True):
     kind: Literal["prescribed_time"] = "prescribed_time"
     t_f: Positive = 5.0
@@ -247,7 +288,10 @@ class Limit(Table, frozen=True):
     confidence: Quantile | None = None
 
 
-Free = Literal["eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth"]
+Free = Literal[
+    "eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth",
+    "k_p", "k_d", "p", "b", "k", "a1", "b1", "a2", "b2", "gamma", "m", "n",
+]  # fmt: skip
 FREE: tuple[str, ...] = typing.get_args(Free)
 FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")]
 
@@ -283,7 +327,7 @@ class Scenario(Table, frozen=True, kw_only=True):
         | EachSinusoid
         | EachRandomWalk
     )
-    controller: Controller | ChainController | SystemController
+    controller: Any  # the table of its kind, see `layouts.TABLES`
     observer: (
         NoObserver
         | NonlinearObserver

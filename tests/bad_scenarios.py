@@ -7,7 +7,6 @@ UNIT, ONE_KEY = (
     "exactly one of quat_xyzw, quat_wxyz, rotvec_deg, mrp, dcm_body_to_inertial, euler_deg",
 )
 INERTIA, CLEAR = "three principal moments or a symmetric 3x3", "|q4| of at least 0.001"
-NOT_YET = "is not available yet; allowed is "
 FINITE, PRESCRIBED = "observer.kind = 'finite_time'\n", "observer.kind = 'prescribed_time'\n"
 OPPOSITE = "controller.error = 'multiplicative'\n"
 CHAIN = 'plant.kind = "chain"\n'
@@ -325,9 +324,27 @@ BAD = [
         "above 0.0",
     ),
     # what the contract knows and the project cannot do yet
-    ("controller.kind = 'pd'", 'controller.kind = "pd"', NOT_YET + '"prescribed_time"'),
-    ("controller.kind = 'terminal'", 'controller.kind = "terminal"', NOT_YET + '"prescribed_time"'),
-    ("controller.kind = 'fixed_time'", 'controller.kind = "fixed_time"', NOT_YET + '"prescribed_time"'),
+    ("controller.kind = 'pd'", 'controller.kind = "pd" needs the sampled loop', 'loop.mode is "continuous"'),
+    ("controller.kind = 'lqr'", 'controller.kind is "lqr"', '"prescribed_time" or "pd" or "terminal" or "fixed_time"'),
+    ("plant.kind = 'chain'\ncontroller.kind = 'pd'", 'controller.kind is "pd"', '"prescribed_time"'),
+    ("controller = { kind = 'pd', eta = 3.0 }", "controller.eta is not", "controller."),
+    ("controller = { kind = 'terminal', p = 2.0 }", "controller.p is 2.0", "between 1 and 2"),
+    (
+        "controller = { kind = 'fixed_time', gamma = 1.7 }\nloop.mode = 'sampled'",
+        "controller.gamma is 1.7",
+        "greater than 1 + 1/p, 1.8",
+    ),
+    (
+        "controller.kind = 'pd'\nloop.mode = 'sampled'\ntune.free = ['eta']",
+        'tune.free is ["eta"], but the law of controller.kind = "pd" has no eta',
+        "allowed is some of t_f, k_p, k_d, observer_gain",
+    ),
+    ("tune.free = ['k_p']", 'controller.kind = "prescribed_time" has no k_p', "eta, delta"),
+    (
+        "controller.kind = 'terminal'\nloop.mode = 'sampled'\ntune = { free = ['p'], bounds = { p = [1.0, 1.9] } }",
+        "tune.bounds.p is [1.0, 1.9]",
+        "above 1.0 and below 2.0",
+    ),
     ("controller.error = 'left'", 'controller.error is "left"', '"additive" or "multiplicative"'),
     ("observer.kind = 'luenberger'", 'observer.kind is "luenberger"', '"finite_time" or "prescribed_time"'),
     (FINITE + "observer.gain = [1e-4, 1, 1]", "observer.gain is [0.0001", "controller.disturbance_rate_bound, 0.001"),

@@ -23,7 +23,7 @@ FLOORS = {
         signals hardware
         observers laws clock
         controllers
-        sensors
+        sensors baselines
         metrics
         rollout
         components
@@ -58,7 +58,7 @@ FLOORS = {
         optimise
         evolution
         report single reproduction mapping
-        results pareto campaign_folder
+        results pareto compare campaign_folder
         campaign_summary
         show show_campaign options
         campaign_commands

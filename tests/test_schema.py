@@ -12,6 +12,7 @@ from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import (
     Attitude,
     AxesWheels,
+    Baseline,
     ChainPlant,
     GravityGradient,
     Prescribed,
@@ -100,6 +101,14 @@ ATTITUDES = [
     {"euler_deg": [10.0, 20.0, 30.0], "sequence": "ZYX"},
 ]
 DRAWN_ATTITUDES = {"axis_angle": {"min_deg": 20.0, "max_deg": 140.0}, "normal": {"std_deg": 3.0}, "uniform": {}}
+BASELINE = {"t_f": 30.0, "disturbance_rate_bound": 1e-3, "disturbance_bound": 0.01, "initial_estimate_error": 0.0}
+BASELINES = {
+    "pd": {"k_p": 0.2, "k_d": 0.6},
+    "terminal": {"p": 1.3, "b": 0.1, "k": 0.1, "sign_width": 1e-3},
+    "fixed_time": {
+        "a1": 0.1, "b1": 0.2, "a2": 1.0, "b2": 1.0, "p": 1.25, "gamma": 2.0, "m": 1.5, "n": 0.5, "sign_width": 1e-3,
+    },
+}  # fmt: skip
 # every key of every table, one table at a time so that what is made wrong in it is all that is wrong
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SYSTEM_CONTROLLER = {key: value for key, value in CHAIN_DEFAULTS["controller"].items() if key != "a"}
@@ -170,6 +179,7 @@ COMPLETE = [
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
     {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
+    *({"controller": {"kind": kind, **gains, **BASELINE}} for kind, gains in BASELINES.items()),
     {"observer": {"kind": "none"}},
     {"observer": {"kind": "finite_time", "gain": [0.1, 0.1, 0.1], "sign_width": 1e-5}},
     {"observer": {"kind": "prescribed_time", "gain": [1.0, 1.0, 1.0], "mu": 3.0, "t_o": 6.0, "delta_o": 0.1}},
@@ -291,6 +301,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
     named.pop(Actuators)
     named.pop(WheelLimits)
     named.pop(Prescribed)
+    named.pop(Baseline)
     named.pop(SumDisturbance)  # of tables that are looked at like any other
     named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
     for wheels in (PyramidWheels, AxesWheels):

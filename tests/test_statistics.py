@@ -72,6 +72,9 @@ def test_drivers_are_found_and_shared_out():
     assert found["x"]["first_order"] == pytest.approx(0.89, abs=0.02)
     assert found["y"]["first_order"] == pytest.approx(0.09, abs=0.02)
     assert found["z"]["first_order"] < 0.004  # chance alone would show 31 of 60 000 bins' worth, which is taken off
+    # with few trials a bin chance alone would show 31/1280 = 0.024 of the variance, on average
+    chance = statistics.drivers({str(k): rng.normal(size=1280) for k in range(40)}, rng.normal(size=1280))
+    assert np.mean([one["first_order"] for one in chance.values()]) < 0.01
     even = statistics.drivers({"x": x}, x**2)
     assert abs(even["x"]["rank_correlation"]) < 0.02  # it sees no direction
     assert even["x"]["first_order"] > 0.98  # but nothing else drives it

@@ -193,6 +193,41 @@ def pareto(
     )  # fmt: skip
 
 
+@app.command
+def compare(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = "0",
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Tune the paper's law and three others to the same requirements, and judge all on the same fresh trials.
+
+    The others are quaternion PD, nonsingular terminal and fixed-time sliding mode. Interrupted or killed, the same
+    command goes on from there.
+
+    Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
+    interrupted.
+    """
+    key = whole("--seed", seed)
+    loaded, folder = prepare(scenario, "compare", out)
+    from tuning import compare as comparing
+
+    comparing.check(loaded)
+    loaded = _with_tune(loaded)
+    known_by = comparing.told(loaded, key)
+    return _search(
+        loaded, folder, known_by, force, quiet, "",
+        work=lambda told, journal: comparing.compare(loaded, key, told, journal),
+        write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
+        summary=comparing.summary,
+        shown=show.comparison,
+    )  # fmt: skip
+
+
 for _command in (
     campaign_commands.montecarlo,
     campaign_commands.summarize,

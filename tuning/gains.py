@@ -27,6 +27,15 @@ UNITS = {
         "sign_width": "-",
         "t_f": "s",
         "filter_bandwidth": "rad/s",
+        "k_p": "1/s^2",
+        "k_d": "1/s",
+        "b": "1/s^p",
+        "k": "1/s^2",
+        "a1": "1/s",
+        "b1": "1/s",
+        "a2": "1/s^(2-p)",
+        "b2": "1/s^(2-p)",
+        **dict.fromkeys(("p", "gamma", "m", "n"), "-"),
     },
     "chain": {**_STATE_UNITS, "sign_width": "s"},
     "system": _STATE_UNITS,
@@ -71,11 +80,12 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 def gains_of(parts: Parts) -> dict[str, float]:
     """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
     controller = parts.controller
-    gains = {name: float(getattr(controller, name)) for name in ("eta", "delta")}
+    law = [name for name in controller.free if name not in ("k1", "sign_width", "t_f")]
+    gains = {name: float(getattr(controller, name)) for name in law}
     each = [float(v) for v in getattr(parts.observer, "gain", ())]
     if each:
         gains["observer_gain"] = sum(each) / len(each)
-    gains |= {name: float(getattr(controller, name)) for name in ("k1", "sign_width", "t_f")}
+    gains |= {name: float(getattr(controller, name)) for name in controller.free if name not in law}
     if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
     return {**gains, **{f"{_AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
@@ -111,6 +121,21 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
         gains["eta"] = scenario.plant.order + 1.0
     papers = isinstance(scenario.observer, tables.NonlinearObserver | tables.EachNonlinearObserver)
     return {**gains, "observer_gain": 10.0} if papers else gains
+
+
+def papers(scenario: Scenario) -> Scenario:
+    """The scenario under the paper's law with the paper's gains for its plant."""
+    table, own = scenario.controller, of_paper(scenario)
+    if isinstance(table, tables.Baseline):
+        kept = {key: getattr(table, key) for key in tables.Baseline.__struct_fields__}
+        law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
+        scenario = scenarios.replace(scenario, tune=None, controller=law)
+    return in_scenario(scenario, own)
+
+
+def differ(one: Scenario, other: Scenario) -> bool:
+    """Whether two scenarios fly another law or other gains."""
+    return any(getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "filter"))
 
 
 def _each(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ptsmc_jax import drawing, linear, montecarlo, schema, store, study_plots
 from ptsmc_jax.clock import Anchored, Flight
+from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.observers import NonlinearObserver, NoObserver
 from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.rollout import Parts
@@ -152,7 +153,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     parts = ready.parts
-    if ready.scenario.loop.mode == "sampled" and isinstance(parts.plant, Spacecraft):
+    papers = isinstance(parts.controller, Prescribed) and isinstance(parts.plant, Spacecraft)
+    if ready.scenario.loop.mode == "sampled" and papers:
         found = linear.margins(parts)
         at, hold = found["hand_over"], found["hold"]
         known |= {"radius": at.radius, "gain_margin": at.gain, "delay_margin": at.delay}
@@ -168,7 +170,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
     second_order = getattr(scenario.plant, "order", 2) == 2
-    if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order:
+    papers = hasattr(scenario.controller, "eta")
+    if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order or not papers:
         return {}
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)

@@ -87,7 +87,9 @@ def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates |
 
 
 def with_sign(problem: Problem, width: float) -> Problem:
-    """The problem flown with another width of the smooth sign; 0 is the exact one."""
+    """The problem flown with another width of the smooth sign, if its law has one; 0 is the exact one."""
+    if not hasattr(problem.parts.controller, "sign_width"):
+        return problem
     controller = replace(problem.parts.controller, sign_width=jnp.asarray(float(width)))
     return replace(problem, parts=replace(problem.parts, controller=controller))
 

@@ -202,7 +202,7 @@ class Run:
 
     def descend(self, problem: Problem, z: np.ndarray, steps: int, what: str) -> None:
         """All starts by Adam, then a polish of the best ones."""
-        tightened, self._width = self._tightened(problem), float(problem.parts.controller.sign_width)
+        tightened, self._width = self._tightened(problem), float(getattr(problem.parts.controller, "sign_width", 0.0))
         best, alive = Best(z, len(problem.metrics), self._margin), np.ones(len(z), dtype=bool)
         # slopes range over decades as limits are crossed: clipped, and with a short memory of their size
         rate = optax.cosine_decay_schedule(RATE, steps, LAST_RATE / RATE)
@@ -279,8 +279,8 @@ class Run:
             if self.best_so_far[1] >= before[1] and f - best.f[best.order()[0]] < GAINED:
                 return
 
-    def _refine(self, tightened: Problem, rng: np.random.Generator) -> None:
-        """Better points around the best ones, without slopes, ever closer."""
+    def _refine(self, tightened: Problem, rng: np.random.Generator, *, widely: bool = True) -> None:
+        """Better points around the best one, without slopes, ever closer; widely: around other good ones too."""
         best, count = self._best, len(tightened.names)
         assert best is not None
         chosen: list[int] = []
@@ -288,7 +288,7 @@ class Run:
             apart = [np.abs(share_of(best.z[k]) - share_of(best.z[j])).max() for j in chosen]
             if np.isfinite(best.f[k]) and min(apart, default=1.0) >= APART / 2:
                 chosen.append(int(k))
-        passes = [*chosen[:FOLLOWED], None, None] if self._exact else [None]
+        passes = [*chosen[:FOLLOWED], None, None] if self._exact and widely else [None]
         for one in passes:  # the best one of all twice more
             start = int(best.order()[0]) if one is None else one
             for k in range(REFINED):
@@ -310,7 +310,7 @@ class Run:
         if self._exact:
             tightened = self._tightened(with_sign(problem, 0.0))
             self._as_judged(tightened, np.concatenate([self._best.z, known]))
-        self._refine(tightened, rng)
+        self._refine(tightened, rng, widely=False)
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended

@@ -17,6 +17,7 @@ from ptsmc_jax import drawing, metrics, schema, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.scenario import replace as changed
+from ptsmc_jax.scenario import study
 from ptsmc_jax.schema import wrong
 from ptsmc_jax.tables import Limit, Scenario
 from tuning import gains, report, trust
@@ -123,13 +124,12 @@ def trace(
         if all(np.abs(best[k][2] - other[2]).max() >= APART for other in climbed.values()):
             climbed[float(ladder[k])] = best[k]
     judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
-    others, known_gains = {"paper": gains.of_paper(scenario)}, gains.gains_of(ready.parts)
-    at_start = {name: known_gains[name] for name in others["paper"]}
-    if at_start != others["paper"]:
-        others["before"] = at_start
+    others = {"paper": gains.papers(limited)}
+    if gains.differ(limited, others["paper"]):
+        others["before"] = limited
     fixed = {}
-    for name, values in others.items():
-        trials = report.judge(gains.in_scenario(limited, values), fresh_seed, ready.requirements)
+    for name, other in others.items():
+        trials, values = report.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
         fixed[name] = _point(np.nan, values, np.nan, trials, ready.requirements)
     count = next(iter(judged.values()))[1].status.size if judged else 0
     return Front(_marked(judged), fixed, fresh_seed, count, evaluate.rollouts, evaluate.gradients)

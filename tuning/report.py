@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax import draws, montecarlo, tables
+from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
 from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_within
@@ -80,10 +81,12 @@ def tune(
     journal: Journal | None = None,
     *,
     globally: bool = False,
+    trusted: bool = True,
 ) -> Tuning:
     """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw.
 
-    journal: of evaluations, from which an interrupted run goes on; globally: compare with differential evolution.
+    journal: of evaluations, from which an interrupted run goes on; globally: compare with differential evolution;
+    trusted: find out what makes the result believable too.
     """
     table = scenario.tune
     assert table is not None
@@ -112,9 +115,8 @@ def tune(
     trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
-    paper, at_start = gains.of_paper(scenario), gains.gains_of(ready.parts)
-    candidates = {"tuned": tuned, "paper": gains.in_scenario(scenario, paper)}
-    if any(at_start[name] != paper.get(name, at_start[name]) for name in at_start):
+    candidates = {"tuned": tuned, "paper": gains.papers(scenario)}
+    if gains.differ(scenario, candidates["paper"]):
         candidates["before"] = scenario
     fresh, judged_gains = {}, {}
     for name, candidate in candidates.items():
@@ -125,10 +127,10 @@ def tune(
     ]
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
-    if limit is not None and T_F not in problem.names:
+    if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
         shortest = shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
     believed = smooth_value = None
-    if not found.interrupted:
+    if trusted and not found.interrupted:
         if posed.exact:
             smooth_value = float(np.exp(evaluate.fly(found.smooth, found.z[None]).value[0]))
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
@@ -192,7 +194,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
         torque_weight=table.torque_weight,
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
-    exact = scenario.loop.mode == "sampled" and "sign_width" not in bounds.names  # as `as_flown` judges
+    smooth = hasattr(scenario.controller, "sign_width") and "sign_width" not in bounds.names
+    exact = smooth and scenario.loop.mode == "sampled"  # as `as_flown` judges
     if exact and float(ready.parts.controller.sign_width) == 0.0:  # nothing to descend by
         problem = objective.with_sign(problem, SMOOTH)
     return Posed(ready, problem, Evaluator(bounds, journal), own, exact)
@@ -215,7 +218,9 @@ def as_flown(scenario: Scenario) -> Scenario:
     if scenario.loop.mode != "sampled":
         return scenario
     changes: dict[str, Any] = {"loop__clock": "flight"}
-    if scenario.tune is None or "sign_width" not in gains.named(scenario):
+    if hasattr(scenario.controller, "sign_width") and (
+        scenario.tune is None or "sign_width" not in gains.named(scenario)
+    ):
         changes["controller__sign_width"] = 0.0
     return replace(scenario, **changes)
 

@@ -1,6 +1,6 @@
 """What the commands print: progress while they work, results when they are done."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +212,42 @@ def _trust(summary: dict[str, Any]) -> Iterator[str]:
         off = believed["slopes_off_central_differences"]
         shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items() if value is not None)
         yield f"slopes by automatic differentiation agree with differences to {shown}"
+
+
+def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """Laws side by side, as `summary.json` says."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console, laws = Console(highlight=False), summary["laws"]
+    table = Table("", *(law.replace("_", " ") for law in laws), "unit", box=None, pad_edge=False)
+
+    def row(label: str, unit: str, value: Callable[[dict[str, Any]], float | None], digits: str = ".3g") -> None:
+        cells = (value(found) for found in laws.values())
+        table.add_row(label, *("-" if cell is None else f"{cell:{digits}}" for cell in cells), unit)
+
+    row("RMS window error", "-", lambda found: found["window_error"], ".2e")
+    row("mean peak torque", "N m", lambda found: found["peak_torque"])
+    row("largest", "N m", lambda found: found["largest_peak_torque"])
+    row("mean effort", "N m s", lambda found: found["effort"])
+    row("mean chattering", "N m/s", lambda found: found["chattering"])
+    row("settles, median", "s", lambda found: (found["settling_time"] or {}).get("0.5"), ".1f")
+    row("  nearest fifth", "s", lambda found: (found["settling_near_far"] or [None])[0], ".1f")
+    row("  farthest fifth", "s", lambda found: (found["settling_near_far"] or [None])[-1], ".1f")
+    row("  never", "", lambda found: found["unsettled"], "d")
+    table.add_row("all limits met", *("yes" if found["met"] else "no" for found in laws.values()), "")
+    told = f"each law tuned alike, judged on {summary['trials']} fresh trials"
+    console.print(f"comparison {how}: {told}, flight clock, exact sign", soft_wrap=True)
+    console.print(table)
+    for law, found in summary["laws"].items():
+        gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
+        bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
+        console.print(f"{law}: {gains}{bound}", soft_wrap=True)
+        missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
+        if missed:
+            console.print(f"  of {summary['trials']} trials {', '.join(missed)}", soft_wrap=True)
+    console.print(f"settles: from when the angle stays below {summary['settling_angle']:g} rad", soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:

@@ -1,0 +1,147 @@
+"""The laws to compare with, against the identities and closed forms that they are made for."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import attitude, baselines, clock, numerics, plants, rollout, signals
+from tests import helpers
+from tests.helpers import FULL_INERTIA, vector
+
+BODY = plants.spacecraft(FULL_INERTIA)
+COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
+LAWS = {
+    "pd": baselines.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
+    "terminal": baselines.Terminal(
+        **COMMON, p=vector(1.3), b=vector(0.6), k=vector(0.5), sign_width=vector(1e-3)
+    ),
+    "fixed_time": baselines.FixedTime(
+        **COMMON, a1=vector(0.3), b1=vector(0.5), a2=vector(1.2), b2=vector(0.7), p=vector(1.25), gamma=vector(2.0),
+        m=vector(1.5), n=vector(0.5), sign_width=vector(1e-3),
+    ),
+}  # fmt: skip
+SLIDING = ("terminal", "fixed_time")
+T = vector(1.3)
+TARGET = signals.Spin(vector(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()), vector([0.02, -0.01, 0.03]))(T)
+X = plants.AttitudeState(vector(Rotation.from_rotvec([1.1, 0.4, -0.8]).as_quat()), vector([0.05, -0.11, 0.07]))
+D = vector([0.02, -0.01, 0.015])
+
+
+def accelerated(law, k2=0.0):
+    """V'' of the error quaternion under the law, with d known exactly, by the plant's own equations."""
+    u, s = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(k2))
+    motion = BODY.rate(T, X, u, D)
+
+    def v_dot(t):  # along the motion, to first order in t; the reference moves on too
+        later = jax.tree.map(lambda x, rate: x + t * rate, X, motion)
+        rate = TARGET.w
+        q = TARGET.q + t * 0.5 * attitude.multiply(TARGET.q, jnp.concatenate([rate, jnp.zeros(1)]))
+        return law.errors(later, signals.Target(q, rate + t * TARGET.w_dot, TARGET.w_dot))[1]
+
+    return jax.jvp(v_dot, (vector(0.0),), (vector(1.0),))[1], s
+
+
+@pytest.mark.parametrize("name", SLIDING)
+def test_the_torque_gives_the_error_the_acceleration_that_the_law_asks_for(name):
+    law = LAWS[name]
+    v, v_dot = law.errors(X, TARGET)
+    _, wanted = law.surface(v, v_dot)
+    np.testing.assert_allclose(accelerated(law)[0], wanted, rtol=1e-12, atol=1e-14)
+    # with a bound on the estimation error it also switches, by |T J^-1| K2 / 2
+    got, s = accelerated(law, k2=0.03)
+    switching = 0.5 * law.influence(X, TARGET) * 0.03 * np.tanh(s / 1e-3)
+    np.testing.assert_allclose(got, wanted - switching, rtol=1e-9)
+
+
+def test_pd_turns_the_body_as_its_formula_says():
+    """w_e' = -k_p v - k_d w_e, whatever the inertia, the reference's motion and a known disturbance."""
+    law = LAWS["pd"]
+    u, _ = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(0.7))
+    w_dot = BODY.rate(T, X, u, D).w
+    q_e = Rotation.from_quat(np.array(TARGET.q)).inv() * Rotation.from_quat(np.array(X.q))
+    v = np.asarray(q_e.as_quat(canonical=True))[:3]
+    carried = q_e.inv().apply(np.array(TARGET.w))
+    w_e = np.asarray(X.w) - carried
+    wanted = -0.4 * v - 0.9 * w_e + q_e.inv().apply(np.array(TARGET.w_dot)) - np.cross(w_e, carried)
+    np.testing.assert_allclose(w_dot, wanted, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", SLIDING)
+@pytest.mark.parametrize("trial", range(5))
+def test_the_surfaces_draw_near_as_their_papers_say(name, trial):
+    """s' by automatic differentiation along v'' = alpha: what the law was solved for."""
+    law = LAWS[name]
+    rng = np.random.default_rng(trial)
+    v, v_dot = vector(rng.uniform(-0.8, 0.8, 3)), vector(rng.uniform(-0.3, 0.3, 3))
+    s, alpha = law.surface(v, v_dot)
+    s_dot = jax.jvp(lambda v, v_dot: law.surface(v, v_dot)[0], (v, v_dot), (v_dot, alpha))[1]
+    if name == "terminal":
+        wanted = -(1.3 / 0.6) * np.abs(v_dot) ** 0.3 * 0.5 * np.asarray(s)
+    else:
+        power = {a: np.sign(s) * np.abs(s) ** a for a in (1.5, 0.5)}
+        wanted = -(np.abs(v_dot) ** 0.25) * (1.2 * power[1.5] + 0.7 * power[0.5])
+    np.testing.assert_allclose(s_dot, wanted, rtol=1e-10, atol=1e-13)
+
+
+def flown(law, angle, rate, t_end, period=0.005):
+    """History of the angle about the z axis of a body with no disturbance, sampled quickly."""
+    q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
+    body = plants.spacecraft((10.0, 12.0, 14.0))
+    law = replace(law, model=body, t_f=vector(t_end - 1.0), delta=vector(period))
+    run = helpers.parts(t_end - 1.0, 3.0, period, inertia=(10.0, 12.0, 14.0), q=q, rate=(0.0, 0.0, rate), period=period,
+                        t_end=t_end, disturbance=signals.Constant(jnp.zeros(3)))  # fmt: skip
+    run = replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))
+    log = rollout.simulate_jit(run, record=True).log
+    kept = np.asarray(log.lasts)
+    return np.asarray(log.t)[kept], np.asarray(log.error)[kept, 2]
+
+
+def test_pd_flies_its_eigenaxis_equation():
+    """theta'' + k_d theta' + k_p sin(theta/2) = 0; held over 5 ms, which is what the two differ by."""
+    t, v = flown(LAWS["pd"], 2.0, 0.0, 15.0)
+    exact = solve_ivp(lambda _, y: (y[1], -0.9 * y[1] - 0.4 * np.sin(y[0] / 2)), (0.0, 15.0), (2.0, 0.0), t_eval=t,
+                      rtol=1e-10, atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(v, np.sin(exact.y[0] / 2), atol=2e-3)
+    halved = flown(LAWS["pd"], 2.0, 0.0, 15.0, period=0.0025)
+    late = [np.abs(np.interp(12.0, *run) - np.sin(np.interp(12.0, t, exact.y[0]) / 2)) for run in ((t, v), halved)]
+    assert late[1] < 0.6 * late[0]  # and it halves with the period
+
+
+def sliding(name, v):
+    """V' on the surface s = 0."""
+    return -((0.6 * v) ** (1 / 1.3)) if name == "terminal" else -(0.3 * v**2.0 + 0.5 * v**0.8)
+
+
+@pytest.mark.parametrize("v", [0.1, 0.4, 0.8])
+@pytest.mark.parametrize("name", SLIDING)
+def test_on_their_surfaces_they_arrive_when_their_papers_say(name, v):
+    law = replace(LAWS[name], k=vector(5.0)) if name == "terminal" else LAWS[name]
+    arrival = quad(lambda v: -1.0 / sliding(name, v), 0.0, v)[0]
+    if name == "terminal":
+        np.testing.assert_allclose(arrival, v ** (1 - 1 / 1.3) * 1.3 / (0.3 * 0.6 ** (1 / 1.3)), rtol=1e-6)
+    else:
+        assert arrival < 1 / (0.3 * 1.0) + 1.25 / (0.5 * 0.25)  # the bound, wherever it starts
+    rate = 2.0 * sliding(name, v) / np.sqrt(1.0 - v * v)
+    t, error = flown(law, 2.0 * np.arcsin(v), rate, arrival + 3.0)
+    before = t < 0.95 * arrival
+    exact = solve_ivp(lambda _, y: sliding(name, np.maximum(y, 0.0)), (0.0, 0.95 * arrival), (v,), t_eval=t[before],
+                      rtol=1e-10, atol=1e-13)  # fmt: skip
+    np.testing.assert_allclose(error[before], exact.y[0], atol=4e-3 * v)  # held over 5 ms
+    assert np.abs(error[t > arrival]).max() < 1e-3 * v
+
+
+def test_signed_powers():
+    x = vector([-2.0, -1e-9, 0.0, 0.5, 3.0])
+    for a in (0.3, 1.0, 1.7):
+        np.testing.assert_allclose(numerics.signed_power(x, vector(a)), np.sign(x) * np.abs(x) ** a, rtol=1e-14)
+        slope = jax.vmap(jax.grad(lambda v, a=a: numerics.signed_power(v, vector(a))))(x)
+        known = np.asarray(x) != 0.0
+        np.testing.assert_allclose(slope[known], a * np.abs(x[known]) ** (a - 1.0), rtol=1e-12)
+        assert slope[~known] == 0.0
+    by_power = jax.jvp(lambda a: numerics.signed_power(x, a), (vector(0.7),), (vector(1.0),))[1]
+    assert np.all(np.isfinite(by_power))
