@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO := scenarios/first_flight.toml
 OUT := out/tune-first_flight
 
-.PHONY: tune test setup table clean
+.PHONY: tune test setup table notebooks notebooks-kept clean
 
 tune: $(VENV)/.installed
 	$(BIN)/ptsmc tune $(SCENARIO) --out $(OUT)
@@ -20,6 +20,13 @@ test: $(VENV)/.installed-dev
 table: $(VENV)/.installed
 	$(BIN)/python -m tuning.table
 
+notebooks: $(VENV)/.installed-notebooks
+	$(BIN)/jupyter lab notebooks
+
+# the notebooks executed, and kept with their outputs beside their sources
+notebooks-kept: $(VENV)/.installed-dev
+	$(BIN)/python notebooks/execute.py
+
 setup: $(VENV)/.installed-dev
 
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -30,6 +37,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-notebooks: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[notebooks]'
 	@touch $@
 
 clean:

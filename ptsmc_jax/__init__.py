@@ -30,7 +30,11 @@ _EXPORTS = {
     "Parts": "rollout",
     "Result": "rollout",
     "STATUS": "rollout",
-    "simulate": "rollout",
+    "simulate": "explore",
+    "trials": "explore",
+    "verdicts": "explore",
+    "read": "scenario",
+    "replace": "scenario",
     "simulate_jit": "rollout",
     "Metrics": "metrics",
     "Dispersion": "dispersions",
@@ -53,6 +57,9 @@ if TYPE_CHECKING:
     from ptsmc_jax.controllers import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
     from ptsmc_jax.controllers import PrescribedTimeSystem as PrescribedTimeSystem
     from ptsmc_jax.dispersions import Dispersion as Dispersion
+    from ptsmc_jax.explore import simulate as simulate
+    from ptsmc_jax.explore import trials as trials
+    from ptsmc_jax.explore import verdicts as verdicts
     from ptsmc_jax.metrics import Metrics as Metrics
     from ptsmc_jax.observers import FiniteTimeObserver as FiniteTimeObserver
     from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
@@ -69,9 +76,10 @@ if TYPE_CHECKING:
     from ptsmc_jax.rollout import STATUS as STATUS
     from ptsmc_jax.rollout import Parts as Parts
     from ptsmc_jax.rollout import Result as Result
-    from ptsmc_jax.rollout import simulate as simulate
     from ptsmc_jax.rollout import simulate_jit as simulate_jit
     from ptsmc_jax.scenario import Study as Study
+    from ptsmc_jax.scenario import read as read
+    from ptsmc_jax.scenario import replace as replace
     from ptsmc_jax.scenario import study as study
     from ptsmc_jax.schema import ScenarioError as ScenarioError
     from ptsmc_jax.sensors import Sensors as Sensors

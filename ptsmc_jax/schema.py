@@ -23,6 +23,10 @@ from ptsmc_jax.tables import ATTITUDE_KEYS, Limit, Positive, Scenario, Table, Tr
 class ScenarioError(ValueError):
     """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed."""
 
+    def _render_traceback_(self) -> list[str]:
+        """In a notebook that sentence, and nothing of how it came about: IPython asks for this."""
+        return [f"ScenarioError: {self}"]
+
 
 def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
     """The error for a key whose value is not allowed."""

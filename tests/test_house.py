@@ -45,7 +45,8 @@ FLOORS = {
         montecarlo runs
         store remark_2 drawing rows statistics
         plotting study_plots campaign_plots campaign
-        cluster
+        cluster animation
+        explore
         paper
         slips
     """,

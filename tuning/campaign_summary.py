@@ -129,7 +129,7 @@ def write_summary(folder: Folder, found: dict[str, Any], figures: bool) -> None:
     def fill(making: Path) -> None:
         store.write_json(making / "summary.json", found)
         if figures:
-            drawing.save(_figures(folder, found), making / "figures")
+            drawing.save(figures_of(folder, found), making / "figures")
 
     store.write(folder.path, fill)
 
@@ -162,7 +162,8 @@ def replay(folder: Folder, trial: int) -> tuple[runs.Run, float | None]:
     return run, off if row["status"] == run.status else np.inf
 
 
-def _figures(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
+def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
+    """Figures of a campaign by name."""
     parts, ready, kind = folder.whole_parts(), folder.campaign.ready, folder.scenario.plant.kind
     limits = {r.metric: r.limit for r in ready.requirements}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))

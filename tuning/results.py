@@ -126,7 +126,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     ]
     store.write_csv(folder / "history.csv", ["step", "start", goal, *gain_names.named(scenario), *over], rows)
     if figures:
-        drawing.save(_figures(scenario, tuning), folder / "figures")
+        drawing.save(figures_of(scenario, tuning), folder / "figures")
 
 
 def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
@@ -135,7 +135,8 @@ def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
     return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
 
 
-def _figures(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+    """Figures of a tuning run by name."""
     assert scenario.tune is not None
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]

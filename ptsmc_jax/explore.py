@@ -1,0 +1,153 @@
+"""For notebooks: a scenario flown, looked at and plotted in a line each. The pure core is `rollout.simulate`."""
+
+import html
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure
+
+from ptsmc_jax import animation, campaign, metrics, plotting, runs, scenario
+from ptsmc_jax.montecarlo import OwnMetrics
+from ptsmc_jax.requirements import Verdict
+from ptsmc_jax.rollout import FINISHED, STATUS
+from ptsmc_jax.runs import Run
+from ptsmc_jax.tables import Scenario
+
+
+class Quantities(Mapping[str, float]):
+    """Numbers by name, shown with their units and meanings."""
+
+    def __init__(self, values: Mapping[str, float], catalogue: Mapping[str, tuple[str, str]]):
+        self._values, self._catalogue = dict(values), catalogue
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name][0]}" for name, value in self.items())
+
+    def _repr_html_(self) -> str:
+        rows = [(name, _number(value), *self._catalogue[name]) for name, value in self.items()]
+        return _table(("metric", "value", "unit", "meaning"), rows)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A run of a scenario."""
+
+    scenario: Scenario
+    run: Run
+
+    @property
+    def status(self) -> str:
+        """Ok, missed, singular or diverged."""
+        return self.run.status
+
+    @property
+    def metrics(self) -> Quantities:
+        """What the run is judged by, see `metrics.CATALOGUE` for units; settling_time is NaN where it never settles."""
+        return Quantities(self.run.metrics, self.run.catalogue)
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """One for each requirement of the scenario."""
+        return self.run.verdicts
+
+    def plot(self, *names: str) -> "Figures":
+        """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
+        limit = next((v.limit for v in self.run.verdicts if v.metric.startswith("peak_torque")), None)
+        made = plotting.run_figures(self.run.parts, self.run.log, limit)
+        unknown = [name for name in names if name not in made]
+        if unknown:
+            raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(made)}")
+        return Figures({name: made[name] for name in names or made})
+
+    def animate(self, frames: int = 40) -> "animation.Animation":
+        """The body turning toward its reference, in three dimensions; spacecraft only, else raises ValueError."""
+        return animation.of_run(self.run.parts, self.run.log, frames)
+
+    def to_polars(self) -> pl.DataFrame:
+        """The history, a row a sample: t [s], state, estimate, delivered torque, sliding variable, error."""
+        log = self.run.log
+        blocks = {**self.run.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s, "error": log.error}
+        columns = {f"{name}{k + 1}": np.asarray(block)[:, k] for name, block in blocks.items()
+                   for k in range(np.shape(block)[1])}  # fmt: skip
+        return pl.DataFrame({"t": np.asarray(log.t), **columns})
+
+    def __repr__(self) -> str:
+        return "\n".join([self._said(), repr(self.metrics), *map(str, self.verdicts)])
+
+    def _repr_html_(self) -> str:
+        verdicts = "".join(f"<li>{html.escape(str(v))}</li>" for v in self.verdicts)
+        return f"<p>{html.escape(self._said())}</p>{self.metrics._repr_html_()}<ul>{verdicts}</ul>"
+
+    def _said(self) -> str:
+        why = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
+        return f"status: {self.status}{why}"
+
+
+class Figures(dict[str, Figure]):
+    """Figures by name, shown one below the other."""
+
+    def _repr_html_(self) -> str:
+        import base64
+        import io
+
+        shown = []
+        for figure in self.values():
+            buffer = io.BytesIO()
+            figure.savefig(buffer, dpi=90)
+            shown.append(f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">')
+        return "".join(shown)
+
+
+def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = None) -> Flight:
+    """Fly a scenario, or the scenario of a file, once: nominal, or a trial with its dispersions and noise.
+
+    Raises ScenarioError, with one sentence, where it cannot be flown.
+    """
+    known = what if isinstance(what, Scenario) else scenario.read(what)
+    return Flight(known, runs.fly(scenario.study(known, drawn=trial is not None), seed, trial))
+
+
+def trials(
+    what: Scenario | str | Path, count: int = 1000, *, seed: int = 0, own: OwnMetrics | None = None
+) -> pl.DataFrame:
+    """Rows of the first `count` trials of a scenario, as `ptsmc montecarlo` keeps them.
+
+    Number, status, reason, bad_time [s], the metrics in the units of `metrics.CATALOGUE`, what each trial flew with,
+    and metrics of one's own (see `montecarlo.one`).
+    """
+    known = what if isinstance(what, Scenario) else scenario.read(what)
+    return campaign.Campaign(scenario.study(known), seed, own).fly(0, count)
+
+
+def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
+    """One for each requirement of the scenario over these rows; a failed trial breaks every one."""
+    finished = rows["status"].is_in([STATUS[code][0] for code in FINISHED]).to_numpy()
+    wanted = scenario.study(what).requirements
+    return [r.verdict(rows[r.metric].to_numpy().astype(float), finished) for r in wanted]
+
+
+def units(kind: str = "spacecraft") -> dict[str, str]:
+    """The unit of each metric of this kind of plant."""
+    return {name: unit for name, (unit, _) in metrics.CATALOGUES[kind].items()}
+
+
+def _number(value: float) -> str:
+    return "-" if value != value else f"{value:.5g}"
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    cells = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table>"

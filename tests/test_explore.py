@@ -1,0 +1,108 @@
+import re
+import tomllib
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+import ptsmc_jax
+from ptsmc_jax import animation, campaign, explore, metrics, runs, scenario
+from ptsmc_jax.schema import ScenarioError
+from tests.helpers import SHORT
+
+TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return ptsmc_jax.simulate(scenario.from_tables(TABLES), seed=3, trial=7)
+
+
+def test_a_flight_is_the_run_of_its_trial(flight):
+    run = runs.fly(scenario.study(flight.scenario), 3, 7)
+    assert list(flight.metrics) == list(run.metrics)
+    np.testing.assert_array_equal(list(flight.metrics.values()), list(run.metrics.values()))
+    assert flight.status == run.status == "ok"
+    assert [str(v) for v in flight.verdicts] == [str(v) for v in run.verdicts]
+    frame = flight.to_polars()
+    assert frame.columns[:8] == ["t", *(f"q{k}" for k in range(1, 5)), *(f"w{k}" for k in range(1, 4))]
+    np.testing.assert_array_equal(frame["u2"], run.log.u[:, 1])
+    error = np.sqrt(sum(frame[f"error{k}"].to_numpy() ** 2 for k in (1, 2, 3)))
+    assert flight.metrics["hold_error"] == pytest.approx(error[frame["t"].to_numpy() >= 5.0].max(), rel=0.05)
+
+
+def test_a_file_is_read_and_errors_are_those_of_the_command(tmp_path):
+    (tmp_path / "s.toml").write_text(SHORT)
+    assert ptsmc_jax.simulate(tmp_path / "s.toml").status == "ok"
+    with pytest.raises(ScenarioError, match="is not there"):
+        ptsmc_jax.simulate(tmp_path / "none.toml")
+    with pytest.raises(ScenarioError, match=r"controller\.eta is 1\.5, but must be a number greater than 2") as caught:
+        ptsmc_jax.replace(scenario.from_tables(TABLES), controller__eta=1.5)
+    # what IPython shows in the place of a traceback
+    assert caught.value._render_traceback_() == [f"ScenarioError: {caught.value}"]
+
+
+def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():
+    turned = scenario.from_tables({"initial": {"rotvec_deg": [180.0, 0.0, 0.0]}, "dispersion": {"attitude": {}}})
+    with pytest.raises(ScenarioError, match="q4 = 0"):
+        ptsmc_jax.simulate(turned)
+    assert ptsmc_jax.simulate(turned, trial=0).status in ("ok", "missed")
+
+
+def test_tables_show_units_and_escape_what_they_show(flight):
+    shown = flight._repr_html_()
+    for name, (unit, meaning) in flight.run.catalogue.items():
+        assert f"<td>{name}</td>" in shown
+        assert f"<td>{unit}</td>" in shown
+        assert meaning.replace("'", "&#x27;") in shown
+    assert "status: ok" in repr(flight)
+    assert re.search(r"peak_torque +[\d.]+ N m", repr(flight.metrics))
+    hostile = explore.Quantities({"<b>": 1.0}, {"<b>": ("<script>", "&")})
+    assert "<b>" not in hostile._repr_html_()
+    assert "<script>" not in hostile._repr_html_()
+    assert "&lt;script&gt;" in hostile._repr_html_()
+    assert explore.units()["effort"] == metrics.CATALOGUE["effort"][0]
+
+
+def test_figures_by_name(flight):
+    assert set(flight.plot()) == {"attitude", "rate", "error", "sliding", "torque", "convergence", "disturbance"}
+    two = flight.plot("error", "torque")
+    assert list(two) == ["error", "torque"]
+    assert two._repr_html_().count('<img src="data:image/png;base64,') == 2
+    with pytest.raises(ValueError, match="there is no figure 'eror'; allowed are"):
+        flight.plot("eror")
+
+
+def test_trials_are_the_campaigns_rows(flight):
+    rows = ptsmc_jax.trials(flight.scenario, 70, seed=3)
+    made = campaign.Campaign(scenario.study(flight.scenario), 3)
+    assert rows.equals(made.fly(0, 70))
+    assert rows["window_error"][7] == pytest.approx(flight.metrics["window_error"], rel=1e-12)
+    (verdict,) = ptsmc_jax.verdicts(flight.scenario, rows)
+    assert verdict.met
+    assert verdict.worst == rows["peak_torque"].max()
+    broken = rows.with_columns(status=pl.when(pl.col("trial") == 3).then(pl.lit("diverged")).otherwise("status"))
+    assert ptsmc_jax.verdicts(flight.scenario, broken)[0].failures == 1
+
+
+def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
+    made = flight.animate(frames=4)
+    content = made._repr_html_()
+    assert content.count("data:image/png;base64") == 4
+    assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", content)
+    assert not re.search(r"<i class", content)
+    made.save(tmp_path / "a.html")
+    assert (tmp_path / "a.html").read_text().startswith("<!doctype html>")
+    with pytest.raises(ValueError, match="at least 2"):
+        flight.animate(frames=1)
+    chain = ptsmc_jax.simulate(scenario.from_tables({"plant": {"kind": "chain"}}))
+    with pytest.raises(ValueError, match="only a spacecraft"):
+        chain.animate()
+    assert "x2" in chain.to_polars().columns
+    assert "states" in chain.plot()
+
+
+def test_axes_are_turned_as_scipy_turns_them():
+    turn, vectors = Rotation.from_rotvec([0.4, -1.2, 0.7]), np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(animation.turned(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
