@@ -39,7 +39,6 @@ for label, case in {"quiet": quiet, "with noise": flight}.items():
     axes.semilogy(history["t"], np.maximum(error, 1e-9), label=label)
 axes.set(xlabel="time [s]", ylabel="2-norm of the attitude error [-]")
 axes.legend()
-figure
 
 # %% [markdown]
 # Over 300 attitudes, for the paper's two values of η. The RMS error in the second after t_f grows 30 to 400 times, and the
@@ -73,7 +72,6 @@ for label, errors in found.items():
     axes.loglog(deltas, errors, "o-", label=label)
 axes.set(xlabel="hand-over before t_f, delta [s]", ylabel="RMS window error [-]")
 axes.legend()
-figure
 
 # %% [markdown]
 # Try it: the sliders change η, δ and the period and fly 64 attitudes at each stop. Where there is no `ipywidgets`, one

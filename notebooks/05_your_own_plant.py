@@ -63,7 +63,6 @@ for angle in (0.1, 0.5, 1.0, 2.0, 3.0):
     axes.semilogy(history["t"], np.abs(history["error1"]) + 1e-9, label=f"from {angle:g}")
 axes.set(xlabel="time [s]", ylabel="|error|")
 axes.legend()
-figure
 
 # %% [markdown]
 # For your own jit, vmap and grad there is the pure core: `rollout.simulate(parts, seed, trial)`, with every number of the

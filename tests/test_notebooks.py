@@ -59,7 +59,7 @@ def test_every_figure_is_explained(source):
     """Text of two sentences or more stands above every cell that draws."""
     cells = jupytext.read(source).cells
     for k, cell in enumerate(cells):
-        if cell.cell_type == "code" and re.search(r"\.plot\(|Figures\(|\nfigure$|animate\(", cell.source):
+        if cell.cell_type == "code" and re.search(r"\.plot\(|Figures\(|subplots\(|animate\(", cell.source):
             above = [one for one in cells[max(0, k - 2) : k] if one.cell_type == "markdown"]
             assert above, cell.source
     texts = [cell.source for cell in cells if cell.cell_type == "markdown"]
