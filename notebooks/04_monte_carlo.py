@@ -83,7 +83,7 @@ worst.select(
 )
 
 # %%
-run, off = campaign_summary.replay(folder, worst["trial"][0])
-print(f"off its row by {off:.1e}, relative")
+found = campaign_summary.replay(folder, worst["trial"][0])
+print(f"off its row by {found.off:.0e}, relative; the run with its history by {found.rounding:.0e}, by rounding")
 again = ptsmc.simulate(flight, seed=1, trial=worst["trial"][0])
 again.plot("error", "torque")

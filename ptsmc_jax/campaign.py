@@ -37,8 +37,9 @@ class Campaign:
 
     def fly(self, first: int, count: int) -> pl.DataFrame:
         """Rows of the trials from `first` on."""
-        trials = np.arange(first, first + count, dtype=np.uint32)
-        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, trials, own=self.own)
+        # never so few that another program flies them: rows are then the same to the last digit
+        wanted = np.resize(np.arange(first, first + count, dtype=np.uint32), max(count, montecarlo.FEW))
+        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, wanted, own=self.own)
         named = [rollout.STATUS[int(code)] for code in flown.status]
         heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
         numbers = {
@@ -47,7 +48,8 @@ class Campaign:
             **flown.drawn,
             **flown.own,
         }
-        return pl.DataFrame({"trial": trials, **heading, **numbers}).with_columns(pl.col(pl.Float64).fill_nan(None))
+        frame = pl.DataFrame({"trial": wanted, **heading, **numbers})
+        return frame.head(count).with_columns(pl.col(pl.Float64).fill_nan(None))
 
     def draw(self, first: int, count: int) -> pl.DataFrame:
         """What the trials from `first` on would fly with."""

@@ -245,6 +245,25 @@ def test_a_replay_that_differs_from_its_row_is_told(command, flown):
     assert (code, "off its row by 1.0e-09" in said) == (1, True)
 
 
+def test_a_replay_is_its_row_to_the_last_digit_whatever_rounding_does(command, tmp_path):
+    """Errors of 1e-6 of a body that turns: another program's rounding shows at 1e-11, the campaign's own does not."""
+    (tmp_path / "h.toml").write_text(
+        'controller = { error = "multiplicative", t_f = 12.0, delta = 0.5, sign_width = 0.0 }\n'
+        'loop = { mode = "sampled", period = 0.05, t_end = 13.0, clock = "flight" }\n'
+        "hardware = { attitude_noise = 2e-5, rate_noise = 1e-6, torque_lag = 0.1 }\n"
+        'reference = { kind = "sinusoid" }\nfilter = { kind = "steady_state" }\n'
+        "dispersion = { attitude = {}, inertia = {} }\n"
+    )
+    assert command("montecarlo", "h.toml", "--trials", 70, "--no-figures", "--quiet")[0] in (0, 1)
+    for trial in (0, 33, 69):
+        code, said, _ = command("replay", "out/montecarlo-h", "--trial", trial, "--no-figures")
+        assert (code, "equal to its row, to the last digit" in said) == (0, True)
+    command("montecarlo", "h.toml", "--trials", 71, "--no-figures", "--quiet")
+    rows = rows_of(tmp_path / "out/montecarlo-h")
+    command("montecarlo", "h.toml", "--trials", 7, "--no-figures", "--quiet", "--out", "few")
+    assert rows_of(tmp_path / "few").equals(rows.head(7))  # few trials are flown by the same program
+
+
 @pytest.mark.parametrize("asked", [["summarize"], ["worst"], ["replay", "--trial", "1"]])
 def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
     (tmp_path / "empty").mkdir()

@@ -179,12 +179,12 @@ def replay(
         raise UsageError(f"--trial is {number}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(number)
     store.check(place, force or out is None)  # a replay of the same trial is the same
-    run, off = campaign_summary.replay(opened, number)
-    store.write(place, lambda making: single.write(making, opened.scenario, run, opened.seed, number, figures))
+    found = campaign_summary.replay(opened, number)
+    store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, number, figures))
     if not quiet:
-        show.run(run, place)
-        show_campaign.replayed(off)
-    return 0 if off is None or off <= campaign_summary.SAME else 1
+        show.run(found.run, place)
+        show_campaign.replayed(found.off, found.rounding)
+    return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
 
 
 def _summarised(folder, quiet: bool, figures: bool) -> int:

@@ -1,6 +1,7 @@
 """What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -147,19 +148,35 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     return rows.read(parts).head(folder.trials)[chosen]
 
 
-def replay(folder: Folder, trial: int) -> tuple[runs.Run, float | None]:
-    """A trial's run in full, and how far its metrics are off its row's, relative; None: it has no row."""
-    run = runs.fly(folder.campaign.ready, folder.seed, trial)
+@dataclass(frozen=True)
+class Replay:
+    """A trial flown again."""
+
+    run: runs.Run  # with its history
+    off: float | None  # largest difference of the row flown again from the one kept, relative; None: none is kept
+    rounding: float  # the same of the run with its history, which another program flies, from the row flown again
+
+
+def replay(folder: Folder, trial: int) -> Replay:
+    """A trial's row as the campaign flies it, and its run in full."""
+    run, row = runs.fly(folder.campaign.ready, folder.seed, trial), folder.campaign.fly(trial, 1)
     there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
-    if not there:
-        return run, None
-    row = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial).row(0, named=True)
-    off = 0.0
-    for name, value in run.metrics.items():
-        kept = np.nan if row[name] is None else row[name]
-        if not (np.isnan(value) and np.isnan(kept)):
-            off = max(off, abs(value - kept) / max(abs(kept), 1e-300)) if value != kept else off
-    return run, off if row["status"] == run.status else np.inf
+    kept = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial) if there else None
+    again = row.row(0, named=True)
+    rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
+    if run.status != again["status"]:
+        rounding = np.inf
+    if kept is None:
+        return Replay(run, None, rounding)
+    return Replay(run, max(_off(value, again[name]) for name, value in kept.row(0, named=True).items()), rounding)
+
+
+def _off(a: Any, b: Any) -> float:
+    """Relative difference of two values of a row."""
+    if isinstance(a, float) and isinstance(b, float) and np.isfinite([a, b]).all():
+        return 0.0 if a == b else abs(a - b) / max(abs(a), abs(b))
+    missing = [v is None or v != v for v in (a, b)]
+    return 0.0 if a == b or all(missing) else np.inf
 
 
 def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:

@@ -127,9 +127,10 @@ def worst(frame: Any, by: str, folder: Path) -> None:
     console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
 
 
-def replayed(off: float | None) -> None:
-    """How far a replayed run is off its row."""
+def replayed(off: float | None, rounding: float) -> None:
+    """How far a trial flown again is off its row, and the run with its history off both."""
     if off is None:
         print("the campaign has no row of this trial yet")
     else:
         print("equal to its row, to the last digit" if off == 0.0 else f"off its row by {off:.1e} at most, relative")
+    print(f"the history is another program's: its metrics differ by {rounding:.0e} at most, relative, by rounding")
