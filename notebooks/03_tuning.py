@@ -59,5 +59,5 @@ Figures({"tradeoff": made["tradeoff"]})
 # little torque buys much accuracy, right of it little.
 
 # %%
-front = pareto.trace(small, 0, 4, lambda *told: None, None)
+front = pareto.trace(small, 0, 3, lambda *told: None, None)
 Figures({"front": study_plots.front(front.points, front.others, 0.5, ("-", "N m"))})

@@ -115,7 +115,7 @@ def tradeoff(
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float, unit: str = "s") -> Figure:
     """When each trial settles against where it starts; label -> (initial angles [deg], settling times, NaN: never)."""
     figure, axes = figure_of("When it settles, by where it starts", f"settling time [{unit}]")
-    for (label, (angle, time)), (colour, _), marker in zip(sets.items(), STYLES, MARKERS, strict=True):
+    for (label, (angle, time)), (colour, _), marker in zip(sets.items(), STYLES, MARKERS, strict=False):
         known = np.isfinite(time)
         said = f"{label}: {int((~known).sum())} never" if np.any(~known) else label
         axes.plot(angle[known], time[known], marker, ms=3.5, alpha=0.5, color=colour, mew=0, label=said)

@@ -34,7 +34,7 @@ def item(where: str, allowed: str) -> object:
     """
     place, _, name = where.rpartition(":")
     if not place or not name:
-        raise ValueError(f"it names nothing of Python's; allowed is {allowed}")
+        raise ValueError(f"it names nothing; allowed is {allowed}")
     path = Path(place)
     if place.endswith(".py") and not path.is_file():
         raise ValueError(f"the file {path} is not there")

@@ -18,6 +18,16 @@ hook = install_import_hook(["ptsmc_jax", "tuning"], "beartype.beartype")
 MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
 
+# files that take minutes, which the workers are to begin with: the last ones would keep one of them waiting
+LONGEST = "notebooks campaign_processes cli tuning compare pareto campaign_commands conformity".split()
+
+
+def pytest_collection_modifyitems(items):
+    """Files in the order of `LONGEST`, then the others."""
+    order = {f"test_{name}.py": k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_compiled_programs():
     """A process that keeps every program it ever compiled is ended by the kernel after some 500 of them."""

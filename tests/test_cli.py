@@ -176,7 +176,7 @@ WHOLE = "a whole number from 0 to 4294967295"
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("t.toml",)),
         (("simulat",), ("simulat", "simulate, reproduce, map, tune")),
-        (("montecarlo", "s.toml"), ("montecarlo", "simulate, reproduce, map, tune")),
+        (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, tune")),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),

@@ -396,7 +396,7 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
     tables = {"plant": {"kind": "system", "system": spacecraft_as_system(SPIN), "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
     made = scenario.from_tables(tables)
     store.write_toml(tmp_path / "s.toml", schema.dump(made))
-    with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names no system'):
+    with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names nothing'):
         scenario.read(tmp_path / "s.toml")
     assert store.previous(tmp_path, schema.dump(made), {"command": "tune", "seed": 0}) is None
 
