@@ -17,6 +17,7 @@ import polars as pl
 from ptsmc_jax import lanes, montecarlo, rollout
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.montecarlo import OwnMetrics
+from ptsmc_jax.requirements import Requirement, Verdict
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.rows import Part, Rows
 from ptsmc_jax.scenario import Study
@@ -100,12 +101,24 @@ class Tally:
 
 def tally(parts: list[Part], total: int) -> Tally:
     """Where a campaign with these parts stands."""
-    failed = sum(_failed(pl.read_parquet(part.path, columns=["status"])) for part in parts)
+    failed = sum(failures(pl.read_parquet(part.path, columns=["status"])) for part in parts)
     return Tally(sum(part.count for part in parts), total, failed)
 
 
-def _failed(frame: pl.DataFrame) -> int:
+def failures(frame: pl.DataFrame) -> int:
+    """How many of these rows did not end well."""
     return int((frame["status"] != "ok").sum())
+
+
+def finished(frame: pl.DataFrame) -> np.ndarray:
+    """Which of these rows were flown to the end, (trials,) bool: their metrics are those of the run."""
+    return frame["status"].is_in([rollout.STATUS[code][0] for code in rollout.FINISHED]).to_numpy()
+
+
+def verdicts(requirements: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
+    """One for each requirement over these rows; a failed trial breaks every one."""
+    ok = finished(frame)
+    return [r.verdict(frame[r.metric].to_numpy().astype(float), ok) for r in requirements]
 
 
 def here(make: Callable[[int, int], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
@@ -117,7 +130,7 @@ def here(make: Callable[[int, int], pl.DataFrame], rows: Rows, wanted: list[Want
     with ThreadPoolExecutor(1) as writer:
         for first, count in wanted:
             frame = make(first, count)
-            bad = _failed(frame) if "status" in frame.columns else 0
+            bad = failures(frame) if "status" in frame.columns else 0
             writing.append((writer.submit(rows.write, first, frame), bad))
             while writing and (len(writing) > WAITING or writing[0][0].done()):
                 done, bad = writing.popleft()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ptsmc_jax import store
-from ptsmc_jax.campaign import Campaign, Wanted
+from ptsmc_jax.campaign import Campaign, Wanted, failures
 from ptsmc_jax.rows import Part, Rows
 from ptsmc_jax.store import RefusedError
 
@@ -33,7 +33,7 @@ class Cluster:
         """
         from distributed import as_completed
 
-        recipe, rows = folder.recipe(), folder.rows
+        recipe, rows, here = folder.recipe(), folder.rows, store.packages()
         futures = [self._client.submit(_fly, recipe, *part, pure=False, retries=0) for part in wanted]
         try:
             for future in as_completed(futures, loop=self._client.loop):
@@ -41,7 +41,6 @@ class Cluster:
                 if error is not None:
                     raise RefusedError(f"a worker of the cluster failed: {_sentence(error)}")
                 first, count, name, failed, versions = future.result()
-                here = {key: store.versions("", 0)[key] for key in versions}
                 if versions != here:
                     key = next(key for key in versions if versions[key] != here[key])
                     raise RefusedError(f"a worker of the cluster has {key} {versions[key]}, but here is {here[key]}")
@@ -111,5 +110,4 @@ def _fly(recipe: tuple[Any, tuple], first: int, count: int) -> tuple:
         campaign, rows = _campaign(make, told)
         frame = campaign.fly(first, count)
     part = rows.write(first, frame)
-    versions = {name: value for name, value in store.versions("", 0).items() if name in store.PACKAGES}
-    return first, count, part.path.name, int((frame["status"] != "ok").sum()), versions
+    return first, count, part.path.name, failures(frame), store.packages()

@@ -5,14 +5,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import animation, campaign, metrics, plotting, runs, scenario
 from ptsmc_jax.montecarlo import OwnMetrics
 from ptsmc_jax.requirements import Verdict
-from ptsmc_jax.rollout import FINISHED, STATUS
 from ptsmc_jax.runs import Run
 from ptsmc_jax.tables import Scenario
 
@@ -64,8 +62,7 @@ class Flight:
 
     def plot(self, *names: str) -> "Figures":
         """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
-        limit = next((v.limit for v in self.run.verdicts if v.metric.startswith("peak_torque")), None)
-        made = plotting.run_figures(self.run.parts, self.run.log, limit)
+        made = plotting.run_figures(self.run.parts, self.run.log, self.run.torque_limit)
         unknown = [name for name in names if name not in made]
         if unknown:
             raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(made)}")
@@ -77,11 +74,7 @@ class Flight:
 
     def to_polars(self) -> pl.DataFrame:
         """The history, a row a sample: t [s], state, estimate, delivered torque, sliding variable, error."""
-        log = self.run.log
-        blocks = {**self.run.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s, "error": log.error}
-        columns = {f"{name}{k + 1}": np.asarray(block)[:, k] for name, block in blocks.items()
-                   for k in range(np.shape(block)[1])}  # fmt: skip
-        return pl.DataFrame({"t": np.asarray(log.t), **columns})
+        return pl.DataFrame({**self.run.columns(), **runs.numbered("error", self.run.log.error)})
 
     def __repr__(self) -> str:
         return "\n".join([self._said(), repr(self.metrics), *map(str, self.verdicts)])
@@ -133,9 +126,7 @@ def trials(
 
 def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
     """One for each requirement of the scenario over these rows; a failed trial breaks every one."""
-    finished = rows["status"].is_in([STATUS[code][0] for code in FINISHED]).to_numpy()
-    wanted = scenario.study(what).requirements
-    return [r.verdict(rows[r.metric].to_numpy().astype(float), finished) for r in wanted]
+    return campaign.verdicts(scenario.study(what).requirements, rows)
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

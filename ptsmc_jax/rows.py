@@ -80,11 +80,11 @@ class Rows:
                 kept.append(part)
         return kept, broken
 
-    def tidy(self) -> None:
-        """Remove what a killed process left unfinished, and parts whose trials stand in a longer one."""
+    def tidy(self, parts: Iterable[Part]) -> None:
+        """Remove what a killed process left unfinished, and all parts but these, which `parts` found whole."""
         for path in self.folder.glob(f"{_MAKING}*"):
             path.unlink(missing_ok=True)
-        kept = {part.path for part in self.parts()[0]}
+        kept = {part.path for part in parts}
         for path in self.folder.glob("*.parquet"):
             if path not in kept and _NAME.fullmatch(path.name):
                 path.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ptsmc_jax import rollout
 from ptsmc_jax.requirements import Verdict
@@ -29,6 +30,25 @@ class Run:
     def met(self) -> bool:
         """The run ended well and met every requirement."""
         return self.status == "ok" and all(v.met for v in self.verdicts)
+
+    @property
+    def torque_limit(self) -> float | None:
+        """What the scenario allows of the torque; None: it does not say."""
+        return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable."""
+        log = self.log
+        blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
+        found = {"t": np.asarray(log.t)}
+        for name, block in blocks.items():
+            found |= numbered(name, block)
+        return found
+
+
+def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
+    """The columns of a (time, component) array, by its name and a number from 1 on."""
+    return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
 def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:

@@ -31,10 +31,15 @@ def versions(command: str, seed: int, **others: Any) -> dict[str, Any]:
         "seed": seed,
         **others,
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in PACKAGES},
+        **packages(),
         "platform": platform.platform(),
         "machine": platform.machine(),
     }
+
+
+def packages() -> dict[str, str]:
+    """Versions of the packages that numbers depend on."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def previous(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:

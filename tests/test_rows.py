@@ -50,7 +50,7 @@ def test_a_longer_part_takes_the_place_of_a_shorter_one(kept):
     short, long = kept.write(0, frame(0, 20)), kept.write(0, frame(0, 50))
     after = kept.write(50, frame(50, 10))
     assert kept.parts()[0] == [long, after]
-    kept.tidy()
+    kept.tidy(kept.parts()[0])
     assert not short.path.exists()
     assert kept.parts()[0] == [long, after]
 
@@ -59,7 +59,7 @@ def test_what_a_killed_process_left_is_swept_up_and_never_read(kept):
     kept.write(0, frame(0, 20))
     (kept.folder / ".making-xyz").write_bytes(b"half")
     assert len(kept.parts()[0]) == 1
-    kept.tidy()
+    kept.tidy(kept.parts()[0])
     assert [path.name[0] for path in kept.folder.iterdir()] == ["0"]
 
 

@@ -94,8 +94,7 @@ def begin(wanted: Folder, force: bool) -> None:
     else:
         store.check(path, force=True)
         there = path.is_dir() and any(path.iterdir())
-        known = {name: versions[name] for name in (*wanted.told, *store.PACKAGES)}
-        other = store.difference(path, tables, known) if there else None
+        other = store.difference(path, tables, {**wanted.told, **store.packages()}) if there else None
         if other is not None:
             raise RefusedError(
                 f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew"
@@ -151,25 +150,25 @@ def fly(
     What is damaged is named, set aside and flown again. elsewhere: flies parts on other machines.
     """
     trials = folder.trials if trials is None else trials
-    for path in folder.rows.parts()[1]:
+    parts, broken = folder.rows.parts()
+    for path in broken:
         aside = path.with_name(path.name + ".damaged")
         os.replace(path, aside)
         print(f"ptsmc: {path} is damaged and is flown again; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None
     if alone:  # others may be writing otherwise
-        folder.rows.tidy()
-    parts, _ = folder.rows.parts()
+        folder.rows.tidy(parts)
     wanted = flying.missing(parts, trials, shard)
     made = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
     flying.follow(made, flying.tally(parts, trials), report)
     if alone:
-        folder.rows.tidy()
+        folder.rows.tidy(folder.rows.parts()[0])
 
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write what each trial flies with, without flying it."""
-    folder.plan.tidy()
     parts, _ = folder.plan.parts()
+    folder.plan.tidy(parts)
     made = flying.here(folder.campaign.draw, folder.plan, flying.missing(parts, folder.trials))
     flying.follow(made, Tally(sum(part.count for part in parts), folder.trials, 0), report)
 

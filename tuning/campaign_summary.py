@@ -13,7 +13,7 @@ from ptsmc_jax import campaign as flying
 from ptsmc_jax import campaign_plots as plots
 from ptsmc_jax import drawing, metrics, rows, runs, schema, statistics, store
 from ptsmc_jax.requirements import Requirement, Verdict
-from ptsmc_jax.rollout import FINISHED, STATUS
+from ptsmc_jax.rollout import STATUS
 from ptsmc_jax.store import RefusedError
 from tuning.campaign_folder import Folder
 
@@ -45,13 +45,8 @@ def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], lis
     wanted = tuple(folder.campaign.ready.requirements)
     names = dict.fromkeys(r.metric for r in wanted)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
-    finished = _finished(frame)
-    verdicts = [r.verdict(frame[r.metric].to_numpy(), finished) for r in wanted]
+    verdicts = flying.verdicts(wanted, frame)
     return verdicts, [_told(v, r) for v, r in zip(verdicts, wanted, strict=True)]
-
-
-def _finished(frame: pl.DataFrame) -> np.ndarray:
-    return frame["status"].is_in([STATUS[code][0] for code in FINISHED]).to_numpy()
 
 
 def _told(verdict: Verdict, wanted: Requirement) -> dict[str, Any]:
@@ -74,7 +69,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     _, told = judged(folder)
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
-    finished, failed = _finished(head), head.filter(pl.col("status") != "ok")
+    finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
     reasons = [
         {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
@@ -143,7 +138,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     if by not in allowed:
         raise RefusedError(f"--by is {by}, but must be a column of the rows; near is {schema.nearest(by, allowed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
-    failed = ~_finished(frame)
+    failed = ~flying.finished(frame)
     chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)
     return rows.read(parts).head(folder.trials)[chosen]
 
@@ -185,7 +180,7 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     limits = {r.metric: r.limit for r in ready.requirements}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
-    finished = _finished(frame)
+    finished = flying.finished(frame)
     made: dict[str, Any] = {}
     shown = np.arange(min(DRAWN, frame.height))
     t, error = flying.history(folder.campaign, shown.astype(np.uint32))

@@ -28,7 +28,6 @@ KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts",
 class Contender:
     """A law with its gains, judged on the fresh trials."""
 
-    law: str
     flown: Scenario
     gains: dict[str, float]
     at_bound: dict[str, str]
@@ -92,7 +91,7 @@ def contenders(scenario: Scenario) -> dict[str, Scenario]:
 def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
     fresh_seed = report.seed_of_judge(seed)
-    made = {"paper": _judged("paper", gains.papers(scenario), {}, {}, fresh_seed)}
+    made = {"paper": _papers(gains.papers(scenario), fresh_seed)}
     stopped = False
     for law, posed in contenders(scenario).items():
 
@@ -100,16 +99,15 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
             tell(f"{law}: {what}", *others)
 
         tuned = report.tune(posed, seed, told, journal, trusted=False)
-        made[law] = _judged(law, tuned.tuned, tuned.gains, tuned.at_bound, fresh_seed)
+        made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, tuned.fresh["tuned"], tuned.verdicts)
         stopped |= tuned.search.interrupted
     return Comparison(made, fresh_seed, stopped)
 
 
-def _judged(law: str, flown: Scenario, own: dict[str, float], at_bound: dict[str, str], fresh_seed: int) -> Contender:
+def _papers(flown: Scenario, fresh_seed: int) -> Contender:
     ready = study(flown)
     trials = report.judge(flown, fresh_seed, ready.requirements)
-    verdicts = [r.verdict(getattr(trials.metrics, r.metric), trials.finished) for r in ready.requirements]
-    return Contender(law, flown, own or gains.gains_of(ready.parts), at_bound, trials, verdicts)
+    return Contender(flown, gains.gains_of(ready.parts), {}, trials, report.verdicts_of(ready.requirements, trials))
 
 
 def figures_of(one: Contender) -> dict[str, Any]:

@@ -187,7 +187,7 @@ def _point(limit, named, trained, trials: Trials, requirements: Sequence[Require
     errors = np.asarray(trials.metrics.window_error)[trials.finished]
     peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
     quantile = next(r.quantile for r in requirements if r.metric == TORQUE) or 1.0
-    verdicts = [r.verdict(getattr(trials.metrics, r.metric), trials.finished) for r in requirements]
+    verdicts = report.verdicts_of(requirements, trials)
     return Point(
         limit=limit,
         gains=dict(named),

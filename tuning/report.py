@@ -122,9 +122,7 @@ def tune(
     for name, candidate in candidates.items():
         fresh[name] = judge(candidate, fresh_seed, ready.requirements)
         judged_gains[name] = gains.gains_of(study(candidate).parts)
-    verdicts = [
-        r.verdict(getattr(fresh["tuned"].metrics, r.metric), fresh["tuned"].finished) for r in ready.requirements
-    ]
+    verdicts = verdicts_of(ready.requirements, fresh["tuned"])
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
     if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
@@ -211,6 +209,11 @@ def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requiremen
     flown = study(as_flown(scenario))
     trials = np.arange(trials_of(flown, _fresh_trials(requirements)))
     return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
+
+
+def verdicts_of(requirements: Sequence[Requirement], trials: Trials) -> list[Verdict]:
+    """One for each requirement over these trials."""
+    return [r.verdict(getattr(trials.metrics, r.metric), trials.finished) for r in requirements]
 
 
 def as_flown(scenario: Scenario) -> Scenario:

@@ -16,12 +16,9 @@ def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | No
     verdicts = {v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met} for v in run.verdicts}
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     store.write_json(folder / "summary.json", {**heading, **run.metrics, "verdicts": verdicts})
-    log = run.log
-    columns = {**run.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
-    header = ["t", *(f"{name}{k + 1}" for name, block in columns.items() for k in range(block.shape[1]))]
-    store.write_csv(folder / "trajectory.csv", header, np.column_stack([log.t, *columns.values()]).tolist())
+    columns = run.columns()
+    store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:
         from ptsmc_jax import drawing, plotting  # takes 0.3 s, which a run without figures need not wait for
 
-        limit = next((v.limit for v in run.verdicts if v.metric.startswith("peak_torque")), None)
-        drawing.save(plotting.run_figures(run.parts, log, limit), folder / "figures")
+        drawing.save(plotting.run_figures(run.parts, run.log, run.torque_limit), folder / "figures")
