@@ -98,7 +98,7 @@ def check(scenario: Scenario, tune: tables.Tune) -> None:
 def _check_bounds(scenario: Scenario, tune: tables.Tune, name: str, bounds: tuple[float, float]) -> None:
     key, (lower, upper), free = f"tune.bounds.{name}", bounds, tune.free or ()
     if name not in tables.FREE:
-        raise ScenarioError(f"{key} is not a known gain; the nearest known one is {schema.nearest(name, tables.FREE)}")
+        raise ScenarioError(f"{key} is not a known gain; {schema.nearest(name, tables.FREE)}")
     if name not in free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.show(free)}")
     least, most, closed = _range(scenario, tune, name)

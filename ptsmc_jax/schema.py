@@ -94,7 +94,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
             place = _place(name, layout)
             raise ScenarioError(f"{name} = {show(raw[name])} stands outside a table; {place}")
         known = (*layout, "requirements")
-        raise ScenarioError(f"[{name}] is not a known table; the nearest known one is [{nearest(name, known)}]")
+        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, known, '[{}]')}")
 
     plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
     order = 0
@@ -135,7 +135,7 @@ def _place(key: str, layout: Mapping[str, Any]) -> str:
     """Where a key that stands outside a table may belong."""
     keys = {field: name for name, table in layout.items() for struct in _structs(table)
             for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
-    closest = nearest(key, keys)
+    closest = difflib.get_close_matches(key, keys, n=1, cutoff=0.0)[0]
     return f"the nearest known key is {keys[closest]}.{closest}"
 
 
@@ -176,9 +176,13 @@ def _without_none(value: Any) -> Any:
     return value
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The known name most like this one."""
-    return difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)[0]
+def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
+    """What a name may have been meant for: the known one most like it, or, where none is like it, all of them."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"the nearest known one is {form.format(close[0])}"
+    return f"known are {', '.join(form.format(one) for one in known)}"
 
 
 def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Table:
@@ -209,8 +213,8 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
     found = {}
     for key, table in raw.items():
         if key not in struct.__struct_fields__:
-            closest = nearest(key, struct.__struct_fields__)
-            raise ScenarioError(f"dispersion.{key} is not a known key; the nearest known one is dispersion.{closest}")
+            known = nearest(key, struct.__struct_fields__, "dispersion.{}")
+            raise ScenarioError(f"dispersion.{key} is not a known key; {known}")
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
         found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key])
@@ -220,7 +224,7 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
 def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
     key = f"requirements.{metric}"
     if metric not in metrics:
-        raise ScenarioError(f"{key} is not a known metric; the nearest known one is {nearest(metric, metrics)}")
+        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, metrics)}")
     if isinstance(value, Mapping):
         if "limit" not in value:
             raise wrong(key, value, "a number greater than 0 or a table with `limit`")
@@ -233,8 +237,7 @@ def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
     known = struct.__struct_fields__
     for key in raw:
         if key not in known:
-            closest = nearest(key, known)
-            raise ScenarioError(f"{name}.{key} is not a known key; the nearest known one is {name}.{closest}")
+            raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
     return struct(**{key: _value(f"{name}.{key}", value, hints[key]) for key, value in raw.items()})
 
 

@@ -35,7 +35,7 @@ BAD = [
     ("contrller.eta = 3.0", "[contrller] is not a known table", "nearest known one is [controller]"),
     ("eta = 3.0", "eta = 3.0 stands outside a table", "nearest known key is controller.eta"),
     ("etta = 3.0", "etta = 3.0 stands outside a table", "nearest known key is controller.eta"),
-    ("[etta]", "[etta] is not a known table", "nearest known one is ["),
+    ("[etta]", "[etta] is not a known table", "known are [plant], [spacecraft], ["),
     ("controller = 3", "controller is 3", "a table"),
     ("[[loop]]\nt_end = 40.0", "loop is [{ t_end = 40.0 }]", "a table"),
     ("controller.kind = 'pid'", 'controller.kind is "pid"', '"prescribed_time"'),
@@ -137,7 +137,8 @@ BAD = [
     (EULER % "3", "initial.sequence is 3", "three axes in SciPy's notation"),
     ("initial.rate = [0.0, 0.0]", "initial.rate is [0.0, 0.0]", "three numbers"),
     ("initial.rat = [0.0, 0.0, 0.0]", "initial.rat is not a known key", "nearest known one is initial.rate"),
-    ("reference.rate = [0.0, 0.0, 0.1]", "reference.rate is not a known key", "nearest known one is reference."),
+    ("reference.rate = [0.0, 0.0, 0.1]", "reference.rate is not a known key", "known are reference.quat_xyzw, "),
+    ("initial.quaternion = [0, 0, 0, 1]", "initial.quaternion is not a known key", "known are initial.quat_xyzw, "),
     ("reference.kind = 'orbit'", 'reference.kind is "orbit"', '"fixed" or "spin"'),
     ("reference.kind = ['fixed']", 'reference.kind is ["fixed"]', '"fixed" or "spin"'),
     # chains

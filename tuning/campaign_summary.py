@@ -136,7 +136,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     names = list(pl.read_parquet_schema(parts[0].path))
     allowed = [name for name in names if name not in ("trial", "status", "reason", "bad_time")]
     if by not in allowed:
-        raise RefusedError(f"--by is {by}, but must be a column of the rows; near is {schema.nearest(by, allowed)}")
+        raise RefusedError(f"--by is {by}, but must be a column of the rows; {schema.nearest(by, allowed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
     failed = ~flying.finished(frame)
     chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)
