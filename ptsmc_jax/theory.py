@@ -211,10 +211,25 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     else:
         error, error_rate = _start(parts)
         s0 = float(jnp.linalg.norm(law.t_f * error_rate + law.eta * error))
-    bound = parts.observer.error_bound()
-    switching = float(law.switching_rate(bound.largest, visited(parts) if isinstance(parts.plant, System) else None))
-    beta = switching * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
+    beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
+
+
+def switching_rate(parts: Parts) -> float:
+    """Largest factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, along the run."""
+    seen = visited(parts) if isinstance(parts.plant, System) else None
+    return float(parts.controller.switching_rate(parts.observer.error_bound().largest, seen))
+
+
+def narrowest_sign(parts: Parts, period: float) -> float:
+    """Width below which a sampled smooth sign overshoots, in the units of s.
+
+    s' = -c tanh(s / width), c = tau^(n-1) times `switching_rate`, held for a period h, reaches s = 0 in one period from
+    inside the boundary layer at width = c h; below c h / 2 it hops from side to side, and slopes grow from hop to hop.
+    Of the largest c before the hand-over, at t = 0.
+    """
+    law = parts.controller
+    return float(law.t_f) ** (law.order - 1) * switching_rate(parts) * period
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:

@@ -229,7 +229,7 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
     code, _, error = command("replay", FOLDER, "--trial", 250)
     assert (code, "--trial is 250, but must be a whole number from 0 to 249" in error) == (2, True)
     code, _, error = command("worst", FOLDER, "--by", "peek_torque")
-    assert (code, "near is peak_torque" in error) == (2, True)
+    assert (code, "nearest known one is peak_torque" in error) == (2, True)
 
 
 def test_a_replay_that_differs_from_its_row_is_told(command, flown):

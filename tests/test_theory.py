@@ -75,6 +75,15 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
     assert np.all(size <= allowed * (1 + 1e-6) + 1e-9)
 
 
+def test_the_narrowest_sign_is_reached_through_in_one_period():
+    run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
+    width = theory.narrowest_sign(run, 0.05)
+    before, _ = run.controller.boundary_layer(run.observer.error_bound().largest)
+    # its layer's rate times the period, from the law's own rate at its own width
+    np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
+    np.testing.assert_allclose(theory.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
+
+
 def test_exact_path_is_the_path_of_the_run():
     rate = (0.02, -0.03, 0.05)
     run = parts(30.0, 3.0, 0.05, rate=rate)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ptsmc_jax import clock, dispersions, signals
+from ptsmc_jax import clock, dispersions, scenario, signals
 from ptsmc_jax.requirements import Requirement
 from tests.helpers import parts, vector
-from tuning import evolution, objective, optimise, starts, trust
+from tuning import evolution, objective, optimise, report, starts, trust
 from tuning.bounds import Bounds
 from tuning.evaluate import Evaluator
 
@@ -122,3 +122,26 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     # and where the search is stopped at its start, the distance says so
     lost = replace(found, z=evaluate.bounds.free(np.array([2.3, 3.0])))
     assert evolution.check(evaluate, lost, 0).distance > 0.5
+
+
+CHATTERING = {
+    "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+    "disturbance": {"kind": "sinusoid", "amplitude": [0.3], "frequency": [1.0], "phase": [0.0]},
+    "controller": {"t_f": 5.0, "sign_width": 1e-3, "disturbance_rate_bound": 0.5},
+    "observer": {"kind": "nonlinear", "gain": [5.0]},
+    "loop": {"mode": "sampled", "period": 0.05, "t_end": 6.0},
+    "hardware": {"state_noise": [1e-4, 1e-4]},
+    "tune": {"free": ["eta", "delta", "observer_gain"], "trials": 16},
+}
+
+
+def test_a_sign_too_narrow_for_the_period_is_descended_by_at_a_width_that_has_slopes():
+    posed = report.pose(scenario.from_tables(CHATTERING), 0)
+    z = posed.evaluate.bounds.free(np.array([3.0, 0.33, 2.0]))
+    as_written = objective.with_sign(posed.problem, 1e-3)
+    assert trust.slope_error(posed.evaluate, posed.problem, z) < 1e-6  # of order 4 over 1e-3
+    assert trust.slope_error(posed.evaluate, as_written, z) > 0.5
+    # s' = -c tanh(s / width), c = t_f K2 with K2 = 0.5 / gain: deadbeat at width = c h
+    wide = objective.with_sign(posed.problem, 5.0 * 0.5 / 2.0 * 0.05)
+    f, expected = (posed.evaluate.fly(one, z[None]).f for one in (posed.problem, wide))
+    np.testing.assert_allclose(f, expected, rtol=1e-9)

@@ -30,6 +30,8 @@ class Problem:
     trials: Leaf  # (trials,) uint32, that name the noise
     coordinates: Coordinates  # of what is drawn, arrays over the trials first
     limits: Leaf  # (requirements,) in the metrics' units
+    # the smooth sign is at least so many times K2 wide, the observer's bound: narrower ones chatter, without slopes
+    widened: Leaf
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
@@ -57,6 +59,7 @@ def problem(
         trials=jnp.zeros(0, dtype=jnp.uint32),
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=jnp.asarray([r.limit for r in requirements], dtype=float),
+        widened=jnp.zeros(()),
         averaged=len(trials),
         names=names,
         metrics=tuple(r.metric for r in requirements),
@@ -86,12 +89,16 @@ def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates |
     )
 
 
-def with_sign(problem: Problem, width: float) -> Problem:
+def with_sign(problem: Problem, width: float, widened: float = 0.0) -> Problem:
     """The problem flown with another width of the smooth sign, if its law has one; 0 is the exact one."""
     if not hasattr(problem.parts.controller, "sign_width"):
         return problem
-    controller = replace(problem.parts.controller, sign_width=jnp.asarray(float(width)))
-    return replace(problem, parts=replace(problem.parts, controller=controller))
+    parts = _signed(problem.parts, jnp.asarray(float(width)))
+    return replace(problem, parts=parts, widened=jnp.asarray(float(widened)))
+
+
+def _signed(parts: Parts, width: Array) -> Parts:
+    return replace(parts, controller=replace(parts.controller, sign_width=width))
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
@@ -104,6 +111,9 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     """
     named = dict(zip(problem.names, gains, strict=True))
     parts = with_gains(problem.parts, named)
+    if hasattr(parts.controller, "sign_width"):
+        bound = problem.widened * parts.observer.error_bound().largest
+        parts = _signed(parts, jnp.maximum(parts.controller.sign_width, bound))
 
     def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
         trial, coordinates = case

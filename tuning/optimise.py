@@ -172,7 +172,7 @@ class Run:
         self._problem: Problem | None = None
         self._history: list[Step] = []
         self._dropped: list[int] = []
-        self._width = 0.0  # of the smooth sign
+        self._sign = (0.0, 0.0)  # the smooth one of the descent
         self.rounds = 0
 
     @property
@@ -202,7 +202,8 @@ class Run:
 
     def descend(self, problem: Problem, z: np.ndarray, steps: int, what: str) -> None:
         """All starts by Adam, then a polish of the best ones."""
-        tightened, self._width = self._tightened(problem), float(getattr(problem.parts.controller, "sign_width", 0.0))
+        tightened = self._tightened(problem)
+        self._sign = (float(getattr(problem.parts.controller, "sign_width", 0.0)), float(problem.widened))
         best, alive = Best(z, len(problem.metrics), self._margin), np.ones(len(z), dtype=bool)
         # slopes range over decades as limits are crossed: clipped, and with a short memory of their size
         rate = optax.cosine_decay_schedule(RATE, steps, LAST_RATE / RATE)
@@ -332,7 +333,7 @@ class Run:
             worst=self._best.worst[best],
             history=self._history,
             problem=(judged := replace(self._problem, limits=self._problem.limits / (1.0 - self._margin))),
-            smooth=with_sign(judged, self._width),
+            smooth=with_sign(judged, *self._sign),
             dropped=self._dropped,
             rounds=self.rounds,
             margin=self._margin,

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import draws, montecarlo, tables
+from ptsmc_jax import draws, montecarlo, tables, theory
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
 from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_within
+from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
@@ -194,9 +195,18 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     own = np.asarray(gains.own(ready.parts, bounds.names))
     smooth = hasattr(scenario.controller, "sign_width") and "sign_width" not in bounds.names
     exact = smooth and scenario.loop.mode == "sampled"  # as `as_flown` judges
-    if exact and float(ready.parts.controller.sign_width) == 0.0:  # nothing to descend by
-        problem = objective.with_sign(problem, SMOOTH)
+    if exact:
+        own_width = float(ready.parts.controller.sign_width) or SMOOTH
+        problem = objective.with_sign(problem, own_width, _widened(ready.parts, scenario.loop.period))
     return Posed(ready, problem, Evaluator(bounds, journal), own, exact)
+
+
+def _widened(parts: Parts, period: float) -> float:
+    """Width of the narrowest smooth sign that does not chatter, over the observer's bound, with which it grows."""
+    bound = float(parts.observer.error_bound().largest)
+    if not isinstance(parts.controller, Prescribed) or bound == 0.0:
+        return 0.0
+    return theory.narrowest_sign(parts, period) / bound
 
 
 def seed_of_judge(seed: int) -> int:
