@@ -170,14 +170,14 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning import optimise, report, starts, worst
+    from tuning import optimise, refine, report, starts, worst
 
-    small = {"CROSSED": 16, "REFINED": 3}
     for module, name, value in (
         (worst, "SCREENED", 64),
         (report, "FRESH", fresh),
         (starts, "CANDIDATES", 8),
-        *((optimise, name, value) for name, value in small.items()),
+        (optimise, "SPREAD", 16),
+        (refine, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)
 

@@ -56,6 +56,7 @@ FLOORS = {
         objective
         evaluate
         worst trust polish starts
+        refine
         optimise
         evolution
         report single reproduction mapping

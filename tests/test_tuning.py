@@ -186,7 +186,7 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
 def test_search_finds_the_constrained_optimum(monkeypatch):
     """Against a brute-force scan of the same problem, screening for harder trials left out."""
     monkeypatch.setattr(worst, "SCREENED", 16)
-    monkeypatch.setattr(starts, "CANDIDATES", 8)
+    monkeypatch.setattr(starts, "CANDIDATES", 32)
     some = problem(peak_torque=0.9)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)

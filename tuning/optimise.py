@@ -2,7 +2,7 @@
 
 All starts together by Adam on the augmented Lagrangian for inequalities,
 L = f + sum (max(0, m + p c)^2 - m^2) / (2 p) (Nocedal and Wright, Numerical Optimization, 2006, eq. 17.65),
-then each by sequential quadratic programming (SciPy's SLSQP), and, where the exact sign judges, without slopes.
+then each by sequential quadratic programming (SciPy's SLSQP), and the best of them, as it is judged, without slopes.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,8 @@ from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
 from tuning.objective import Problem, coordinates_of, with_sign, with_trials
 from tuning.polish import Best, largest, polish
-from tuning.starts import APART, EDGE, Report, logit, promising, share_of, starting_points, toward_edges
+from tuning.refine import refine
+from tuning.starts import Report, logit, promising, share_of, starting_points, toward_edges
 from tuning.worst import Hardest
 
 PENALTY = 20.0
@@ -28,16 +29,14 @@ SAME = 0.01  # of the bounds: starts as near to a polished one are not polished
 RATE, LAST_RATE = 0.15, 0.01  # Adam's learning rate in the free reals, cosine decay
 LARGEST_SLOPE = 1.0
 PATIENCE, GAINED = 30, 1e-3  # steps without this much less F in any start end the descent
-# refinement without slopes: points around the best one, times; spread at first, and by how much it shrinks
-AROUND, REFINED, SPREAD, SHRINK = 64, 18, 0.05, 0.75
-CROSSED, FOLLOWED, CROSSINGS = 512, 4, 3  # points that share gains with the best one; those polished; times, at most
+SPREAD, FOLLOWED = 512, 4  # points over the bounds, flown under the exact sign; those that count beside the starts
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
 SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
 HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
 ROUNDS = 6  # searches again with hardest trials added, at most
 
-CROSSING, REFINING = "looking for a better valley", "refining"
+SPREADING, REFINING = "looking for a better valley", "refining"
 
 
 @dataclass(frozen=True)
@@ -237,20 +236,20 @@ class Run:
     def settle(self, problem: Problem, rng: np.random.Generator) -> None:
         """From what the descent found to the best gains as they are judged.
 
-        Where the exact sign judges, F has no slopes to go by: it is flown at the gains found, at points spread over the
-        bounds and at points that share gains, and so the active limits, with the best one, and refined around the best
-        of these. Otherwise the points that share gains are polished like the starts.
+        Where the exact sign judges, F has no slopes to go by: it is flown at the gains found and at points spread over
+        the bounds, and refined around the best of these. Otherwise what the refinement finds is polished like a start.
         """
         if not self.started:
             return
+        assert self._best is not None
         tightened = self._tightened(with_sign(problem, 0.0) if self._exact else problem)
         if self._exact:
-            assert self._best is not None
-            spread = logit(toward_edges(rng.random((CROSSED, len(problem.names)))))
-            far = promising(self._evaluate, tightened, spread, FOLLOWED, partial(self._report, CROSSING))
+            spread = logit(toward_edges(rng.random((SPREAD, len(problem.names)))))
+            far = promising(self._evaluate, tightened, spread, FOLLOWED, partial(self._report, SPREADING))
             self._as_judged(tightened, np.concatenate([self._best.z, far]))
-        self._cross(tightened, rng)
         self._refine(tightened, rng)
+        if not self._exact:
+            self._polish(tightened, self._best, [int(self._best.order()[0])])
 
     def _tightened(self, problem: Problem) -> Problem:
         return replace(problem, limits=problem.limits * (1.0 - self._margin))
@@ -261,47 +260,11 @@ class Run:
         if np.isfinite(best.f).any():
             self._best, self._problem = best, tightened
 
-    def _cross(self, tightened: Problem, rng: np.random.Generator) -> None:
-        """Look for a better valley: points that share some gains, and so the active limits, with the best one."""
-        best, count = self._best, len(tightened.names)
+    def _refine(self, tightened: Problem, rng: np.random.Generator) -> None:
+        best = self._best
         assert best is not None
-        for _ in range(CROSSINGS if count > 1 else 0):
-            before, f = self.best_so_far, best.f[best.order()[0]]
-            share = toward_edges(rng.random((CROSSED, count)))
-            kept = np.argsort(rng.random((CROSSED, count)), axis=1) < rng.integers(1, count, (CROSSED, 1))
-            points = np.where(kept, best.z[best.order()[0]], logit(share))
-            z = promising(self._evaluate, tightened, points, FOLLOWED, partial(self._report, CROSSING))
-            more = best.add(z)
-            if self._exact:
-                flown = self._evaluate.fly(tightened, z)
-                best.offer(z, flown, np.isfinite(flown.f), slice(more[0], None))
-            else:
-                self._polish(tightened, best, more)
-            if self.best_so_far[1] >= before[1] and f - best.f[best.order()[0]] < GAINED:
-                return
-
-    def _refine(self, tightened: Problem, rng: np.random.Generator, *, widely: bool = True) -> None:
-        """Better points around the best one, without slopes, ever closer; widely: around other good ones too."""
-        best, count = self._best, len(tightened.names)
-        assert best is not None
-        chosen: list[int] = []
-        for k in best.order():
-            apart = [np.abs(share_of(best.z[k]) - share_of(best.z[j])).max() for j in chosen]
-            if np.isfinite(best.f[k]) and min(apart, default=1.0) >= APART / 2:
-                chosen.append(int(k))
-        passes = [*chosen[:FOLLOWED], None, None] if self._exact and widely else [None]
-        for one in passes:  # the best one of all twice more
-            start = int(best.order()[0]) if one is None else one
-            for k in range(REFINED):
-                self._report(REFINING, k, REFINED, *self.best_so_far)
-                moved = rng.random((AROUND, count)) < 0.5  # the others stay, and with them, often, the active limits
-                moved[np.arange(AROUND), rng.integers(0, count, AROUND)] = True
-                step = SPREAD * SHRINK**k * rng.normal(size=(AROUND, count)) * moved
-                z = logit(np.clip(share_of(best.z[start]) + step, EDGE, 1.0 - EDGE))
-                seen = self._evaluate.fly(tightened, z)
-                for at in np.argsort(seen.f, kind="stable")[:8]:  # the limits decide which of the lowest counts
-                    finite = np.isfinite(seen.f[at : at + 1])
-                    best.offer(z[at : at + 1], seen.at(int(at)), finite, slice(start, start + 1))
+        refine(self._evaluate, tightened, best, int(best.order()[0]), int(rng.integers(2**31)),
+               lambda done, steps: self._report(REFINING, done, steps, *self.best_so_far))  # fmt: skip
 
     def step(self, problem: Problem, known: np.ndarray, rng: np.random.Generator) -> None:
         """The best gains that keep these limits, from known ones (points, gains): polished, then refined as judged."""
@@ -311,7 +274,7 @@ class Run:
         if self._exact:
             tightened = self._tightened(with_sign(problem, 0.0))
             self._as_judged(tightened, np.concatenate([self._best.z, known]))
-        self._refine(tightened, rng, widely=False)
+        self._refine(tightened, rng)
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended

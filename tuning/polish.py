@@ -32,13 +32,6 @@ class Best:
         for old, new in zip(kept, (z, seen.f, np.exp(seen.value), over, worst), strict=True):
             old[starts][better] = new[better]
 
-    def add(self, z: np.ndarray) -> list[int]:
-        """More starts, z (starts, gains); returns their numbers."""
-        more = Best(z, self.worst.shape[1], self.margin)
-        for name in ("z", "f", "value", "over", "worst"):
-            setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
-        return list(range(len(self.f) - len(z), len(self.f)))
-
     def order(self) -> np.ndarray:
         """Starts from the best to the worst."""
         return np.lexsort((self.f, self.over))

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from scipy.stats import qmc
 
-from tuning.evaluate import Evaluator
+from tuning.evaluate import Evaluator, Measured
 from tuning.objective import Problem
 
 CANDIDATES = 128  # points flown for each start that is chosen
@@ -35,12 +35,11 @@ def promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int, 
     A point that has no better one within `APART` of it, in the unit cube, is taken for the lowest of its valley (as in
     multi-level single linkage, Rinnooy Kan and Timmer, Math. Programming 39, 1987); the others follow, not too close.
     """
-    merit = []
+    found = []
     for k in range(0, len(z), 64):
-        flown = evaluate.fly(problem, z[k : k + 64])
-        merit.append(flown.f + CHARGE * np.log1p(flown.c.max(axis=(1, 2), initial=0.0)))
+        found.append(merit(evaluate.fly(problem, z[k : k + 64])))
         tell(min(k + 64, len(z)), len(z), np.nan, np.nan)
-    merits, share = np.concatenate(merit), share_of(z)
+    merits, share = np.concatenate(found), share_of(z)
     order = np.asarray([k for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])], dtype=int)
     apart = np.abs(share[order, None] - share[None, order]).max(axis=2)  # row and column by merit
     lowest = [k for k in range(len(order)) if np.all(apart[k, :k] >= APART)]
@@ -50,6 +49,11 @@ def promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int, 
             if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
                 chosen.append(k)
     return z[order[chosen]]
+
+
+def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
+    """(points,) F, with what they are beyond a limit charged, so many times as hard."""
+    return flown.f + CHARGE * np.log1p(times * flown.c.max(axis=(1, 2), initial=0.0))
 
 
 def toward_edges(uniform: np.ndarray) -> np.ndarray:
