@@ -17,7 +17,7 @@ from typing import Any
 import tomli_w
 
 JOURNAL = "journal.bin"  # of a run that is not finished
-PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
+PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
 class RefusedError(ValueError):
@@ -137,15 +137,15 @@ def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
     text, before = tomli_w.dumps(_named(tables)), ""
     while text != before:  # innermost arrays first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
-    _write(path, text)
+    write_text(path, text)
 
 
 def write_json(path: Path, value: Any) -> None:
     """A JSON file; numbers that are not finite become null."""
-    _write(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """A text file that is whole or not there."""
     making = path.with_name(f".{path.name}-{os.getpid()}")
     making.write_text(text, encoding="utf-8")

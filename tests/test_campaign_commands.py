@@ -8,6 +8,7 @@ import pytest
 
 from ptsmc_jax import campaign
 from tests.helpers import same
+from tests.pages import checked
 
 FOLDER = "out/montecarlo-s"
 OVERSHOOT = """
@@ -55,6 +56,9 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     ]  # fmt: skip
     figures = {path.name for path in (folder / "figures").iterdir()}
     assert figures == {"fan.png", "distributions.png", "torque_by_angle.png", "inputs.png"}
+    read = checked(folder)
+    assert "Every requirement is met 250 trials of seed 3: 250 ok" in read.text
+    assert "ptsmc montecarlo scenario.toml --trials 250 --seed 3" in read.text
     found, rows = summary(folder), rows_of(folder)
     assert (found["status"], found["flown"], found["counts"]["ok"]) == ("met", 250, 250)
     errors = rows["window_error"].to_numpy()

@@ -12,6 +12,7 @@ import pytest
 from ptsmc_jax import metrics, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
+from tests.pages import checked
 from tests.test_scenario import check_sentence
 from tuning import cli, single
 
@@ -111,6 +112,14 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert len(rows) >= 2 * 5
     # the gains beat the paper's on the same trials, in this noise too
     assert summary["fresh"]["window_error"]["rms"] < summary["paper"]["window_error"]["rms"]
+
+    read = checked(tmp_path / "t")
+    assert set(read.charts) == {"search"}
+    assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
+    gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
+    assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict
+    (verdict,) = summary["verdicts"]
+    assert f"{100 * verdict['margin']:.3g} % of the limit" in read.text[: read.text.index("Requirements")]
 
     before = tree(tmp_path / "t")
     again, told, _ = command("tune", "s.toml", "--out", "t")
@@ -510,6 +519,10 @@ def test_reproduce_leaves_what_the_contract_says(command, tmp_path):
     assert (status, err) == (0, "")
     assert "holds in part" in out
     folder = tmp_path / "out" / "reproduce"
+    read = checked(folder)
+    assert read.charts == {}
+    for claim in json.loads((folder / "summary.json").read_text())["claims"]:
+        assert " ".join(claim["claim"].split()) in read.text
     assert {"summary.json", "versions.json", "claims.md"} <= set(tree(folder))
     assert command("reproduce")[0] == 2  # it is there already
     assert command("reproduce", "some.toml")[0] == 2
@@ -529,6 +542,8 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     assert status == 0
     assert "4 of 4 pairs flown" in out
     assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
+    again = "ptsmc map scenario.toml --x loop.period=0.05:0.1:2 --y controller.delta=0.2:0.8:2 --trials 2 --seed 0"
+    assert again in checked(tmp_path / "out" / "map-s").text
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.delta=0.2:0.8:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
         status, out, err = command("map", "s.toml", *pairs, "--out", "bad", *bad)

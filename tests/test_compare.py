@@ -10,6 +10,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, SHORT, small_search
+from tests.pages import checked
 from tuning import compare, gains
 
 TABLES = tomllib.loads(SHORT)
@@ -81,6 +82,9 @@ def test_the_command(command, tmp_path, monkeypatch):
         for name, value in found["laws"][law]["gains"].items():
             if name != "observer_gain":
                 assert getattr(again.controller, name) == pytest.approx(value, rel=1e-9)
+    read = checked(folder)
+    assert read.text.startswith("ptsmc compare: compare-s")
+    assert f"{found['laws']['pd']['window_error']:.2e}" in read.text
     code, again, _ = command("compare", "s.toml")
     assert "already done" in again
     assert command("compare", "s.toml", "--seed", "x")[0] == 2

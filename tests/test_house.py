@@ -62,7 +62,10 @@ FLOORS = {
         report single reproduction mapping
         results pareto compare campaign_folder
         campaign_summary
-        show show_campaign options
+        told options
+        show
+        show_campaign page_charts
+        page
         campaign_commands
         cli table
     """,

@@ -12,6 +12,7 @@ from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import SHORT, small_search, tree
+from tests.pages import checked
 from tuning import pareto, report, show
 
 
@@ -88,6 +89,9 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
         np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
         np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
     assert f"{len(kept)} points, each judged on 60 fresh trials" in told
+    read = checked(tmp_path / "p")
+    assert set(read.charts) == {"front"}
+    assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
     assert command("pareto", "s.toml", "--points", 6, "--out", "p")[1].startswith("front already done")
     assert command("pareto", "s.toml", "--points", 7, "--out", "p")[0] == 2
 

@@ -182,7 +182,7 @@ def replay(
     found = campaign_summary.replay(opened, number)
     store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, number, figures))
     if not quiet:
-        show.run(found.run, place)
+        show.run(single.summary(found.run), opened.scenario.plant.kind, place)
         show_campaign.replayed(found.off, found.rounding)
     return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
 

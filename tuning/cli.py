@@ -56,7 +56,7 @@ def simulate(
     run = runs.fly(study(loaded, drawn=number is not None), key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
-        show.run(run, folder)
+        show.run(single.summary(run), loaded.plant.kind, folder)
     return 0 if run.met else 1
 
 
@@ -78,7 +78,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     made = reproduction.reproduce()
     store.write(folder, lambda making: reproduction.write(making, made, figures))
     if not quiet:
-        show.reproduction(made, folder)
+        show.reproduction(reproduction.summary(made), folder)
     return 0 if made.ok else 1
 
 
@@ -226,6 +226,24 @@ def compare(
         summary=comparing.summary,
         shown=show.comparison,
     )  # fmt: skip
+
+
+@app.command(name="report")
+def report_(
+    folder: Annotated[Path, Parameter(name="DIR", help="Folder that a command left.")], /, *, quiet: Quiet = False
+) -> int:
+    """Make one page of HTML, DIR/report.html, from the results in a folder: to be sent, opened and printed anywhere.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax import store
+    from tuning import page
+
+    made = page.build(folder)
+    store.write(folder, lambda making: store.write_text(making / "report.html", made))
+    if not quiet:
+        show.say(f"page in {folder / 'report.html'}")
+    return 0
 
 
 for _command in (

@@ -35,6 +35,11 @@ class Axis:
     values: tuple[float, ...]
 
     @property
+    def text(self) -> str:
+        """As `axis` reads it."""
+        return f"{self.key}={self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}"
+
+    @property
     def logarithmic(self) -> bool:
         """Whether it is spaced by factors."""
         return self.values[0] > 0 and self.values[-1] > WIDE * self.values[0]
@@ -188,7 +193,8 @@ def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray,
 def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
-    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.key, y=y.key))
+    trials = max((cell.trials for cell in cells), default=0)
+    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials))
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)
     rows = [["" if value != value else value for value in row] for row in cells_of]

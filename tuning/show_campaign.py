@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
+from tuning import show, told
 
 
 class Progress:
@@ -48,56 +48,9 @@ class Progress:
 
 def campaign(found: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from ptsmc_jax.metrics import CATALOGUES
-
-    console = Console(highlight=False)
-    if found["status"] == "unfinished":
-        console.print(f"NOT finished: {found['flown']} of {found['trials']} trials are flown", soft_wrap=True)
-    counts = ", ".join(f"{count} {status}" for status, count in found["counts"].items() if count)
-    console.print(f"{found['flown']} trials of seed {found['seed']}: {counts}", soft_wrap=True)
-    for reason in found["reasons"]:
-        first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
-        console.print(f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}", soft_wrap=True)
-    table = Table("", "median", "99.73 %", "95 % interval", "largest", "unit", box=None, pad_edge=False)
-    for name, told in found["quantiles"].items():
-        far = told["0.9973"]
-        between = f"{_number(far['low'])}..{_number(far['high'])}"
-        cells = (told["0.5"]["value"], far["value"])
-        unit = CATALOGUES[found["plant"]].get(name, ("",))[0]
-        table.add_row(name, *(_number(v) for v in cells), between, _number(told.get("max")), unit)
-    console.print(table)
-    for verdict in found["verdicts"]:
-        console.print(_verdict(verdict), soft_wrap=True)
-    for name in dict.fromkeys(("window_error", *(v["metric"] for v in found["verdicts"]))):
-        driven = [item for item in found["drivers"].get(name, {}).items() if max(map(abs, item[1].values())) >= WEAK]
-        driven = sorted(driven, key=lambda item: -max(map(abs, item[1].values())))[:3]
-        if driven:
-            said = (f"{key} {d['rank_correlation']:+.2f} ({100 * d['first_order']:.0f} %)" for key, d in driven)
-            text = f"{name} goes with {', '.join(said)}: rank correlation (share of the variance)"
-            console.print(text, soft_wrap=True)
-    console.print(f"results in {folder}", soft_wrap=True)
-
-
-def _number(value: float | None) -> str:
-    if value is None or value != value:
-        return "-"
-    return "none" if value in (float("inf"), float("-inf")) else f"{value:.3g}"
-
-
-def _verdict(told: dict[str, Any]) -> str:
-    from ptsmc_jax.requirements import verdict_text
-
-    fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
-    text = verdict_text(**{field: told[field] for field in fields})
-    low, high = told["share_interval"]
-    text += f"; within it {100 * told['share']:.6g} % (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
-    if told["quantile"] is not None and told["confidence"] is not None:
-        text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
-        text += f"; with so many failures {told['fewest_trials']} trials would do"
-    return text
+    show.say(*told.campaign_counts(found))
+    show.table(told.campaign(found))
+    show.say(*map(told.verdict, found["verdicts"]), *told.campaign_drivers(found), f"results in {folder}")
 
 
 def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:

@@ -1,6 +1,7 @@
 """What `ptsmc simulate` leaves: the history of one run as CSV, its metrics and verdicts, figures."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -9,13 +10,18 @@ from ptsmc_jax.runs import Run
 from ptsmc_jax.tables import Scenario
 
 
+def summary(run: Run) -> dict[str, Any]:
+    """What `summary.json` says."""
+    verdicts = {v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met} for v in run.verdicts}
+    heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
+    return {**heading, **run.metrics, "verdicts": verdicts}
+
+
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
     store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial))
-    verdicts = {v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met} for v in run.verdicts}
-    heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
-    store.write_json(folder / "summary.json", {**heading, **run.metrics, "verdicts": verdicts})
+    store.write_json(folder / "summary.json", summary(run))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:

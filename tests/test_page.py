@@ -1,0 +1,238 @@
+"""`ptsmc report`: pages that need nothing else, say the verdict first and run nothing that a user typed."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+
+import numpy as np
+import pytest
+
+from tests.helpers import tree
+from tests.pages import Page, checked
+from tuning import page, page_charts
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
+
+
+def in_chromium(path, tmp_path, *options):
+    """What Chromium makes of a page, and what it says on its console."""
+    assert CHROMIUM is not None
+    with tempfile.TemporaryDirectory() as home:
+        done = subprocess.run(
+            [CHROMIUM, "--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--virtual-time-budget=8000",
+             "--enable-logging=stderr", "--disable-background-networking", f"--user-data-dir={home}", *options,
+             path.as_uri()],
+            capture_output=True, text=True, timeout=300, check=True, env={**os.environ, "HOME": home},
+        )  # fmt: skip
+    said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    harmless = ("GL Driver Message", "willReadFrequently")
+    return done.stdout, [line for line in said if not any(word in line for word in harmless)]
+
+
+@pytest.fixture
+def flown(command, tmp_path):
+    assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", "run", "--quiet")[0] in (0, 1)
+    return tmp_path / "run"
+
+
+def test_a_run_becomes_a_page(command, flown):
+    before = tree(flown)
+    code, said, error = command("report", "run")
+    assert (code, said.strip(), error) == (0, f"page in {os.path.join('run', 'report.html')}", "")
+    after = tree(flown)
+    assert {name: content for name, content in after.items() if name != "report.html"} == before
+    read = checked(flown)
+    assert after["report.html"].decode() == page.build(flown)
+    summary = json.loads((flown / "summary.json").read_text())
+    for name in ("window_error", "peak_torque", "hold_error"):
+        assert f"{summary[name]:.5g}" in read.text
+    assert summary["settling_time"] is None
+    assert "settling_time never s" in read.text
+    assert "ptsmc simulate scenario.toml --trial 3 --seed 5" in read.text
+    assert (flown / "scenario.toml").read_text().split("\n")[0] in read.text
+    rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
+    history = {line["name"]: line for line in read.charts["history"]["data"]}
+    assert set(history) == set(rows.dtype.names or ()) - {"t"}
+    for name in ("q4", "w2", "u3"):
+        np.testing.assert_allclose(history[name]["x"], rows["t"], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(history[name]["y"], rows[name], rtol=1e-5, atol=1e-12)
+    assert command("report", "run", "--quiet") == (0, "", "")  # again, in place
+
+
+def test_the_body_turns_as_it_flew(flown):
+    made = checked(flown).charts["attitude"]
+    rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
+    times = np.array([float(frame["name"]) for frame in made["frames"]])
+    assert times[0] == 0.0
+    assert times[-1] == pytest.approx(rows["t"][-1])
+    for frame in (made["frames"][0], made["frames"][-1]):
+        k = np.argmin(np.abs(rows["t"] - float(frame["name"])))
+        q = [rows[f"q{j}"][k] for j in (1, 2, 3, 4)]
+        from scipy.spatial.transform import Rotation
+
+        tips = np.array([[axis[c][1] for c in "xyz"] for axis in frame["data"][1:]])
+        np.testing.assert_allclose(tips, Rotation.from_quat(q).as_matrix().T, atol=2e-5)
+
+
+@pytest.mark.parametrize(("status", "mood", "said"), [
+    ("ok", "good", "Every requirement is met"),
+    ("missed", "bad", "The run failed: missed"),
+    ("diverged", "bad", "The run failed: diverged"),
+])  # fmt: skip
+def test_the_verdict_comes_first(flown, status, mood, said):
+    summary = json.loads((flown / "summary.json").read_text())
+    summary.update(status=status, reason="", verdicts={"peak_torque": {"limit": 30.0, "margin": 0.5, "met": True}})
+    (flown / "summary.json").write_text(json.dumps(summary))
+    read = checked(flown)
+    (header,) = [attrs for tag, attrs in read.found if tag == "header"]
+    assert header["class"] == mood
+    assert read.text.index(said) < read.text.index("Requirements")
+    (bar,) = [float(attrs["width"]) for tag, attrs in read.found if tag == "rect" and attrs["class"] != "all"]
+    assert bar == 150.0  # of a limit at 300
+    assert "50 % of the limit" in read.text
+    summary["verdicts"]["peak_torque"] = {"limit": 0.01, "margin": None, "met": False}
+    (flown / "summary.json").write_text(json.dumps(summary))
+    assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
+
+
+def hostile_folder(flown):
+    """The same result as a user could have named everything in it."""
+    folder = flown.with_name(re.sub("/", "", HOSTILE))
+    flown.rename(folder)
+    summary = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps({**summary, "status": "diverged", "reason": HOSTILE}))
+    versions = json.loads((folder / "versions.json").read_text())
+    (folder / "versions.json").write_text(json.dumps({**versions, HOSTILE: HOSTILE, "platform": HOSTILE}))
+    with (folder / "scenario.toml").open("a") as file:
+        file.write(f"# {HOSTILE}\n")
+    header, *rows = (folder / "trajectory.csv").read_text().splitlines()
+    header = header.replace("s3", '"' + HOSTILE.replace('"', '""') + '"')
+    (folder / "trajectory.csv").write_text("\n".join([header, *rows]))
+    return folder
+
+
+def test_what_a_user_typed_is_text(flown):
+    plain = [tag for tag, _ in checked(flown).found]
+    folder = hostile_folder(flown)
+    read = checked(folder)  # which knows every element and attribute that may be there
+    assert [tag for tag in plain if tag in ("script", "img")] == [t for t, _ in read.found if t in ("script", "img")]
+    assert read.text.count("onerror=document.title=1") >= 4
+    assert HOSTILE in [line["name"] for line in read.charts["history"]["data"]]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("hostile", [False, True])
+def test_chromium_draws_it_without_an_error_or_a_request(flown, tmp_path, hostile):
+    """The policy forbids every request and foreign script; one that was tried would be on the console."""
+    folder = hostile_folder(flown) if hostile else flown
+    place = tmp_path / "page.html"
+    place.write_text(page.build(folder))
+    drawn, console = in_chromium(place, tmp_path, "--dump-dom")
+    assert console == []
+    title = re.search(r"<title>(.*?)</title>", drawn, re.S)
+    assert title is not None
+    assert title[1].startswith("ptsmc simulate: ")
+    body = re.sub(r"<script.*?</script>", "", drawn, flags=re.S)
+    for name in ("history", "attitude"):
+        assert re.search(rf'class="chart \w+ js-plotly-plot" id="{name}"', body)
+    assert body.count("scatterlayer") == 5 + hostile  # a panel for q, w, d_hat, u and s, and for another name
+    assert "<canvas" in body  # the turning body
+    assert "WebGL is not supported" not in body
+    assert 'data-title="Zoom in"' in body
+    assert "Share" not in re.findall(r'data-title="([^"]*)"', body)
+    assert not any("hare" in title for title in re.findall(r'data-title="([^"]*)"', body))  # nothing is uploaded
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_a_foreign_script_would_be_told(flown, tmp_path):
+    """That the test above can fail."""
+    place = tmp_path / "page.html"
+    foreign = '<script>document.title = "x"</script><img src="https://example.org/x.png">'
+    place.write_text(page.build(flown).replace("<main>", f"<main>{foreign}"))
+    drawn, console = in_chromium(place, tmp_path, "--dump-dom")
+    assert len(console) == 2
+    assert "<title>ptsmc simulate" in drawn
+    with pytest.raises(AssertionError):
+        Page(place.read_text())
+
+
+def test_what_is_no_result_is_refused(command, flown, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder, said in (
+        ("none", "none is no folder"),
+        ("s.toml", "s.toml is no folder"),
+        ("empty", "empty holds no result"),
+    ):
+        code, out, error = command("report", folder)
+        assert (code, out) == (2, "")
+        assert error.startswith(f"ptsmc: {said}; allowed is ")
+        assert error.count("\n") == 1
+    kept = tree(flown)
+    for name, content, said in (
+        ("summary.json", None, "run holds a simulate that is not finished; run the same command to its end"),
+        ("summary.json", "{", "run holds a file that cannot be read: "),
+        ("summary.json", "{}", "run lacks 'verdicts', as results of another version do (0.1.0); make it again"),
+        ("versions.json", "[]", "run holds no result; allowed is a folder that a ptsmc command left"),
+        ("versions.json", '{"command": ["x"]}', "run holds no result"),
+        ("scenario.toml", "a = [", "run holds a file that cannot be read: "),
+        ("trajectory.csv", None, "run holds a simulate that is not finished"),
+    ):
+        if content is None:
+            (flown / name).unlink()
+        else:
+            (flown / name).write_text(content)
+        code, out, error = command("report", "run")
+        assert (code, out) == (2, ""), name
+        assert error.startswith(f"ptsmc: {said}"), error
+        assert "report.html" not in tree(flown)
+        for path, old in kept.items():
+            (flown / path).write_bytes(old)
+
+
+def test_without_plotly_it_says_how_to_install_it(command, flown, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    code, _, error = command("report", "run")
+    assert code == 2
+    assert error == "ptsmc: the page needs plotly.offline: pip install 'ptsmc-jax[report]'\n"
+
+
+def test_a_front_has_its_intervals_and_its_knee():
+    def point(peak, rms, **marks):
+        own = {"gains": {"eta": 3.0}, "interval": [0.9 * rms, 1.2 * rms], "knee": False, "dominated": False}
+        return {"peak": peak, "rms": rms, **own, **marks}
+
+    summary = {"points": [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)],
+               "paper": point(5.0, 1e-4, interval=None)}  # fmt: skip
+    drawn = page_charts.front(summary, {"peak_torque": "N m", "window_error": "-"}, 1.5)
+    named = {trace["name"]: trace for trace in drawn["data"]}
+    assert {name: trace["x"] for name, trace in named.items()} == {
+        "front": [1.0, 2.0], "knee": [1.0], "beaten by others": [3.0], "paper": [5.0],
+    }  # fmt: skip
+    np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
+    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
+    assert named["paper"]["error_y"]["array"] == [0.0]
+    assert drawn["layout"]["shapes"][0]["x0"] == 1.5
+    assert "peak torque [N m]" in json.dumps(drawn["layout"])
+
+
+def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():
+    t = np.linspace(0.0, 50.0, 10 * page_charts.POINTS)
+    columns = {"t": t, "x1": np.sin(t), "u1": np.where(t > 49.0, np.nan, t)}
+    made = page_charts.history(columns, False, {"t_f": 35.0})
+    x, u = made["data"]
+    assert len(x["x"]) == page_charts.POINTS
+    assert (x["x"][0], x["x"][-1]) == (0.0, 50.0)
+    assert u["y"][-1] is None
+    json.dumps(made, allow_nan=False)
+    assert [shape["x0"] for shape in made["layout"]["shapes"]] == [35.0]
+
+
+def test_other_plants_have_pages_too(command, tmp_path):
+    (tmp_path / "c.toml").write_text('[plant]\nkind = "chain"\norder = 2\nx0 = [1.0, 0.0]\n[controller]\nt_f = 5.0\n')
+    command("simulate", "c.toml", "--out", "chain", "--quiet")
+    read = checked(tmp_path / "chain")
+    assert set(read.charts) == {"history"}
