@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ptsmc_jax.drawing import RC, STYLES, figure_of
+from ptsmc_jax.drawing import RC, STYLES, figure_of, plain_ticks
 from ptsmc_jax.metrics import CATALOGUES
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
@@ -71,6 +71,7 @@ def distributions(found: Mapping[str, tuple[str, np.ndarray, float | None]]) -> 
             axes.minorticks_off()
             if known and ordered[0] > 0.0 and ordered[known - 1] > 3.0 * ordered[0]:
                 axes.set_xscale("log")
+                plain_ticks(axes.xaxis)
             if limit is not None:
                 within = np.mean(values <= limit)
                 said = f"limit {limit:g} {unit}".rstrip(" -") + f": {100 * within:.6g} % within"
@@ -102,6 +103,7 @@ def torque_by_angle(
     if finished.size and finished.min() > 0.0:
         top = max(finished.max(), limit or 0.0)
         axes.set_yscale("log")
+        plain_ticks(axes.yaxis)
         axes.set_ylim(finished.min() / 1.3, top * 1.5)
     axes.legend(fontsize=9)
     return figure

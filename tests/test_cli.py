@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from ptsmc_jax import metrics, runs, scenario, store
+from ptsmc_jax import metrics, montecarlo, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
 from tests.pages import checked
@@ -107,6 +107,11 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     tuned = scenario.read(tmp_path / "t" / "tuned.toml")
     assert tuned.controller.eta == summary["gains"]["eta"]
     assert tuned.controller.delta == summary["gains"]["delta"]
+    ready = scenario.study(tuned)  # what is handed over flies as it was judged
+    again = montecarlo.run(ready.parts, ready.dispersion, summary["fresh"]["seed"], np.arange(40))
+    rms = np.sqrt(np.mean(again.metrics.window_error**2))
+    assert rms == pytest.approx(summary["fresh"]["window_error"]["rms"], rel=1e-12)
+    assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 0.0)
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
     assert len(rows) >= 2 * 5

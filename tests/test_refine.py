@@ -80,9 +80,9 @@ def test_it_looks_around_the_start():
     valley = Valley(np.eye(2))
     refined(valley, [0.1, -0.2])
     first = valley.seen[1]  # after the start itself; the bounds, 1.5 spreads and more away, hold back one in twelve
-    assert first.shape == (refine.POPULATION, 2)
-    np.testing.assert_allclose(first.mean(axis=0), [0.1, -0.2], atol=5.0 * refine.SPREAD / np.sqrt(len(first)))
-    assert np.all(np.abs(first.std(axis=0) / refine.SPREAD - 0.9) < 0.3)
+    assert first.shape == (refine.WIDELY[0], 2)
+    np.testing.assert_allclose(first.mean(axis=0), [0.1, -0.2], atol=5.0 * refine.WIDELY[1] / np.sqrt(len(first)))
+    assert np.all(np.abs(first.std(axis=0) / refine.WIDELY[1] - 0.9) < 0.3)
 
 
 def test_where_nothing_keeps_the_limit_it_goes_on_toward_it():

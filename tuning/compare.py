@@ -91,7 +91,7 @@ def contenders(scenario: Scenario) -> dict[str, Scenario]:
 def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
     fresh_seed = report.seed_of_judge(seed)
-    made = {"paper": _papers(gains.papers(scenario), fresh_seed)}
+    made = {"paper": _papers(report.as_flown(gains.papers(scenario)), fresh_seed)}
     stopped = False
     for law, posed in contenders(scenario).items():
 

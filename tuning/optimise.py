@@ -18,7 +18,7 @@ from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
 from tuning.objective import Problem, coordinates_of, with_sign, with_trials
 from tuning.polish import Best, largest, polish
-from tuning.refine import refine
+from tuning.refine import NEARBY, WIDELY, refine
 from tuning.starts import Report, logit, promising, share_of, starting_points, toward_edges
 from tuning.worst import Hardest
 
@@ -260,11 +260,11 @@ class Run:
         if np.isfinite(best.f).any():
             self._best, self._problem = best, tightened
 
-    def _refine(self, tightened: Problem, rng: np.random.Generator) -> None:
+    def _refine(self, tightened: Problem, rng: np.random.Generator, size: tuple[int, float] = WIDELY) -> None:
         best = self._best
         assert best is not None
         refine(self._evaluate, tightened, best, int(best.order()[0]), int(rng.integers(2**31)),
-               lambda done, steps: self._report(REFINING, done, steps, *self.best_so_far))  # fmt: skip
+               lambda done, steps: self._report(REFINING, done, steps, *self.best_so_far), size)  # fmt: skip
 
     def step(self, problem: Problem, known: np.ndarray, rng: np.random.Generator) -> None:
         """The best gains that keep these limits, from known ones (points, gains): polished, then refined as judged."""
@@ -274,7 +274,7 @@ class Run:
         if self._exact:
             tightened = self._tightened(with_sign(problem, 0.0))
             self._as_judged(tightened, np.concatenate([self._best.z, known]))
-        self._refine(tightened, rng)
+        self._refine(tightened, rng, NEARBY)
 
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended

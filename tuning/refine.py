@@ -10,25 +10,35 @@ from tuning.objective import Problem
 from tuning.polish import SLACK, Best
 from tuning.starts import EDGE, logit, merit, share_of
 
-POPULATION, GENERATIONS = 128, 40
-SPREAD = 0.2  # of the first points, in shares of the bounds' intervals
+GENERATIONS = 40
+WIDELY = 128, 0.2  # points of a generation; spread of the first ones, in shares of the bounds' intervals
+NEARBY = 32, 0.05  # the same from a point that is nearly the best
 STEEP = 10.0  # times the charge for a breach of a limit among far-off points: here many points are close to one
 PATIENCE, GAINED = 12, 1e-4  # generations without this much less F end it
 WORST = 1e9  # merit of a point that failed
 
 
-def refine(evaluate: Evaluator, problem: Problem, best: Best, start: int, seed: int, tell: Callable) -> None:
+def refine(
+    evaluate: Evaluator,
+    problem: Problem,
+    best: Best,
+    start: int,
+    seed: int,
+    tell: Callable,
+    size: tuple[int, float] = WIDELY,
+) -> None:
     """Better points around a start's best iterate, kept in `best`; tell(generation, generations) is called.
 
     Covariance matrix adaptation (Hansen and Ostermeier, Evol. Comput. 9(2), 2001), in shares of the bounds' intervals.
     """
     within = np.tile([EDGE, 1.0 - EDGE], (len(problem.names), 1))
     middle = np.clip(share_of(best.z[start]), *within[0])
-    evolution = CMA(middle, SPREAD, bounds=within, seed=seed, population_size=POPULATION)
+    population, spread = size
+    evolution = CMA(middle, spread, bounds=within, seed=seed, population_size=population)
     record = list[float]()
     for k in range(GENERATIONS):
         tell(k, GENERATIONS)
-        share = np.asarray([evolution.ask() for _ in range(POPULATION)])
+        share = np.asarray([evolution.ask() for _ in range(population)])
         z = logit(share)
         seen = evaluate.fly(problem, z)
         merits = np.nan_to_num(merit(seen, STEEP), nan=WORST, posinf=WORST)

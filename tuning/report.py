@@ -46,7 +46,7 @@ class Trust:
 class Tuning:
     """A finished tuning run."""
 
-    tuned: Scenario
+    tuned: Scenario  # as it was judged
     gains: dict[str, float]
     search: Search
     at_bound: dict[str, str]
@@ -112,7 +112,7 @@ def tune(
 
     report("judging on fresh trials", 0, 0, found.value, 0.0)
     named = {name: rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
-    tuned = gains.in_scenario(scenario, named)
+    tuned = as_flown(gains.in_scenario(scenario, named))
     trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
@@ -122,12 +122,12 @@ def tune(
     fresh, judged_gains = {}, {}
     for name, candidate in candidates.items():
         fresh[name] = judge(candidate, fresh_seed, ready.requirements)
-        judged_gains[name] = gains.gains_of(study(candidate).parts)
+        judged_gains[name] = gains.gains_of(study(as_flown(candidate)).parts)
     verdicts = verdicts_of(ready.requirements, fresh["tuned"])
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
     if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
-        shortest = shortest_time(as_flown(tuned), limit, fresh_seed, fresh["tuned"].trial)
+        shortest = shortest_time(tuned, limit, fresh_seed, fresh["tuned"].trial)
     believed = smooth_value = None
     if trusted and not found.interrupted:
         if posed.exact:
