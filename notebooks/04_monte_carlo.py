@@ -32,11 +32,11 @@ from tuning import campaign_folder, campaign_summary, show_campaign
 # %%
 flight = ptsmc.replace(
     ptsmc.read("../scenarios/first_flight.toml"),
-    controller__eta=2.861,
+    controller__eta=2.857,
     controller__delta=0.384,
     controller__sign_width=0.0,
     loop__clock="flight",
-    observer__gain=[7.25] * 3,
+    observer__gain=[7.03] * 3,
     hardware__rate_bias=1e-6,
     dispersion__rate={"kind": "normal", "std": 0.002},
     dispersion__inertia={"kind": "relative_normal", "std": 0.05, "axes_deg": 1.0},
