@@ -64,7 +64,7 @@ FLOORS = {
         campaign_summary
         told options
         show
-        show_campaign page_charts
+        show_campaign page_charts convert
         page
         campaign_commands
         cli table

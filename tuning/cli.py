@@ -246,6 +246,36 @@ def report_(
     return 0
 
 
+_Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.")]
+
+
+@app.command
+def convert_attitude(
+    *,
+    quat_xyzw: _Numbers = None,
+    quat_wxyz: _Numbers = None,
+    rotvec_deg: _Numbers = None,
+    mrp: _Numbers = None,
+    dcm_body_to_inertial: Annotated[str | None, Parameter(help="Nine numbers, row by row.")] = None,
+    euler_deg: _Numbers = None,
+    sequence: Annotated[
+        str | None, Parameter(help="Three axes in SciPy's notation, of euler_deg and of what is printed; default ZYX.")
+    ] = None,
+) -> int:
+    """Print one attitude, of the body relative to the inertial frame, in every form that a scenario takes.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from tuning import convert
+
+    given = {
+        "quat_xyzw": quat_xyzw, "quat_wxyz": quat_wxyz, "rotvec_deg": rotvec_deg, "mrp": mrp,
+        "dcm_body_to_inertial": dcm_body_to_inertial, "euler_deg": euler_deg, "sequence": sequence,
+    }  # fmt: skip
+    show.say(*convert.lines(convert.quaternion(given), sequence))
+    return 0
+
+
 for _command in (
     campaign_commands.montecarlo,
     campaign_commands.summarize,
