@@ -51,7 +51,7 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     q, q_f = np.asarray(log.x.q)[shown], np.broadcast_to(np.asarray(log.reference.q), (len(t), 4))[shown]
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
     edges = [(i, j) for i, j in combinations(range(8), 2) if np.sum(corners[i] != corners[j]) == 1]
-    with matplotlib.rc_context(RC):
+    with matplotlib.rc_context({**RC, "animation.embed_limit": 1e4}):  # MB; beyond it frames would be dropped
         figure = Figure(figsize=(4.6, 4.6), dpi=70)
         axes = figure.add_subplot(projection="3d")
         box = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in edges]

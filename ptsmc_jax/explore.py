@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
@@ -108,6 +109,8 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
 
     Raises ScenarioError, with one sentence, where it cannot be flown.
     """
+    _whole("seed", seed)
+    _whole("trial", 0 if trial is None else trial)
     known = what if isinstance(what, Scenario) else scenario.read(what)
     return Flight(known, runs.fly(scenario.study(known, drawn=trial is not None), seed, trial))
 
@@ -120,6 +123,8 @@ def trials(
     Number, status, reason, bad_time [s], the metrics in the units of `metrics.CATALOGUE`, what each trial flew with,
     and metrics of one's own (see `montecarlo.one`).
     """
+    _whole("seed", seed)
+    _whole("count", count, 1)
     known = what if isinstance(what, Scenario) else scenario.read(what)
     return campaign.Campaign(scenario.study(known), seed, own).fly(0, count)
 
@@ -132,6 +137,12 @@ def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
 def units(kind: str = "spacecraft") -> dict[str, str]:
     """The unit of each metric of this kind of plant."""
     return {name: unit for name, (unit, _) in metrics.CATALOGUES[kind].items()}
+
+
+def _whole(name: str, value: object, least: int = 0) -> None:
+    """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards."""
+    if not isinstance(value, int | np.integer) or not least <= value < 2**32:
+        raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
 
 
 def _number(value: float) -> str:

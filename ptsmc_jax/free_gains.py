@@ -123,6 +123,8 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
         return least, MOST_STEPS * loop.period - hold if loop.mode == "sampled" else math.inf, False
     if name == "gamma":  # gamma - 1/p > 1, for every p
         return 1.0 + 1.0 / tune.bounds.get("p", (scenario.controller.p,))[0], math.inf, False
+    if name == "p" and "gamma" not in (tune.free or ()) and hasattr(scenario.controller, "gamma"):
+        return _least_p(scenario), 2.0, False
     if name in _POWERS:
         return *_POWERS[name], False
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):
@@ -153,6 +155,9 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
     if name == "gamma":
         least = 1.0 + 1.0 / (tune.bounds.get("p") or _default(scenario, tune, "p", free))[0]
         return least + 0.05, least + 2.0
+    if name == "p" and "gamma" not in free and hasattr(scenario.controller, "gamma"):
+        least = _least_p(scenario)
+        return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
     return {
         "observer_gain": (0.5, 300.0),
         "k1": (0.1, 10.0),
@@ -165,6 +170,11 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         "m": (1.05, 3.0),
         "n": (0.05, 0.95),
     }[name]
+
+
+def _least_p(scenario: Scenario) -> float:
+    """What p must exceed for gamma - 1/p > 1."""
+    return max(1.0, 1.0 / (scenario.controller.gamma - 1.0))
 
 
 def _has_gain(scenario: Scenario) -> bool:

@@ -78,6 +78,8 @@ def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
         key, rate = _slew(scenario.controller, reach.smallest_t_f)
+        if isinstance(scenario.controller, t.Baseline):  # a bound only: a run that turns faster is marked
+            rate = min(rate, 0.5 * MOST_SUBSTEPS * 0.025 / scenario.loop.period)
         found[key] = rate
     return found
 

@@ -145,3 +145,22 @@ def test_signed_powers():
         assert slope[~known] == 0.0
     by_power = jax.jvp(lambda a: numerics.signed_power(x, a), (vector(0.7),), (vector(1.0),))[1]
     assert np.all(np.isfinite(by_power))
+
+
+def test_pd_tells_what_it_drives_to_zero_and_knows_no_singularity():
+    law, half = LAWS["pd"], attitude.multiply(TARGET.q, vector([0.0, 0.0, 1.0, 0.0]))
+    q_e, w_e, *_ = law.relative(X, TARGET)
+    s = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]
+    np.testing.assert_allclose(s, q_e[:3] + 0.9 / 0.4 * w_e, rtol=1e-12)
+    turned = plants.AttitudeState(half, X.w)
+    assert law.clearance(turned, TARGET) == 1.0
+    for name in SLIDING:
+        np.testing.assert_allclose(LAWS[name].clearance(turned, TARGET), 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", SLIDING)
+def test_the_sign_is_as_wide_as_it_is_told_and_exact_at_zero(name):
+    s = vector([1e-9, -2e-9, 0.0])
+    np.testing.assert_array_equal(replace(LAWS[name], sign_width=vector(0.0)).sign(s), [1.0, -1.0, 0.0])
+    np.testing.assert_allclose(replace(LAWS[name], sign_width=vector(0.5)).sign(vector([0.1, -1.0, 0.0])),
+                               np.tanh([0.2, -2.0, 0.0]), rtol=1e-14)  # fmt: skip

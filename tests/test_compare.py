@@ -3,15 +3,17 @@
 import csv
 import json
 import tomllib
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import montecarlo, rollout, scenario
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, SHORT, small_search
 from tests.pages import checked
-from tuning import compare, gains
+from tuning import compare, gains, report
 
 TABLES = tomllib.loads(SHORT)
 
@@ -93,6 +95,8 @@ def test_the_command(command, tmp_path, monkeypatch):
 def test_settling_is_summed_up_by_where_trials_start():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
     assert compare._near_far(angle, settling) == (30.0, 33.0)
+    assert compare._near_far(angle, np.where(angle > 2.2, np.inf, settling)) == (30.0, 33.0)
+    assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
     assert compare._rank_correlation(angle, angle**3) == pytest.approx(1.0)
     assert compare._rank_correlation(angle, -angle) == pytest.approx(-1.0)
 
@@ -113,3 +117,105 @@ def test_the_first_flight_can_be_compared():
     for other in posed.values():
         assert tuned(other).trials == 32
         scenario.study(other)
+
+
+def test_nothing_that_is_asked_of_one_law_is_not_asked_of_the_others():
+    asked = {"objective": "cvar", "level": 0.8, "torque_weight": 0.1, "worst_case": True, "trials": 7, "starts": 3,
+             "steps": 5}  # fmt: skip
+    known = {"disturbance_rate_bound": 2e-3, "disturbance_bound": 0.03, "initial_estimate_error": 0.004}
+    base = scenario.replace(scenario.from_tables(TABLES), tune=asked,
+                            controller={"t_f": 5.0, "delta": 0.5, "sign_width": 0.02, **known})  # fmt: skip
+    for kind, other in compare.contenders(base).items():
+        assert {key: getattr(other.tune, key) for key in asked} == asked
+        assert {key: getattr(other.controller, key) for key in known} == known
+        assert getattr(other.controller, "sign_width", 0.02) == 0.02, kind
+
+
+def test_for_the_shortest_t_f_every_law_may_move_its_gains():
+    base = scenario.replace(scenario.from_tables(TABLES), tune={
+        "free": ["eta", "delta", "t_f"], "objective": "t_f", "bounds": {"t_f": [4.0, 8.0]}})  # fmt: skip
+    free = {kind: tuned(other) for kind, other in compare.contenders(base).items()}
+    assert free["pd"].free == ("k_p", "k_d", "observer_gain", "t_f")
+    assert free["fixed_time"].free == ("a1", "b1", "a2", "b2", "observer_gain", "t_f")
+    assert all(tune.bounds["t_f"] == (4.0, 8.0) for tune in free.values())
+
+
+@pytest.fixture(scope="module")
+def eight():
+    ready = scenario.study(scenario.from_tables(TABLES))
+    return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
+
+
+def contender(trials, **changes):
+    base = scenario.from_tables(TABLES)
+    verdicts = report.verdicts_of(scenario.study(base).requirements, trials)
+    return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts))
+
+
+def changed(trials, status, **metrics):
+    numbers = {name: np.asarray(value, dtype=float) for name, value in metrics.items()}
+    return replace(trials, status=np.asarray(status, dtype=np.int32), metrics=trials.metrics._replace(**numbers))
+
+
+def test_a_contender_is_summed_up_over_what_it_flew(eight):
+    nan, ok, bad = np.nan, rollout.OK, rollout.DIVERGED
+    trials = changed(eight, [ok] * 6 + [rollout.MISSED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
+                     peak_torque=[1.0] * 5 + [2.0, 3.0, 99.0],
+                     settling_time=[1.0, 2.0, 3.0, 4.0, nan, nan, nan, 0.5])  # fmt: skip
+    one = contender(trials)
+    assert not one.met  # one failed, and one missed t_f
+    found = compare.figures_of(one)
+    assert found["window_error"] == pytest.approx(np.sqrt((5 + 4 + 9) / 7))
+    assert found["peak_torque"] == pytest.approx(10 / 7)
+    assert found["largest_peak_torque"] == 3.0
+    assert found["unsettled"] == 4
+    assert found["settling_time"] == {"0.01": 1.0, "0.5": 4.0, "0.99": None}  # half of all, not of those that settled
+    missed = contender(changed(eight, [ok] * 7 + [rollout.MISSED]))
+    assert all(v.met for v in missed.verdicts)
+    assert not missed.met
+
+
+def rivals(monkeypatch, eight, interrupt=None):
+    """What a comparison asks of `report`: seeds that laws are tuned and judged by, without any search."""
+    asked = []
+
+    def tune(posed, seed, told, journal, *, trusted):
+        law = posed.controller.kind
+        asked.append(("tune", law, seed))
+        return SimpleNamespace(tuned=posed, gains={}, at_bound={}, fresh={"tuned": eight}, verdicts=[],
+                               search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
+
+    def judge(flown, seed, requirements):
+        asked.append(("judge", "paper", seed))
+        return eight
+
+    monkeypatch.setattr(report, "tune", tune)
+    monkeypatch.setattr(report, "judge", judge)
+    return asked
+
+
+def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
+    asked = rivals(monkeypatch, eight)
+    made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
+    assert asked == [("judge", "paper", report.seed_of_judge(5)),
+                     *(("tune", law, 5) for law in ("prescribed_time", "pd", "terminal", "fixed_time"))]  # fmt: skip
+    assert made.status == "met"
+    lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
+    assert replace(made, contenders=lost).status == "not met"
+    assert compare.told(made.contenders["paper"].flown, 5) != compare.told(made.contenders["paper"].flown, 6)
+
+
+def test_an_interruption_ends_the_comparison(monkeypatch, eight):
+    asked = rivals(monkeypatch, eight, interrupt="pd")
+    made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
+    assert made.status == "interrupted"
+    assert [law for what, law, _ in asked if what == "tune"] == ["prescribed_time", "pd"]
+
+
+def test_what_a_rival_cannot_fly_is_refused_before_any_search(monkeypatch, eight):
+    asked = rivals(monkeypatch, eight)
+    opposite = {"initial": {"rotvec_deg": [0.0, 0.0, 90.0]}, "reference": {"rotvec_deg": [0.0, 0.0, -90.0]}}
+    tables = {name: table for name, table in TABLES.items() if name != "dispersion"} | opposite
+    with pytest.raises(ScenarioError, match=r"the law terminal cannot fly this: .*q_e4 = 0"):
+        compare.compare(scenario.from_tables(tables), 0, lambda *told: None)
+    assert not asked

@@ -106,3 +106,57 @@ def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
 def test_axes_are_turned_as_scipy_turns_them():
     turn, vectors = Rotation.from_rotvec([0.4, -1.2, 0.7]), np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(animation.turned(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
+
+
+FLOWN = {name: table for name, table in TABLES.items() if name != "tune"}
+
+
+def peak(result, parts):
+    return {"mine": 2.0 * result.metrics.peak_torque}
+
+
+def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
+    flight = scenario.from_tables(FLOWN)
+    rows = ptsmc_jax.trials(flight, 2, own=peak)
+    np.testing.assert_allclose(rows["mine"], 2.0 * rows["peak_torque"], rtol=1e-14)
+    for asked in (lambda: ptsmc_jax.trials(flight, -1), lambda: ptsmc_jax.simulate(flight, seed=2**32),
+                  lambda: ptsmc_jax.simulate(flight, trial=-1)):  # fmt: skip
+        with pytest.raises(ValueError, match="but must be a whole number from"):
+            asked()
+
+
+def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
+    slow = scenario.replace(scenario.from_tables(FLOWN), hardware__torque_limit=1e-3)
+    run = ptsmc_jax.simulate(slow)
+    assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
+    assert "<td>settling_time</td><td>-</td><td>s</td>" in run.metrics._repr_html_()
+    assert explore.units("chain")["peak_torque"] == "u"
+
+
+def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
+    drawn = []
+
+    class Watched:
+        def __init__(self, figure, draw, frames, interval):
+            for k in range(frames):
+                lines = [np.stack(line.get_data_3d()).T for line in draw(k)[:-1]]
+                drawn.append((float(draw(k)[-1].get_text().split()[2]), lines))
+
+        def to_jshtml(self, default_mode):
+            return ""
+
+    monkeypatch.setattr(animation, "FuncAnimation", Watched)
+    tables = FLOWN | {"reference": {"rotvec_deg": [0.0, 0.0, 40.0]}}
+    flight = ptsmc_jax.simulate(scenario.from_tables(tables), trial=1)
+    flight.animate(frames=4)
+    np.testing.assert_allclose([t for t, _ in drawn], [0.0, 6.5 / 3, 13.0 / 3, 6.5], atol=0.11)
+    log, edges = flight.run.log, np.sort([1.0, 0.7, 0.5] * 4)
+    for q, lines in ((log.x.q[0], drawn[0][1]), (log.x.q[-1], drawn[-1][1])):
+        np.testing.assert_allclose(np.sort([np.linalg.norm(b - a) for a, b in lines[:12]]), edges, rtol=1e-12)
+        corners = np.unique(np.round(np.concatenate(lines[:12]), 9), axis=0)
+        back = animation.turned(np.append(-q[:3], q[3]), corners)
+        np.testing.assert_allclose(np.abs(back), np.tile(animation.SIDES, (8, 1)), atol=1e-8)
+        for at, three in ((q, lines[12:15]), (log.reference.q[0], lines[15:])):
+            np.testing.assert_allclose(
+                [end for _, end in three], animation.turned(np.asarray(at), np.eye(3)), atol=1e-12
+            )

@@ -1,13 +1,16 @@
 """Gains by name: moved in parts as in the scenario, axis by axis, the time after t_f kept."""
 
+import tomllib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, rollout, sensors
+from ptsmc_jax import montecarlo, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
-from tests.helpers import finer, vector
+from ptsmc_jax.schema import ScenarioError
+from tests.helpers import SHORT, finer, vector
 from tuning import bounds, gains, report
 
 BASE = {
@@ -112,3 +115,19 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
     one, other = (rollout.simulate_jit(finer(p, 4)).metrics for p in (moved, changed.parts))
     np.testing.assert_allclose(one.peak_torque, other.peak_torque, rtol=1e-6)
     np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)
+
+
+def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
+    from tuning import bounds, gains
+
+    for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
+        base = scenario.replace(
+            scenario.from_tables(tomllib.loads(SHORT)), tune=None, controller={"kind": kind, "t_f": 5.0, **more}
+        )
+        free = {"free": ["p", "b1"]} if more else {}
+        base = scenario.replace(base, tune=free)
+        box = bounds.of_scenario(base)
+        for corner in (box.lower, box.upper):
+            scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
+    with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):
+        scenario.replace(base, tune={"free": ["p"], "bounds": {"p": [1.05, 1.2]}})

@@ -74,33 +74,50 @@ def contenders(scenario: Scenario) -> dict[str, Scenario]:
     table, tune = scenario.controller, scenario.tune
     common = {key: getattr(table, key) for key in tables.Baseline.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
-    if tune.objective == report.T_F:
-        same["free"] = ["t_f"]
     found = {}
     for kind in (OURS, *BASELINES):
         if scenario.controller.kind == kind:
             found[kind] = scenario
         elif kind == OURS:
-            found[kind] = replace(gains.papers(scenario), tune=same)
+            found[kind] = _posed(gains.papers(scenario), tune, same)
         else:
-            other = replace(scenario, tune=None, controller={"kind": kind, **common})
-            found[kind] = replace(other, tune=same)
+            width = {"sign_width": table.sign_width} if kind != "pd" and hasattr(table, "sign_width") else {}
+            other = replace(scenario, tune=None, controller={"kind": kind, **common, **width})
+            found[kind] = _posed(other, tune, same)
     return found
+
+
+def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
+    """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
+    if tune.objective != report.T_F:
+        return replace(other, tune=same)
+    default = replace(other, tune={}).tune
+    assert default is not None
+    assert default.free is not None
+    return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
 def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
     fresh_seed = report.seed_of_judge(seed)
+    rivals = contenders(scenario)
+    for law, posed in rivals.items():
+        try:
+            study(posed)
+        except ScenarioError as error:  # before hours of search, not after
+            raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
     made = {"paper": _papers(report.as_flown(gains.papers(scenario)), fresh_seed)}
     stopped = False
-    for law, posed in contenders(scenario).items():
+    for law, posed in rivals.items():
 
         def told(what: str, *others: Any, law: str = law) -> None:
             tell(f"{law}: {what}", *others)
 
         tuned = report.tune(posed, seed, told, journal, trusted=False)
         made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, tuned.fresh["tuned"], tuned.verdicts)
-        stopped |= tuned.search.interrupted
+        stopped = tuned.search.interrupted
+        if stopped:
+            break
     return Comparison(made, fresh_seed, stopped)
 
 
@@ -116,7 +133,7 @@ def figures_of(one: Contender) -> dict[str, Any]:
     angle, done = trials.drawn["initial_angle"], trials.finished
     settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[done]
     settled = done & np.isfinite(settling)
-    known = settling[settled]
+    known, late = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
     spread = known.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(known) > 0.0
     mean = {name: float(np.mean(getattr(trials.metrics, name)[done])) if done.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
@@ -130,10 +147,10 @@ def figures_of(one: Contender) -> dict[str, Any]:
         **mean,
         "largest_peak_torque": float(np.max(trials.metrics.peak_torque[done])) if done.any() else None,
         "unsettled": int(trials.status.size - known.size),
-        "settling_time": {str(q): float(np.quantile(known, q)) for q in (0.01, 0.5, 0.99)} if known.size else None,
+        "settling_time": {str(q): _quantile(late, q) for q in (0.01, 0.5, 0.99)},
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
         "settling_by_angle": _rank_correlation(angle[settled], known) if spread else None,
-        "settling_near_far": _near_far(angle[settled], known) if spread else None,
+        "settling_near_far": _near_far(angle, late) if spread else None,
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
     }
 
@@ -143,11 +160,17 @@ def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.corrcoef(stats.rankdata(x), stats.rankdata(y))[0, 1])
 
 
-def _near_far(angle: np.ndarray, settling: np.ndarray) -> tuple[float, float]:
-    """Median settling times of the nearest and the farthest fifth of the starts [s]."""
+def _quantile(late: np.ndarray, q: float) -> float | None:
+    """Of settling times [s], infinite where a trial never settles; None: that is never."""
+    found = float(np.quantile(late, q, method="inverted_cdf"))
+    return found if np.isfinite(found) else None
+
+
+def _near_far(angle: np.ndarray, late: np.ndarray) -> tuple[float | None, float | None]:
+    """Median settling times of the nearest and the farthest fifth of the starts [s]; see `_quantile`."""
     order = np.argsort(angle)
     fifth = max(1, angle.size // 5)
-    return float(np.median(settling[order[:fifth]])), float(np.median(settling[order[-fifth:]]))
+    return _quantile(late[order[:fifth]], 0.5), _quantile(late[order[-fifth:]], 0.5)
 
 
 def summary(made: Comparison) -> dict[str, Any]:
