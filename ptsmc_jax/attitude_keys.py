@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import schema, tables
+from ptsmc_jax import schema, signal_tables
 from ptsmc_jax.schema import ScenarioError, wrong
 
 
@@ -17,7 +17,7 @@ def unit(key: str, value: Any) -> np.ndarray:
     return array / length
 
 
-def turn(table: tables.SlewReference) -> np.ndarray:
+def turn(table: signal_tables.SlewReference) -> np.ndarray:
     """Rotation vector of a slew from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
     from scipy.spatial.transform import Rotation
 
@@ -27,7 +27,7 @@ def turn(table: tables.SlewReference) -> np.ndarray:
     return short * (1.0 - 2.0 * np.pi / angle) if table.way == "long" and angle > 0.0 else short
 
 
-def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
+def quaternion(table: signal_tables.Attitude, name: str) -> np.ndarray:
     """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
     key, value = attitude_key(table)
     full = f"{name}.{key}"
@@ -58,12 +58,12 @@ def quaternion(table: tables.Attitude, name: str) -> np.ndarray:
         ) from None
 
 
-def has_attitude(table: tables.Attitude) -> bool:
+def has_attitude(table: signal_tables.Attitude) -> bool:
     """Whether a table gives an attitude at all."""
-    return any(getattr(table, key) is not None for key in tables.ATTITUDE_KEYS)
+    return any(getattr(table, key) is not None for key in signal_tables.ATTITUDE_KEYS)
 
 
-def attitude_key(table: tables.Attitude) -> tuple[str, Any]:
+def attitude_key(table: signal_tables.Attitude) -> tuple[str, Any]:
     """The attitude key that a table uses, and its value."""
-    key = next(key for key in tables.ATTITUDE_KEYS if getattr(table, key) is not None)
+    key = next(key for key in signal_tables.ATTITUDE_KEYS if getattr(table, key) is not None)
     return key, getattr(table, key)

@@ -10,16 +10,19 @@ from ptsmc_jax import (
     baselines,
     checks,
     controllers,
+    device_tables,
+    dispersion_tables,
     dispersions,
     free_gains,
     hardware,
+    law_tables,
     observers,
+    plant_tables,
     plants,
+    signal_tables,
     signals,
 )
-from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import sensors as sensing
-from ptsmc_jax import tables as t
 from ptsmc_jax.tables import Scenario
 
 
@@ -41,11 +44,11 @@ def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
 
 def plant(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     """Nominal plant, law, initial state and reference."""
-    if isinstance(scenario.plant, t.SystemPlant):
+    if isinstance(scenario.plant, plant_tables.SystemPlant):
         model = checks.system(scenario.plant)
         law = controllers.PrescribedTimeSystem(model, *_gains(scenario))
         return model, law, vector(scenario.plant.x0), signals.Now()
-    return _spacecraft(scenario) if isinstance(scenario.plant, t.SpacecraftPlant) else _chain(scenario)
+    return _spacecraft(scenario) if isinstance(scenario.plant, plant_tables.SpacecraftPlant) else _chain(scenario)
 
 
 def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
@@ -58,27 +61,27 @@ def _spacecraft(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
     q_f = jnp.asarray(attitude_keys.quaternion(scenario.reference, "reference"))
     reference: Any = signals.Fixed(q_f)
     table = scenario.reference
-    if isinstance(table, t.SpinReference):
+    if isinstance(table, signal_tables.SpinReference):
         reference = signals.Spin(q_f, vector(table.rate))
-    elif isinstance(table, t.SinusoidReference):
+    elif isinstance(table, signal_tables.SinusoidReference):
         reference = signals.Swing(q_f, vector(table.amplitude), vector(table.frequency), vector(table.phase))
-    elif isinstance(table, t.SlewReference):
+    elif isinstance(table, signal_tables.SlewReference):
         reference = signals.Slew(q_f, vector(attitude_keys.turn(table)), vector(table.duration))
     table = scenario.controller
-    if isinstance(table, t.Baseline):
+    if isinstance(table, law_tables.Baseline):
         kinds = {"pd": baselines.QuaternionPD, "terminal": baselines.Terminal, "fixed_time": baselines.FixedTime}
         kind = kinds[scenario.controller.kind]
         own = {name: vector(getattr(table, name)) for name in kind.free}
         return model, kind(model=model, delta=vector(scenario.loop.period), **own), initial, reference
-    assert isinstance(table, t.Controller)
+    assert isinstance(table, law_tables.Controller)
     multiplicative = table.error == "multiplicative"
     law = controllers.PrescribedTimeMultiplicative if multiplicative else controllers.PrescribedTime
     return model, law(model, *_gains(scenario)), initial, reference
 
 
 def _chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
-    assert isinstance(scenario.plant, t.ChainPlant)
-    assert isinstance(scenario.controller, t.ChainController)
+    assert isinstance(scenario.plant, plant_tables.ChainPlant)
+    assert isinstance(scenario.controller, law_tables.ChainController)
     model = plants.chain(scenario.plant.order)
     controller = controllers.PrescribedTimeChain(model, *_gains(scenario), vector(scenario.controller.a))
     return model, controller, vector(scenario.plant.x0), signals.Origin()
@@ -87,12 +90,12 @@ def _chain(scenario: Scenario) -> tuple[plants.Plant, Any, Any, Any]:
 def observer(scenario: Scenario, model: plants.Plant) -> observers.Observer:
     """The observer; its model is the nominal plant."""
     law, table = scenario.controller, scenario.observer
-    if isinstance(table, t.NoObserver):
+    if isinstance(table, law_tables.NoObserver):
         return observers.NoObserver(model, vector(law.disturbance_bound))
     common = (model, vector(table.gain), vector(law.disturbance_rate_bound), vector(law.initial_estimate_error))
     if isinstance(table, checks.FINITE_TIME):
         return observers.FiniteTimeObserver(*common, vector(table.sign_width))
-    if isinstance(table, t.Prescribed):
+    if isinstance(table, law_tables.Prescribed):
         times = (vector(v) for v in (table.mu, *checks.prescribed_times(scenario, table)))
         return observers.PrescribedTimeObserver(*common, *times)
     return observers.NonlinearObserver(*common)
@@ -102,15 +105,15 @@ def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
     """The disturbance as a function of time and state, and the rate of its random walk (None: none)."""
     signal, walk = [], None
     for table in checks.terms(scenario):
-        if isinstance(table, t.RandomWalk | t.EachRandomWalk):
+        if isinstance(table, signal_tables.RandomWalk | signal_tables.EachRandomWalk):
             step = vector(table.density) / np.sqrt(scenario.loop.period)
             walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # independent walks add up to one
-        elif isinstance(table, t.ConstantDisturbance | t.EachConstant):
+        elif isinstance(table, signal_tables.ConstantDisturbance | signal_tables.EachConstant):
             signal.append(signals.Constant(vector(table.amplitude)))
-        elif isinstance(table, t.SinusoidDisturbance | t.EachSinusoid):
+        elif isinstance(table, signal_tables.SinusoidDisturbance | signal_tables.EachSinusoid):
             values = (table.amplitude, table.frequency, table.phase, table.bias)
             signal.append(signals.Sinusoid(*(vector(v) for v in values)))
-        elif isinstance(table, t.GravityGradient):
+        elif isinstance(table, signal_tables.GravityGradient):
             assert scenario.spacecraft is not None
             turned = attitude_keys.has_attitude(table)
             orbit = attitude_keys.quaternion(table, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
@@ -131,10 +134,10 @@ def true_body(scenario: Scenario) -> plants.Spacecraft:
 def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     """Star tracker, gyro and filter, or a chain's sensor; None where the law sees the true state."""
     table, period = scenario.hardware, scenario.loop.period
-    if isinstance(table, t.StateHardware):
+    if isinstance(table, device_tables.StateHardware):
         return None if table.state_noise is None else sensing.StateSensor(vector(table.state_noise))
-    filtered = isinstance(scenario.filter, t.SteadyStateFilter)
-    table = table or t.Hardware()
+    filtered = isinstance(scenario.filter, device_tables.SteadyStateFilter)
+    table = table or device_tables.Hardware()
     noises = (table.attitude_noise, table.rate_noise, table.rate_noise_density, table.rate_bias, table.rate_bias_walk)
     if not filtered and all(noise is None for noise in noises):
         return None
@@ -142,7 +145,7 @@ def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     gyro = free_gains.gyro_noise(table, period)
     walk = table.rate_bias_walk
     estimator = None
-    if isinstance(scenario.filter, t.SteadyStateFilter):
+    if isinstance(scenario.filter, device_tables.SteadyStateFilter):
         bandwidth = vector(free_gains.filter_bandwidth(scenario))
         estimator = sensing.attitude_filter(bandwidth, *(vector(v) for v in (star, gyro, walk or 0.0, period)), every)
     return sensing.Sensors(
@@ -164,7 +167,11 @@ def actuators(scenario: Scenario) -> hardware.Actuators | None:
         return None
     wheels = None
     if device is not None:
-        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if isinstance(device, t.PyramidWheels) else device.axes
+        axes = (
+            hardware.pyramid(np.deg2rad(device.cant_deg))
+            if isinstance(device, device_tables.PyramidWheels)
+            else device.axes
+        )
         wheels = hardware.wheels(axes, device.momentum, device.torque_limit, device.momentum_limit)
     limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
     return hardware.Actuators(limit, rate_limit, lag, step, wheels, delay)
@@ -185,7 +192,7 @@ def dispersion(scenario: Scenario) -> dispersions.Dispersion:
         "bias": _numbers(table.disturbance_bias, m),
         "levels": {key: level for key, level in levels.items() if level is not None},
     }
-    if isinstance(table, t.StateDispersion):
+    if isinstance(table, dispersion_tables.StateDispersion):
         return dispersions.Dispersion(state=_numbers(table.x0), **common)
     inertia = None
     if table.inertia is not None:
@@ -202,18 +209,18 @@ def dispersion(scenario: Scenario) -> dispersions.Dispersion:
 
 
 def _attitudes(table: Any) -> Any:
-    if isinstance(table, dt.UniformAttitude):
+    if isinstance(table, dispersion_tables.UniformAttitude):
         return dispersions.UniformAttitude()
-    if isinstance(table, dt.NormalAttitude):
+    if isinstance(table, dispersion_tables.NormalAttitude):
         return dispersions.NormalAttitude(vector(np.deg2rad(table.std_deg)))
-    if isinstance(table, dt.AxisAngle):
+    if isinstance(table, dispersion_tables.AxisAngle):
         return dispersions.AxisAngle(*(vector(np.deg2rad(a)) for a in (table.min_deg, table.max_deg)))
     return None
 
 
 def _numbers(table: Any, count: int = 1) -> Any:
     """How numbers are drawn; count: how many a single one of the table stands for."""
-    if isinstance(table, dt.RelativeNormal):
+    if isinstance(table, dispersion_tables.RelativeNormal):
         return dispersions.TruncatedNormal(vector(np.ones(count) * table.std))
     if hasattr(table, "half_width"):
         return dispersions.Uniform(vector(np.ones(count) * table.half_width))

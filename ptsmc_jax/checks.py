@@ -5,7 +5,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import attitude_keys, dispersion_tables, free_gains, hardware, layouts, plants, schema, systems, tables
+from ptsmc_jax import (
+    attitude_keys,
+    device_tables,
+    dispersion_tables,
+    free_gains,
+    hardware,
+    law_tables,
+    layouts,
+    plant_tables,
+    plants,
+    schema,
+    signal_tables,
+    systems,
+    tables,
+)
 from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.free_gains import FINITE_TIME, MOST_STEPS
 from ptsmc_jax.schema import ScenarioError, wrong
@@ -16,7 +30,7 @@ def resolve(scenario: Scenario) -> Scenario:
     """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds."""
     loop, t_f = scenario.loop, scenario.controller.t_f
     observer, disturbance = _each("observer", scenario.observer, scenario), scenario.disturbance
-    if isinstance(disturbance, tables.SumDisturbance):
+    if isinstance(disturbance, signal_tables.SumDisturbance):
         each = tuple(_each("disturbance", term, scenario) for term in disturbance.terms)
         disturbance = msgspec.structs.replace(disturbance, terms=each)
     else:
@@ -25,7 +39,7 @@ def resolve(scenario: Scenario) -> Scenario:
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
     dispersion = scenario.dispersion
-    if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
+    if isinstance(dispersion, dispersion_tables.StateDispersion) and dispersion.x0 is not None:
         key = _spread(dispersion.x0)
         width = getattr(dispersion.x0, key) or (1.0,) * len(initial_state(scenario))
         dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
@@ -39,16 +53,16 @@ def inputs(scenario: Scenario) -> int:
     plant = scenario.plant
     return (
         3
-        if isinstance(plant, tables.SpacecraftPlant)
+        if isinstance(plant, plant_tables.SpacecraftPlant)
         else len(plant.x0) // 2
-        if isinstance(plant, tables.SystemPlant)
+        if isinstance(plant, plant_tables.SystemPlant)
         else 1
     )
 
 
 def initial_state(scenario: Scenario) -> tuple[float, ...]:
     """x0 of a chain or a system."""
-    assert not isinstance(scenario.plant, tables.SpacecraftPlant)
+    assert not isinstance(scenario.plant, plant_tables.SpacecraftPlant)
     return scenario.plant.x0
 
 
@@ -85,7 +99,7 @@ def _check_requirements(scenario: Scenario) -> None:
 
 def _check_plant(scenario: Scenario) -> None:
     plant = scenario.plant
-    if isinstance(plant, tables.SpacecraftPlant):
+    if isinstance(plant, plant_tables.SpacecraftPlant):
         assert scenario.spacecraft is not None
         assert scenario.initial is not None
         assert scenario.reference is not None
@@ -101,11 +115,11 @@ def _check_plant(scenario: Scenario) -> None:
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
         attitude_keys.quaternion(scenario.initial, "initial")
         attitude_keys.quaternion(scenario.reference, "reference")
-        if isinstance(scenario.reference, tables.SlewReference):
+        if isinstance(scenario.reference, signal_tables.SlewReference):
             attitude_keys.unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
         _check_devices(scenario)
         return
-    if isinstance(plant, tables.SystemPlant):
+    if isinstance(plant, plant_tables.SystemPlant):
         _check_system(plant)
     else:
         _check_chain(plant, scenario.controller)
@@ -126,7 +140,7 @@ def _check_each(name: str, table: str, found: Any, m: int) -> None:
             raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
 
 
-def _check_system(plant: tables.SystemPlant) -> None:
+def _check_system(plant: plant_tables.SystemPlant) -> None:
     if plant.system is None:
         raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
     if len(plant.x0) % 2:
@@ -140,7 +154,7 @@ def _check_system(plant: tables.SystemPlant) -> None:
         raise wrong("plant.x0", plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
 
 
-def system(plant: tables.SystemPlant) -> plants.System:
+def system(plant: plant_tables.SystemPlant) -> plants.System:
     """The system that a scenario names, or holds; raises ValueError where there is none."""
     if isinstance(plant.system, plants.System):
         return plant.system
@@ -149,7 +163,7 @@ def system(plant: tables.SystemPlant) -> plants.System:
     return systems.load(plant.system)
 
 
-def _check_chain(plant: tables.ChainPlant, controller: Any) -> None:
+def _check_chain(plant: plant_tables.ChainPlant, controller: Any) -> None:
     n = plant.order
     if len(plant.x0) != n:
         raise wrong("plant.x0", plant.x0, f"a list of plant.order = {n} numbers")
@@ -164,7 +178,7 @@ def _check_chain(plant: tables.ChainPlant, controller: Any) -> None:
         )
 
 
-def prescribed_times(scenario: Scenario, observer: tables.Prescribed) -> tuple[float, float]:
+def prescribed_times(scenario: Scenario, observer: law_tables.Prescribed) -> tuple[float, float]:
     """T_o and delta_o of a prescribed-time observer [s]; a third of t_f, and 0.05 s or a period, if not given."""
     loop = scenario.loop
     t_o = scenario.controller.t_f / 3 if observer.t_o is None else observer.t_o
@@ -174,7 +188,7 @@ def prescribed_times(scenario: Scenario, observer: tables.Prescribed) -> tuple[f
 
 def _check_observer(scenario: Scenario) -> None:
     observer, controller = scenario.observer, scenario.controller
-    if isinstance(observer, tables.Prescribed):
+    if isinstance(observer, law_tables.Prescribed):
         t_o, delta_o = prescribed_times(scenario, observer)
         if t_o > controller.t_f:
             raise wrong("observer.t_o", t_o, f"at most controller.t_f, {controller.t_f}")
@@ -190,17 +204,19 @@ def _check_observer(scenario: Scenario) -> None:
 def terms(scenario: Scenario) -> tuple[Any, ...]:
     """The disturbances that act together."""
     table = scenario.disturbance
-    return table.terms if isinstance(table, tables.SumDisturbance) else (table,)
+    return table.terms if isinstance(table, signal_tables.SumDisturbance) else (table,)
 
 
 def _check_devices(scenario: Scenario) -> None:
     """Disturbances, sensors, filter and wheels of a spacecraft."""
     table, device, estimator = scenario.hardware, scenario.wheels, scenario.filter
-    assert table is None or isinstance(table, tables.Hardware)
+    assert table is None or isinstance(table, device_tables.Hardware)
     for k, term in enumerate(terms(scenario)):
-        if isinstance(term, tables.GravityGradient):
+        if isinstance(term, signal_tables.GravityGradient):
             name = (
-                f"disturbance.terms[{k}]" if isinstance(scenario.disturbance, tables.SumDisturbance) else "disturbance"
+                f"disturbance.terms[{k}]"
+                if isinstance(scenario.disturbance, signal_tables.SumDisturbance)
+                else "disturbance"
             )
             schema.one_attitude(name, term)
             if attitude_keys.has_attitude(term):
@@ -211,18 +227,18 @@ def _check_devices(scenario: Scenario) -> None:
         if table.rate_noise is not None and table.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", table.rate_noise_density, "absent where rate_noise is given")
         every = table.star_tracker_every
-        if every not in (None, 1) and not isinstance(estimator, tables.SteadyStateFilter):
+        if every not in (None, 1) and not isinstance(estimator, device_tables.SteadyStateFilter):
             raise ScenarioError(
                 f"hardware.star_tracker_every is {every}, but without a filter the law needs a sample every period; "
                 'allowed is 1, or [filter] with kind = "steady_state"'
             )
     noisy = table is not None and table.attitude_noise and (table.rate_noise or table.rate_noise_density)
-    if isinstance(estimator, tables.SteadyStateFilter) and estimator.bandwidth is None and not noisy:
+    if isinstance(estimator, device_tables.SteadyStateFilter) and estimator.bandwidth is None and not noisy:
         raise ScenarioError(
             "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
         )
     if device is not None:
-        flat = isinstance(device, tables.PyramidWheels)
+        flat = isinstance(device, device_tables.PyramidWheels)
         axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if flat else np.asarray(device.axes)
         try:
             hardware.wheels(axes)
@@ -243,10 +259,10 @@ def _check_devices(scenario: Scenario) -> None:
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, sampled = controller.t_f, free_gains.hand_over(scenario), loop.mode == "sampled"
-    if isinstance(controller, tables.Baseline) and not sampled:
+    if isinstance(controller, law_tables.Baseline) and not sampled:
         kind = schema.show(scenario.controller.kind)
         raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
-    if isinstance(controller, tables.FixedTimeController) and not controller.gamma - 1.0 / controller.p > 1.0:
+    if isinstance(controller, law_tables.FixedTimeController) and not controller.gamma - 1.0 / controller.p > 1.0:
         raise wrong("controller.gamma", controller.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / controller.p:.6g}")
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
@@ -265,9 +281,9 @@ def _check_loop(scenario: Scenario) -> None:
                 raise ScenarioError(f'hardware.{key} needs the sampled loop, but loop.mode is "{loop.mode}"')
         for name in ("wheels", "filter"):
             value = getattr(scenario, name)
-            if value is not None and not isinstance(value, tables.NoFilter):
+            if value is not None and not isinstance(value, device_tables.NoFilter):
                 raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
-        if any(isinstance(term, tables.RandomWalk | tables.EachRandomWalk) for term in terms(scenario)):
+        if any(isinstance(term, signal_tables.RandomWalk | signal_tables.EachRandomWalk) for term in terms(scenario)):
             raise ScenarioError(
                 f'disturbance.kind = "random_walk" needs the sampled loop, but loop.mode is "{loop.mode}"'
             )
@@ -292,7 +308,7 @@ def _check_dispersion(scenario: Scenario) -> None:
         angles = getattr(dispersion, key, None)
         if isinstance(angles, dispersion_tables.AxisAngle) and angles.min_deg > angles.max_deg:
             raise wrong(f"dispersion.{key}.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
-    if isinstance(dispersion, tables.StateDispersion) and dispersion.x0 is not None:
+    if isinstance(dispersion, dispersion_tables.StateDispersion) and dispersion.x0 is not None:
         key, states = _spread(dispersion.x0), len(initial_state(scenario))
         value = getattr(dispersion.x0, key)
         if len(value) != states:

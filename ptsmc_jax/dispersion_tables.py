@@ -8,34 +8,64 @@ from ptsmc_jax.values import NotNegative, NotNegatives, Table
 
 
 class UniformAttitude(Table, frozen=True):
+    """Any attitude at all, uniform on SO(3)."""
+
     kind: Literal["uniform"] = "uniform"
 
 
 class AxisAngle(Table, frozen=True):
+    """Turned about an axis uniform on the sphere, by a uniform angle; initial: away from the reference at t = 0.
+
+    Attributes:
+        min_deg: smallest angle [deg]
+        max_deg: largest angle [deg]
+    """
+
     kind: Literal["axis_angle"] = "axis_angle"
     min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
     max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
 
 
 class NormalAttitude(Table, frozen=True):
+    """Turned by a normal rotation vector from what the scenario says.
+
+    Attributes:
+        std_deg: 1 sigma per axis [deg]
+    """
+
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 1.0
 
 
 class NormalRate(Table, frozen=True):
+    """Each axis normal about initial.rate.
+
+    Attributes:
+        std: 1 sigma per axis [rad/s]
+    """
+
     kind: Literal["normal"] = "normal"
     std: NotNegative = 0.01
 
 
 class UniformRate(Table, frozen=True):
-    """Each axis uniform within half_width of initial.rate."""
+    """Each axis uniform about initial.rate.
+
+    Attributes:
+        half_width: largest deviation per axis [rad/s]
+    """
 
     kind: Literal["uniform"] = "uniform"
     half_width: NotNegative = 0.01
 
 
 class RelativeInertia(Table, frozen=True):
-    """Principal moments off by a normal share, truncated at three standard deviations, their axes turned."""
+    """The true body's principal moments off by a normal share, truncated at three sigma and to what a body can have.
+
+    Attributes:
+        std: 1 sigma of the share
+        axes_deg: 1 sigma of the small rotation of the principal axes [deg]
+    """
 
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
@@ -43,50 +73,93 @@ class RelativeInertia(Table, frozen=True):
 
 
 class UniformPhase(Table, frozen=True):
+    """Uniform over the circle."""
+
     kind: Literal["uniform"] = "uniform"
 
 
 class RelativeNormal(Table, frozen=True):
-    """Off by a normal share, truncated at three standard deviations."""
+    """Off by a normal share, truncated at three sigma.
+
+    Attributes:
+        std: 1 sigma of the share
+    """
 
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
 
 
 class RelativeUniform(Table, frozen=True):
-    """Off by a share of at most half_width."""
+    """Off by a uniform share.
+
+    Attributes:
+        half_width: largest share
+    """
 
     kind: Literal["relative_uniform"] = "relative_uniform"
     half_width: Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")] = 0.2
 
 
 class NormalBias(Table, frozen=True):
+    """Normal about what [disturbance] says.
+
+    Attributes:
+        std: 1 sigma of each component [N m]
+    """
+
     kind: Literal["normal"] = "normal"
     std: NotNegative = 1e-3
 
 
 class UniformBias(Table, frozen=True):
-    """Each input's within half_width of what [disturbance] says."""
+    """Uniform about what [disturbance] says.
+
+    Attributes:
+        half_width: largest deviation of each component [N m]
+    """
 
     kind: Literal["uniform"] = "uniform"
     half_width: NotNegative = 1e-3
 
 
 class UniformState(Table, frozen=True):
-    """Every state uniform within half_width of x0."""
+    """Every state uniform about x0.
+
+    Attributes:
+        half_width: largest deviation, one number for each state; default: 1 each
+    """
 
     kind: Literal["uniform"] = "uniform"
-    half_width: NotNegatives = ()  # 1 for each state
+    half_width: NotNegatives = ()
 
 
 class NormalState(Table, frozen=True):
-    """Every state normal about x0."""
+    """Every state normal about x0.
+
+    Attributes:
+        std: 1 sigma, one number for each state; default: 1 each
+    """
 
     kind: Literal["normal"] = "normal"
-    std: NotNegatives = ()  # 1 for each state
+    std: NotNegatives = ()
 
 
 class Dispersion(Table, frozen=True):
+    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says.
+
+    Attributes:
+        attitude: of the body at t = 0
+        rate: of the body at t = 0
+        inertia: of the true body; the law knows that of [spacecraft] only
+        reference: the whole reference turned
+        disturbance_phase: of every sinusoid, and of the orbit
+        disturbance_amplitude: of each sinusoid and constant, a factor each
+        disturbance_bias: a constant torque, added
+        attitude_noise: factor on hardware.attitude_noise
+        rate_noise: factor on hardware.rate_noise
+        torque_limit: factor on hardware.torque_limit
+    """
+
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
     rate: NormalRate | UniformRate | None = None
     inertia: RelativeInertia | None = None
@@ -100,6 +173,17 @@ class Dispersion(Table, frozen=True):
 
 
 class StateDispersion(Table, frozen=True):
+    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says.
+
+    Attributes:
+        x0: initial state
+        disturbance_phase: of every sinusoid
+        disturbance_amplitude: of each sinusoid and constant, a factor each
+        disturbance_bias: a constant, added
+        state_noise: factor on hardware.state_noise
+        torque_limit: factor on hardware.torque_limit
+    """
+
     x0: UniformState | NormalState | None = None
     disturbance_phase: UniformPhase | None = None
     disturbance_amplitude: RelativeNormal | RelativeUniform | None = None

@@ -4,11 +4,11 @@ import math
 
 import msgspec
 
-from ptsmc_jax import schema, sensors, tables
+from ptsmc_jax import device_tables, law_tables, plant_tables, schema, sensors, tables
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
-FINITE_TIME = tables.FiniteTimeObserver | tables.EachFiniteTimeObserver
+FINITE_TIME = law_tables.FiniteTimeObserver | law_tables.EachFiniteTimeObserver
 # what is free of the laws to compare with, if a scenario does not say
 _BASELINES: dict[str, tuple[tables.Free, ...]] = {
     "pd": ("k_p", "k_d"),
@@ -21,7 +21,7 @@ MOST_STEPS = 200_000  # of a run
 
 def least_eta(scenario: Scenario) -> float:
     """What eta must exceed: 2 by Theorems 1 and 2, the order of a chain by Theorem 3."""
-    return float(scenario.plant.order) if isinstance(scenario.plant, tables.ChainPlant) else 2.0
+    return float(scenario.plant.order) if isinstance(scenario.plant, plant_tables.ChainPlant) else 2.0
 
 
 def hand_over(scenario: Scenario) -> float:
@@ -31,15 +31,15 @@ def hand_over(scenario: Scenario) -> float:
 
 def filter_bandwidth(scenario: Scenario) -> float:
     """Bandwidth of the scenario's filter [rad/s]: where star tracker and gyro weigh the same, if it gives none."""
-    assert isinstance(scenario.filter, tables.SteadyStateFilter)
+    assert isinstance(scenario.filter, device_tables.SteadyStateFilter)
     if scenario.filter.bandwidth is not None:
         return scenario.filter.bandwidth
     table, period = scenario.hardware, scenario.loop.period
-    assert isinstance(table, tables.Hardware)
+    assert isinstance(table, device_tables.Hardware)
     return sensors.best_bandwidth(table.attitude_noise or 0.0, gyro_noise(table, period), period, _interval(scenario))
 
 
-def gyro_noise(table: tables.Hardware, period: float) -> float:
+def gyro_noise(table: device_tables.Hardware, period: float) -> float:
     """Noise of the gyro, 1 sigma a sample [rad/s]."""
     return table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
 
@@ -74,11 +74,11 @@ def check(scenario: Scenario, tune: tables.Tune) -> None:
         raise ScenarioError(
             f'{said} observer.kind = "none" has no gain; allowed is observer_gain with an observer of another kind'
         )
-    if "filter_bandwidth" in free and not isinstance(scenario.filter, tables.SteadyStateFilter):
+    if "filter_bandwidth" in free and not isinstance(scenario.filter, device_tables.SteadyStateFilter):
         raise ScenarioError(
             f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
         )
-    if "t_f" in free and isinstance(scenario.observer, tables.Prescribed) and scenario.observer.t_o is None:
+    if "t_f" in free and isinstance(scenario.observer, law_tables.Prescribed) and scenario.observer.t_o is None:
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
         raise ScenarioError(f"tune.per_axis is true, but tune.free is {schema.show(free)}, without observer_gain")
@@ -146,7 +146,7 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
         return lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
-        own = filter_bandwidth(scenario) if isinstance(scenario.filter, tables.SteadyStateFilter) else 1.0
+        own = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
         return 0.1 * own, max(own, min(10.0 * own, 1.0 / _interval(scenario)))
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
         assert scenario.observer.gain is not None
@@ -178,7 +178,7 @@ def _least_p(scenario: Scenario) -> float:
 
 
 def _has_gain(scenario: Scenario) -> bool:
-    return not isinstance(scenario.observer, tables.NoObserver)
+    return not isinstance(scenario.observer, law_tables.NoObserver)
 
 
 def _interval(scenario: Scenario) -> float:

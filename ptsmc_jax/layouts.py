@@ -4,86 +4,102 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ptsmc_jax import device_tables, law_tables, plant_tables, signal_tables, values
 from ptsmc_jax import dispersion_tables as dt
 from ptsmc_jax import tables as t
 
 # A table is a struct, or one for each kind, the default first.
-Kinds = dict[str, type[t.Table]]
+Kinds = dict[str, type[values.Table]]
 _STATE_OBSERVERS: Kinds = {
-    "nonlinear": t.EachNonlinearObserver,
-    "finite_time": t.EachFiniteTimeObserver,
-    "prescribed_time": t.EachPrescribedTimeObserver,
+    "nonlinear": law_tables.EachNonlinearObserver,
+    "finite_time": law_tables.EachFiniteTimeObserver,
+    "prescribed_time": law_tables.EachPrescribedTimeObserver,
 }
 _STATE_DISTURBANCES: Kinds = {
-    "sinusoid": t.EachSinusoid,
-    "constant": t.EachConstant,
-    "random_walk": t.EachRandomWalk,
-    "sum": t.SumDisturbance,
+    "sinusoid": signal_tables.EachSinusoid,
+    "constant": signal_tables.EachConstant,
+    "random_walk": signal_tables.EachRandomWalk,
+    "sum": signal_tables.SumDisturbance,
 }
-_STATE_LOOP: dict[str, type[t.Table] | Kinds] = {
+_STATE_LOOP: dict[str, type[values.Table] | Kinds] = {
     "loop": t.Loop,
-    "hardware": t.StateHardware,
-    "dispersion": t.StateDispersion,
+    "hardware": device_tables.StateHardware,
+    "dispersion": dt.StateDispersion,
     "tune": t.Tune,
 }
-TABLES: dict[str, dict[str, type[t.Table] | Kinds]] = {  # by the kind of the plant
+TABLES: dict[str, dict[str, type[values.Table] | Kinds]] = {  # by the kind of the plant
     "spacecraft": {
-        "plant": t.SpacecraftPlant,
-        "spacecraft": t.Spacecraft,
-        "initial": t.Initial,
+        "plant": plant_tables.SpacecraftPlant,
+        "spacecraft": plant_tables.Spacecraft,
+        "initial": signal_tables.Initial,
         "reference": {
-            "fixed": t.FixedReference,
-            "spin": t.SpinReference,
-            "sinusoid": t.SinusoidReference,
-            "slew": t.SlewReference,
+            "fixed": signal_tables.FixedReference,
+            "spin": signal_tables.SpinReference,
+            "sinusoid": signal_tables.SinusoidReference,
+            "slew": signal_tables.SlewReference,
         },
         "disturbance": {
-            "sinusoid": t.SinusoidDisturbance,
-            "none": t.NoDisturbance,
-            "constant": t.ConstantDisturbance,
-            "gravity_gradient": t.GravityGradient,
-            "random_walk": t.RandomWalk,
-            "sum": t.SumDisturbance,
+            "sinusoid": signal_tables.SinusoidDisturbance,
+            "none": signal_tables.NoDisturbance,
+            "constant": signal_tables.ConstantDisturbance,
+            "gravity_gradient": signal_tables.GravityGradient,
+            "random_walk": signal_tables.RandomWalk,
+            "sum": signal_tables.SumDisturbance,
         },
         "controller": {
-            "prescribed_time": t.Controller,
-            "pd": t.PDController,
-            "terminal": t.TerminalController,
-            "fixed_time": t.FixedTimeController,
+            "prescribed_time": law_tables.Controller,
+            "pd": law_tables.PDController,
+            "terminal": law_tables.TerminalController,
+            "fixed_time": law_tables.FixedTimeController,
         },
         "observer": {
-            "nonlinear": t.NonlinearObserver,
-            "none": t.NoObserver,
-            "finite_time": t.FiniteTimeObserver,
-            "prescribed_time": t.PrescribedTimeObserver,
+            "nonlinear": law_tables.NonlinearObserver,
+            "none": law_tables.NoObserver,
+            "finite_time": law_tables.FiniteTimeObserver,
+            "prescribed_time": law_tables.PrescribedTimeObserver,
         },
         "loop": t.Loop,
-        "hardware": t.Hardware,
-        "wheels": {"pyramid": t.PyramidWheels, "axes": t.AxesWheels},
-        "filter": {"steady_state": t.SteadyStateFilter, "none": t.NoFilter},
-        "dispersion": t.Dispersion,
+        "hardware": device_tables.Hardware,
+        "wheels": {"pyramid": device_tables.PyramidWheels, "axes": device_tables.AxesWheels},
+        "filter": {"steady_state": device_tables.SteadyStateFilter, "none": device_tables.NoFilter},
+        "dispersion": dt.Dispersion,
         "tune": t.Tune,
     },
     "chain": {
-        "plant": t.ChainPlant,
-        "disturbance": {"sinusoid": t.EachSinusoid, "none": t.NoDisturbance, **_STATE_DISTURBANCES},
-        "controller": {"prescribed_time": t.ChainController},
-        "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
+        "plant": plant_tables.ChainPlant,
+        "disturbance": {
+            "sinusoid": signal_tables.EachSinusoid,
+            "none": signal_tables.NoDisturbance,
+            **_STATE_DISTURBANCES,
+        },
+        "controller": {"prescribed_time": law_tables.ChainController},
+        "observer": {"none": law_tables.NoObserver, **_STATE_OBSERVERS},
         **_STATE_LOOP,
     },
     "system": {
-        "plant": t.SystemPlant,
-        "disturbance": {"none": t.NoDisturbance, **_STATE_DISTURBANCES},
-        "controller": {"prescribed_time": t.SystemController},
-        "observer": {"none": t.NoObserver, **_STATE_OBSERVERS},
+        "plant": plant_tables.SystemPlant,
+        "disturbance": {"none": signal_tables.NoDisturbance, **_STATE_DISTURBANCES},
+        "controller": {"prescribed_time": law_tables.SystemController},
+        "observer": {"none": law_tables.NoObserver, **_STATE_OBSERVERS},
         **_STATE_LOOP,
     },
 }
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
-_RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
+_RELATIVE: Kinds = {
+    "relative_normal": dt.RelativeNormal,
+    "relative_uniform": dt.RelativeUniform,
+}
 DISPERSIONS: dict[str, Kinds] = {
-    "attitude": {"axis_angle": dt.AxisAngle, "uniform": dt.UniformAttitude, "normal": dt.NormalAttitude},
-    "reference": {"normal": dt.NormalAttitude, "uniform": dt.UniformAttitude, "axis_angle": dt.AxisAngle},
+    "attitude": {
+        "axis_angle": dt.AxisAngle,
+        "uniform": dt.UniformAttitude,
+        "normal": dt.NormalAttitude,
+    },
+    "reference": {
+        "normal": dt.NormalAttitude,
+        "uniform": dt.UniformAttitude,
+        "axis_angle": dt.AxisAngle,
+    },
     "rate": {"normal": dt.NormalRate, "uniform": dt.UniformRate},
     "inertia": {"relative_normal": dt.RelativeInertia},
     "disturbance_phase": {"uniform": dt.UniformPhase},

@@ -10,9 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import attitude_keys, build, checks, clock, observers, theory
-from ptsmc_jax import dispersion_tables as dt
-from ptsmc_jax import tables as t
+from ptsmc_jax import (
+    attitude_keys,
+    build,
+    checks,
+    clock,
+    dispersion_tables,
+    law_tables,
+    observers,
+    plant_tables,
+    signal_tables,
+    theory,
+)
 from ptsmc_jax.free_gains import MOST_STEPS, hand_over
 from ptsmc_jax.laws import SecondOrder
 from ptsmc_jax.plants import System
@@ -78,7 +87,7 @@ def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
         key, rate = _slew(scenario.controller, reach.smallest_t_f)
-        if isinstance(scenario.controller, t.Baseline):  # a bound only: a run that turns faster is marked
+        if isinstance(scenario.controller, law_tables.Baseline):  # a bound only: a run that turns faster is marked
             rate = min(rate, 0.5 * MOST_SUBSTEPS * 0.025 / scenario.loop.period)
         found[key] = rate
     return found
@@ -86,11 +95,11 @@ def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
 
 def _slew(law: Any, t_f: float) -> tuple[str, float]:
     """How fast a law turns the body [rad/s], at most, by the key that says so; on their surfaces the baselines."""
-    if isinstance(law, t.PDController):  # all of the potential energy of its spring
+    if isinstance(law, law_tables.PDController):  # all of the potential energy of its spring
         return "controller.k_p", 2.0 * math.sqrt(law.k_p)
-    if isinstance(law, t.TerminalController):
+    if isinstance(law, law_tables.TerminalController):
         return "controller.b", 2.0 * law.b ** (1.0 / law.p)
-    if isinstance(law, t.FixedTimeController):
+    if isinstance(law, law_tables.FixedTimeController):
         return "controller.a1", 2.0 * (law.a1 + law.b1)
     return "controller.eta", 2.0 * law.eta / t_f
 
@@ -100,17 +109,17 @@ def _spread(scenario: Scenario) -> float:
     table = getattr(scenario.dispersion, "rate", None)
     if table is None:
         return 0.0
-    return 4.6 * table.std if isinstance(table, dt.NormalRate) else np.sqrt(3.0) * table.half_width
+    return 4.6 * table.std if isinstance(table, dispersion_tables.NormalRate) else np.sqrt(3.0) * table.half_width
 
 
 def _reference_frequencies(table: Any) -> dict[str, float]:
     """How fast the reference turns and changes [rad/s], by the key that says so."""
-    if isinstance(table, t.SpinReference):
+    if isinstance(table, signal_tables.SpinReference):
         return {"reference.rate": float(np.linalg.norm(table.rate))}
-    if isinstance(table, t.SinusoidReference):
+    if isinstance(table, signal_tables.SinusoidReference):
         turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
         return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
-    if isinstance(table, t.SlewReference):  # largest rate of the quintic, and the motion's own time
+    if isinstance(table, signal_tables.SlewReference):  # largest rate of the quintic, and the motion's own time
         turning = 1.875 * float(np.linalg.norm(attitude_keys.turn(table)))
         return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
     return {}
@@ -210,7 +219,7 @@ def _grid(
             layer = (max(layer[0], before), max(layer[1], after))
     layer = (max(layer[0], resolved), max(layer[1], resolved))
     rate, frequency = widest.hold_rate(), _fastest(frequencies)
-    order = 1 if isinstance(scenario.plant, t.SpacecraftPlant) else controller.order
+    order = 1 if isinstance(scenario.plant, plant_tables.SpacecraftPlant) else controller.order
 
     def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0)) -> float:
         taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))

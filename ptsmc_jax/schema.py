@@ -7,17 +7,18 @@ import difflib
 import json
 import math
 import tomllib
-import types
 import typing
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
-from ptsmc_jax import layouts, tables
+from ptsmc_jax import keys, layouts, signal_tables
 from ptsmc_jax.layouts import TABLES, Kinds
-from ptsmc_jax.tables import ATTITUDE_KEYS, Limit, Positive, Scenario, Table, Truth
+from ptsmc_jax.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.tables import Limit, Scenario
+from ptsmc_jax.values import Positive, Table, Truth
 
 
 class ScenarioError(ValueError):
@@ -133,10 +134,10 @@ def _plant_kind(plant: Mapping[str, Any]) -> str:
 
 def _place(key: str, layout: Mapping[str, Any]) -> str:
     """Where a key that stands outside a table may belong."""
-    keys = {field: name for name, table in layout.items() for struct in _structs(table)
+    homes = {field: name for name, table in layout.items() for struct in _structs(table)
             for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
-    closest = difflib.get_close_matches(key, keys, n=1, cutoff=0.0)[0]
-    return f"the nearest known key is {keys[closest]}.{closest}"
+    closest = difflib.get_close_matches(key, homes, n=1, cutoff=0.0)[0]
+    return f"the nearest known key is {homes[closest]}.{closest}"
 
 
 def _structs(table: type[Table] | Kinds) -> list[type[Table]]:
@@ -162,9 +163,14 @@ def dump(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
     own = getattr(scenario.plant, "system", None)
     if own is None or isinstance(own, str):
-        return typing.cast(dict, _without_none(msgspec.to_builtins(scenario)))
-    plain = dump(msgspec.structs.replace(scenario, plant=msgspec.structs.replace(scenario.plant, system="")))
-    return {**plain, "plant": {**plain["plant"], "system": own}}  # made in Python: stays what it is
+        return plain(scenario)
+    rest = dump(msgspec.structs.replace(scenario, plant=msgspec.structs.replace(scenario.plant, system="")))
+    return {**rest, "plant": {**rest["plant"], "system": own}}  # made in Python: stays what it is
+
+
+def plain(table: Table) -> dict[str, Any]:
+    """A table as a scenario file would have it; what is None is left out."""
+    return typing.cast(dict, _without_none(msgspec.to_builtins(table)))
 
 
 def _without_none(value: Any) -> Any:
@@ -192,20 +198,20 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Tab
     if not isinstance(kind, str) or kind not in kinds:
         raise wrong(f"{name}.kind", kind, " or ".join(map(show, kinds)))
     struct = kinds[kind]
-    if struct is tables.SumDisturbance:
+    if struct is signal_tables.SumDisturbance:
         return _sum(name, raw, kinds)
     return _fields(name, raw, struct)
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds) -> Table:
     """A table whose `terms` are tables of the other kinds."""
-    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, tables.SumDisturbance)
+    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, signal_tables.SumDisturbance)
     terms = raw.get("terms", ())
     if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
-        raise wrong(f"{name}.terms", terms, 'a list of tables such as [{ kind = "constant" }]')
-    single = {kind: struct for kind, struct in kinds.items() if struct is not tables.SumDisturbance}
+        raise wrong(f"{name}.terms", terms, signal_tables.TERMS)
+    single = {kind: struct for kind, struct in kinds.items() if struct is not signal_tables.SumDisturbance}
     found = tuple(_table(f"{name}.terms[{k}]", term, single) for k, term in enumerate(terms))
-    return tables.SumDisturbance(terms=found)
+    return signal_tables.SumDisturbance(terms=found)
 
 
 def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
@@ -245,13 +251,13 @@ def _value(key: str, value: Any, kind: Any) -> Any:
     value = _plain(value)
     bad = _not_finite(value)
     if bad is not None:
-        raise wrong(key, value, f"{_description(kind)}, and {bad!r} is no finite number")
+        raise wrong(key, value, f"{keys.allowed(kind)}, and {bad!r} is no finite number")
     if _holds_truth(value) and kind is not Truth:  # numpy, which reads the inertia, takes true for 1
-        raise wrong(key, value, _description(kind))
+        raise wrong(key, value, keys.allowed(kind))
     try:
         return msgspec.convert(value, kind, strict=True)
     except msgspec.ValidationError:
-        raise wrong(key, value, _description(kind)) from None
+        raise wrong(key, value, keys.allowed(kind)) from None
 
 
 def _plain(value: Any) -> Any:
@@ -270,12 +276,3 @@ def _not_finite(value: Any) -> float | None:
         return value
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
     return next((bad for bad in map(_not_finite, inside) if bad is not None), None)
-
-
-def _description(kind: Any) -> str:
-    """What a type allows, in words."""
-    if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        return " or ".join(_description(k) for k in typing.get_args(kind) if k is not type(None))
-    if typing.get_origin(kind) is Literal:
-        return " or ".join(show(v) for v in typing.get_args(kind))
-    return next((m.description for m in getattr(kind, "__metadata__", ()) if m.description), "of another type")

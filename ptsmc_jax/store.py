@@ -110,6 +110,15 @@ def check(folder: Path, force: bool) -> None:
         )
 
 
+def check_file(file: Path, force: bool) -> None:
+    """Raise RefusedError where this file must not be written."""
+    if not file.parent.is_dir():
+        raise RefusedError(f"the file is {file}, but {file.parent} is no folder; allowed is one that exists")
+    if file.is_dir() or (file.exists() and not force):
+        allowed = "another name" if file.is_dir() else "another name, or --force to write over it"
+        raise RefusedError(f"the file is {file}, which is there already; allowed is {allowed}")
+
+
 def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place."""
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import attitude_keys, scenario
-from ptsmc_jax.tables import ATTITUDE_KEYS
+from ptsmc_jax.signal_tables import ATTITUDE_KEYS
 from tuning import convert
 
 

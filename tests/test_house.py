@@ -32,7 +32,7 @@ FLOORS = {
         requirements
         dispersions
         values systems
-        device_tables dispersion_tables
+        plant_tables signal_tables law_tables device_tables dispersion_tables keys
         tables
         layouts
         schema
@@ -64,7 +64,7 @@ FLOORS = {
         campaign_summary
         told options
         show
-        show_campaign page_charts convert
+        show_campaign page_charts convert new
         page
         campaign_commands
         cli table

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import clock, dispersions, schema, sensors, signals, store, tables
+from ptsmc_jax import clock, dispersions, schema, sensors, signal_tables, signals, store
 from ptsmc_jax.attitude_keys import quaternion
 from ptsmc_jax.pace import Reach
 from ptsmc_jax.scenario import from_tables, read, replace, study
@@ -319,7 +319,7 @@ def test_replace_by_none_returns_a_key_to_its_default():
     scenario = replace(from_tables({}), controller__t_f=20.0, loop__t_end=None)
     assert scenario.loop.t_end == 30.0
     turned = replace(scenario, initial__quat_xyzw=None, initial__rotvec_deg=[0.0, 0.0, 90.0])
-    assert turned.initial == tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
+    assert turned.initial == signal_tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
 
 
 def test_replace_adds_a_table():

@@ -5,21 +5,14 @@ import re
 import pytest
 
 from ptsmc_jax import schema
-from ptsmc_jax.device_tables import Actuators, WheelLimits
+from ptsmc_jax.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
+from ptsmc_jax.law_tables import Baseline, Prescribed
 from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, STATE_CATALOGUE
+from ptsmc_jax.plant_tables import ChainPlant
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.tables import (
-    Attitude,
-    AxesWheels,
-    Baseline,
-    ChainPlant,
-    GravityGradient,
-    Prescribed,
-    PyramidWheels,
-    Scenario,
-    SumDisturbance,
-)
+from ptsmc_jax.signal_tables import Attitude, GravityGradient, SumDisturbance
+from ptsmc_jax.tables import Scenario
 from ptsmc_jax.values import Table
 from tests.helpers import ROOT
 

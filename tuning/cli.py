@@ -246,6 +246,33 @@ def report_(
     return 0
 
 
+@app.command
+def new(
+    file: Annotated[Path, Parameter(name="FILE", help="Scenario file to write.")] = Path("scenario.toml"),
+    /,
+    *,
+    plant: Annotated[
+        str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; without it spacecraft.")
+    ] = None,
+    like: Annotated[Path | None, Parameter(help="Scenario to begin with; without it the defaults.")] = None,
+    force: Annotated[bool, Parameter(negative="", help="Write over a file that is there already.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Write a scenario file with every key, its value, unit and meaning, to be changed at will.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax import schema, store
+    from tuning import new as templates
+
+    store.check_file(file, force)
+    raw = schema.load(like) if like is not None else {}
+    store.write_text(file, templates.text(plant, raw))
+    if not quiet:
+        show.say(f"scenario in {file}")
+    return 0
+
+
 _Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.")]
 
 
@@ -273,6 +300,18 @@ def convert_attitude(
         "dcm_body_to_inertial": dcm_body_to_inertial, "euler_deg": euler_deg, "sequence": sequence,
     }  # fmt: skip
     show.say(*convert.lines(convert.quaternion(given), sequence))
+    return 0
+
+
+@app.command
+def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fish or powershell.")], /) -> int:
+    """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).
+
+    Exit status: 0 done, 2 bad input.
+    """
+    if shell not in ("bash", "zsh", "fish", "powershell"):
+        raise UsageError(f"the shell is {shell}, but must be bash, zsh, fish or powershell")
+    show.say(app.generate_completion(shell=shell))  # pyright: ignore[reportArgumentType]
     return 0
 
 

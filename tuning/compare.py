@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from ptsmc_jax import drawing, metrics, schema, store, study_plots, tables
+from ptsmc_jax import drawing, law_tables, metrics, plant_tables, schema, store, study_plots, tables
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.scenario import replace, study
@@ -58,7 +58,7 @@ class Comparison:
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where there is nothing to compare with."""
-    if not isinstance(scenario.plant, tables.SpacecraftPlant):
+    if not isinstance(scenario.plant, plant_tables.SpacecraftPlant):
         kind = schema.show(scenario.plant.kind)
         raise ScenarioError(
             f'plant.kind is {kind}, but must be "spacecraft": the laws to compare with are for attitudes'
@@ -72,7 +72,7 @@ def contenders(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
     assert scenario.tune is not None
     table, tune = scenario.controller, scenario.tune
-    common = {key: getattr(table, key) for key in tables.Baseline.__struct_fields__}
+    common = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     found = {}
     for kind in (OURS, *BASELINES):

@@ -9,7 +9,7 @@ import numpy as np
 from ptsmc_jax import attitude_keys, schema
 from ptsmc_jax.metrics import CATALOGUES
 from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.tables import ATTITUDE_KEYS, Initial
+from ptsmc_jax.signal_tables import ATTITUDE_KEYS, Initial
 from tuning.options import UsageError
 
 SEQUENCE = "ZYX"

@@ -10,8 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax import law_tables, plant_tables
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax import tables
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.sensors import Sensors
 from ptsmc_jax.tables import Scenario
@@ -117,17 +117,17 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; delta at least a period."""
     shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
     gains = {"eta": 3.0, "delta": max(0.05, shortest), "k1": 1.0}
-    if isinstance(scenario.plant, tables.ChainPlant):
+    if isinstance(scenario.plant, plant_tables.ChainPlant):
         gains["eta"] = scenario.plant.order + 1.0
-    papers = isinstance(scenario.observer, tables.NonlinearObserver | tables.EachNonlinearObserver)
+    papers = isinstance(scenario.observer, law_tables.NonlinearObserver | law_tables.EachNonlinearObserver)
     return {**gains, "observer_gain": 10.0} if papers else gains
 
 
 def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
-    if isinstance(table, tables.Baseline):
-        kept = {key: getattr(table, key) for key in tables.Baseline.__struct_fields__}
+    if isinstance(table, law_tables.Baseline):
+        kept = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
         law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)

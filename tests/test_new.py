@@ -1,0 +1,153 @@
+"""What `ptsmc new` writes: the scenario asked for, every key of its plant, and what is off is allowed as it stands."""
+
+import re
+import tomllib
+
+import pytest
+
+from ptsmc_jax import keys, layouts, metrics, schema
+from ptsmc_jax.scenario import from_tables
+from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.signal_tables import ATTITUDE_KEYS
+from tests.helpers import ROOT
+from tuning import new
+from tuning.options import UsageError
+
+KEY = re.compile(r"^#?([a-z]\w*) = ")
+TABLE = re.compile(r"^#?\[(\w+)\]")
+ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
+FLIGHT = ROOT / "scenarios" / "first_flight.toml"
+
+
+def blocks(text):
+    """Table -> its lines; what introduces the file is left out."""
+    found, name = {}, None
+    for line in text.splitlines():
+        if match := TABLE.match(line):
+            name = match[1]
+            found[name] = []
+        elif name and KEY.match(line):
+            found[name].append(line)
+    return found
+
+
+def kinds(lines):
+    """The lines of each kind of a table, that in use first; one without kinds is one."""
+    found = [[]]
+    for line in lines:
+        if KEY.match(line)[1] == "kind" and found[-1]:
+            found.append([])
+        found[-1].append(line)
+    return found
+
+
+def values(lines):
+    """Key -> value of lines, on or off; of several with one key the last."""
+    return {key: value for line in lines for key, value in tomllib.loads(line.removeprefix("#")).items()}
+
+
+@pytest.mark.parametrize("plant", ["spacecraft", "chain"])
+def test_what_is_written_is_the_default_scenario(plant):
+    written = tomllib.loads(new.text(plant, {}))
+    assert schema.dump(from_tables(written)) == schema.dump(from_tables({"plant": {"kind": plant}}))
+    assert len(written) > 4  # and says so key by key
+
+
+@pytest.mark.parametrize("name", ["first_flight", "hard_flight", "two_link_arm"])
+def test_a_scenario_like_another_is_that_one(name):
+    raw = schema.load(ROOT / "scenarios" / f"{name}.toml")
+    written = tomllib.loads(new.text(None, raw))
+    assert schema.dump(from_tables(written)) == schema.dump(from_tables(raw))
+    assert all(set(given) <= set(written[table]) for table, given in raw.items())
+
+
+@pytest.mark.parametrize("plant", layouts.TABLES)
+def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
+    text = new.text(plant, {})
+    found = blocks(text)
+    assert list(found) == [*[name for name in layouts.TABLES[plant] if name != "tune"], "requirements", "tune"]
+    for name, table in layouts.TABLES[plant].items():
+        said = kinds(found[name])
+        structs = list(table.values()) if isinstance(table, dict) else [table]
+        assert len(said) == len(structs)
+        explained = set() if name == "initial" else ATTITUDE  # there
+        for lines, struct in zip(said, structs, strict=True):
+            wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
+            assert {KEY.match(line)[1] for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
+            assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
+    for metric in metrics.CATALOGUES[plant]:
+        assert metric in text
+
+
+@pytest.mark.parametrize("plant", ["spacecraft", "chain"])
+def test_what_is_off_is_allowed_as_it_stands(plant):
+    """Each kind of each table, and each line of a dispersion, in a scenario with noise and a limit."""
+    text = new.text(plant, {})
+    found = blocks(text)
+    written = tomllib.loads(text)
+    hardware = values(found["hardware"])
+    for key in ("rate_noise_density", "star_tracker_every"):  # beside rate_noise; without a filter
+        hardware.pop(key, None)
+    base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
+    attitude = {key: value for key, value in written.get("initial", {}).items() if key in ATTITUDE_KEYS}
+    tried = 0
+    for name, lines in found.items():
+        groups = [[line] for line in lines] if name == "dispersion" else kinds(lines)
+        for table in map(values, groups):
+            if name == "initial":  # one attitude key at a time, below
+                table = {**{key: value for key, value in table.items() if key not in ATTITUDE}, **attitude}
+            given = {"loop": {"mode": "sampled"}, "tune": {"objective": "cvar"}}.get(name, {})  # cvar has a level
+            from_tables({**base, name: hardware if name == "hardware" else {**table, **given}})
+            tried += 1
+    layout = layouts.TABLES[plant]
+    drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(layout["dispersion"]))
+    others = sum(len(table) if isinstance(table, dict) else 1 for table in layout.values()) - 1
+    assert tried == others + drawn + 1  # [requirements] is no table of the layout
+
+
+@pytest.mark.parametrize("key", ["quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg"])
+def test_each_attitude_key_is_allowed_as_it_stands(key):
+    table = values(blocks(new.text(None, {}))["initial"])
+    beside = {"sequence": table["sequence"]} if key == "euler_deg" else {}
+    assert from_tables({"initial": {key: table[key], **beside}})
+
+
+def test_what_cannot_be_written_is_refused():
+    with pytest.raises(UsageError, match="--plant is boat, but must be spacecraft or chain or system"):
+        new.text("boat", {})
+    with pytest.raises(UsageError, match="--plant is chain, but the scenario of --like has"):
+        new.text("chain", schema.load(FLIGHT))
+    with pytest.raises(ScenarioError, match=r"controller\.eta is 1"):
+        new.text(None, {"controller": {"eta": 1.0}})
+
+
+def test_the_command_writes_a_file_that_flies(command, tmp_path):
+    assert command("new") == (0, "scenario in scenario.toml\n", "")
+    written = (tmp_path / "scenario.toml").read_text()
+    assert written == new.text(None, {})
+    code, _, error = command("new")
+    assert (code, error) == (
+        2,
+        "ptsmc: the file is scenario.toml, which is there already; allowed is another name, or --force to write "
+        "over it\n",
+    )
+    assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
+    assert (tmp_path / "scenario.toml").read_text() == new.text(None, schema.load(FLIGHT)) != written
+    code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
+    assert code == 1  # with the paper's gains, over its limit
+    assert "peak_torque" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["nowhere/s.toml"], "the file is nowhere/s.toml, but nowhere is no folder; allowed is one that exists"),
+        (["."], "the file is ., which is there already; allowed is another name"),
+        (["a.toml", "--plant", "boat"], "--plant is boat, but must be spacecraft or chain or system"),
+        (["a.toml", "--like", "none.toml"], "the scenario file none.toml is not there"),
+    ],
+)
+def test_the_command_refuses_and_leaves_nothing(command, tmp_path, options, said):
+    before = sorted(tmp_path.iterdir())
+    assert command("new", *options) == (2, "", f"ptsmc: {said}\n")
+    assert sorted(tmp_path.iterdir()) == before
