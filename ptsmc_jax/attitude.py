@@ -15,7 +15,7 @@ Vector = Float[Array, "3"]
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton product p q: the rotation q followed, in the axes it leads to, as R(p) R(q)."""
+    """Hamilton product p q [-]: R(p q) = R(p) R(q)."""
     v = p[3] * q[:3] + q[3] * p[:3] + jnp.cross(p[:3], q[:3])
     return jnp.append(v, p[3] * q[3] - jnp.dot(p[:3], q[:3]))
 
@@ -26,7 +26,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def normalise(q: Quaternion) -> Quaternion:
-    """Q / |q|."""
+    """The unit quaternion q / |q| [-]."""
     return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division, not four
 
 
@@ -63,7 +63,7 @@ def vector_rates(q: Quaternion, w: Vector, w_dot: Vector) -> tuple[Vector, Vecto
 
 
 def from_vector_part(v: Vector, side: Float[Array, ""]) -> tuple[Quaternion, Float[Array, ""]]:
-    """Unit quaternion with this vector part and a scalar of the sign of `side` (0: positive), and 1 - |v|^2.
+    """Unit quaternion with this vector part [-] and a scalar of the sign of `side` (0: positive), and 1 - |v|^2.
 
     Where |v| >= 1 no such quaternion exists: its scalar is then +-1e-6.
     """
@@ -73,7 +73,15 @@ def from_vector_part(v: Vector, side: Float[Array, ""]) -> tuple[Quaternion, Flo
 
 
 def from_rotation_vector(r: Vector) -> Quaternion:
-    """Unit quaternion of the rotation by |r| [rad] about r; smooth at r = 0."""
+    """Unit quaternion of the rotation by |r| [rad] about r; smooth at r = 0.
+
+    >>> q = from_rotation_vector(jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> [f"{part:.6f}" for part in q]  # scalar last
+    ['0.000000', '0.000000', '0.707107', '0.707107']
+    >>> body_x = rotate(q, jnp.array([1.0, 0.0, 0.0]))  # seen from outside
+    >>> bool(jnp.allclose(body_x, jnp.array([0.0, 1.0, 0.0])))
+    True
+    """
     square = jnp.dot(r, r)
     small = square < 1e-6  # beyond the series' three terms: 1e-6^3 / 2^7 / 7! = 1e-24
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -85,6 +93,11 @@ def from_rotation_vector(r: Vector) -> Quaternion:
 
 
 def angle(q: Quaternion, reference: Quaternion) -> Float[Array, ""]:
-    """Angle of the rotation from one attitude to another [rad], 0 to pi, accurate down to 0; gradient 0 there."""
+    """Angle of the rotation from one attitude to another [rad], 0 to pi, accurate down to 0; gradient 0 there.
+
+    >>> start, end = from_rotation_vector(jnp.array([0.0, 0.0, 0.0])), from_rotation_vector(jnp.array([0.0, 0.3, 0.4]))
+    >>> f"{angle(start, end):.6f}"
+    '0.500000'
+    """
     error = multiply(conjugate(reference), q)
     return 2.0 * elementary.arctan2(numerics.norm(error[:3]), jnp.abs(error[3]))

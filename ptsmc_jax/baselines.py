@@ -44,11 +44,11 @@ class Baseline(ErrorQuaternion, Law):
         return self.invert(x, target, 2.0 * (known - switching), d_hat), s
 
     def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
-        """Sliding variable, and v'' without what switches."""
+        """Sliding variable s, and v'' [1/s^2] without what switches, (3,) each."""
         raise NotImplementedError
 
     def sign(self, s: Vector) -> Vector:
-        """Smooth sign of the sliding variable; the exact one for a width of 0."""
+        """Smooth sign tanh(s / sign_width) [-]; the exact one for a width of 0."""
         return numerics.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -96,7 +96,7 @@ class Terminal(Baseline):
     free: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
 
     def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
-        """S and v'' without what switches."""
+        """As the class says, without K sign(s)."""
         s = v + numerics.signed_power(v_dot, self.p) / self.b
         return s, -self.b / self.p * numerics.signed_power(v_dot, 2.0 - self.p) - self.k * s
 
@@ -125,7 +125,7 @@ class FixedTime(Baseline):
     free: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "sign_width", "t_f")
 
     def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
-        """S and v'' without what switches."""
+        """As the class says, without K sign(s)."""
         bend = self.gamma - 1.0 / self.p
         kappa = self.a1 * numerics.signed_power(jnp.abs(v), bend) + self.b1
         kappa_slope = self.a1 * bend * numerics.signed_power(v, bend - 1.0)

@@ -115,7 +115,7 @@ class ErrorQuaternion:
         return attitude.angle(x.q, target.q)
 
     def relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
-        """q_e, w_e, R w_f and R w_f' - w_e x R w_f, the derivative of R w_f less what R w_f' leaves out."""
+        """Of the relative motion q_e [-], w_e, R w_f [rad/s] and (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]."""
         q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
         back = attitude.conjugate(q_e)
         carried = attitude.rotate(back, target.w)
@@ -123,7 +123,7 @@ class ErrorQuaternion:
         return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
 
     def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
-        """V [-] and its derivative [1/s]."""
+        """The vector part v [-] and its derivative [1/s]."""
         q_e, w_e, _, _ = self.relative(x, target)
         v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
         return q_e[:3], v_dot

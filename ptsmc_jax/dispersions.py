@@ -1,7 +1,8 @@
 """What varies from trial to trial, and the draws: parts of a trial as a pure function of (seed, trial).
 
 Every dispersion is a map from coordinates, numbers uniform on (0, 1) or standard normal, to a value: a trial's
-coordinates are drawn, and a search for the worst trial moves them.
+coordinates are drawn, and a search for the worst trial moves them. A normal value is x = nominal + std c, a uniform
+one x = nominal + half_width (2 c - 1).
 """
 
 import math
@@ -39,7 +40,7 @@ class UniformAttitude:
     count: ClassVar[int] = 4
 
     def at(self, c: Float[Array, "4"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
+        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
         del nominal, reference
         return attitude.normalise(c)
 
@@ -55,7 +56,7 @@ class AxisAngle:
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
+        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
         del nominal
         height, azimuth = 2.0 * c[0] - 1.0, 2.0 * np.pi * c[1]
         radius = jnp.sqrt(1.0 - height * height)
@@ -74,7 +75,7 @@ class NormalAttitude:
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude, (4,), of the body or of the reference; nominal: its own; reference: the reference at t = 0."""
+        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
         del reference
         return attitude.multiply(nominal, attitude.from_rotation_vector(self.std * c))
 
@@ -93,7 +94,7 @@ class Uniform:
         return self.half_width.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The numbers, (n,)."""
+        """The numbers, (n,), in the units of the nominal ones, from coordinates c [-]."""
         return nominal + self.half_width * (2.0 * c - 1.0)
 
 
@@ -111,7 +112,7 @@ class Normal:
         return self.std.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The numbers, (n,)."""
+        """The numbers, (n,), in the units of the nominal ones, from coordinates c [-]."""
         return nominal + self.std * c
 
 
@@ -129,7 +130,7 @@ class TruncatedNormal:
         return self.std.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The numbers, (n,): erf_inv of a c between its values at both ends."""
+        """The numbers, (n,), in the units of the nominal ones: erf_inv of a c [-] between its values at both ends."""
         within = math.erf(FARTHEST / math.sqrt(2.0))
         return nominal + self.std * math.sqrt(2.0) * jax.lax.erf_inv((2.0 * c - 1.0) * within)
 
@@ -191,7 +192,10 @@ LEVELS = {
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Dispersion:
-    """Everything that is drawn for a trial; what is None stays nominal."""
+    """Everything that is drawn for a trial; what is None stays nominal.
+
+    Coordinates are numbers (n,) [-] by the name of the stream that they are drawn from.
+    """
 
     attitude: Attitudes | None = None
     state: Uniform | Normal | None = None  # of a chain or a system

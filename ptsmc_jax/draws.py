@@ -36,7 +36,7 @@ def _word(value: Whole) -> Array:
 
 
 def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
-    """The two words of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
+    """The two words [-] of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
     schedule = (key.a, key.b, key.a ^ key.b ^ jnp.uint32(0x1BD11BDA))
     x, y = counter[0] + schedule[0], counter[1] + schedule[1]
     for group in range(5):
@@ -53,7 +53,7 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
 
 
 def stream(seed: Whole, trial: Whole, name: str) -> Key:
-    """Key of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
+    """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
     label = jnp.uint32(zlib.crc32(name.encode()))
     return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
 
@@ -78,7 +78,12 @@ def _unit(word: Array) -> Array:
 
 
 def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
-    """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits)."""
+    """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits).
+
+    >>> key = stream(seed=0, trial=7, name="attitude_noise")
+    >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
+    True
+    """
     return _unit(jnp.stack(_pairs(key, sample, count), axis=1).reshape(-1)[:count])
 
 

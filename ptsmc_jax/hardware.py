@@ -19,7 +19,7 @@ Vector = Float[Array, " m"]
 
 
 def quantise(u: Array, step: Scalar) -> Array:
-    """The nearest multiple of step. Its derivative is that of the command: a staircase has none to learn from."""
+    """The nearest multiple of step [N m], (m,). Its derivative is that of the command: a staircase has none to use."""
     return u + jax.lax.stop_gradient(step * jnp.round(u / step) - u)
 
 

@@ -33,6 +33,10 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Calla
     Composes with jit, vmap, jvp and grad from outside. A primitive without a rule here goes through `jax.vmap` on its
     own, with one warning. Raises ValueError where nothing is mapped, with strict=True NotImplementedError at such a
     primitive.
+
+    >>> crosses = vmap(lambda a: jnp.cross(a, jnp.array([0.0, 0.0, 1.0])))
+    >>> crosses(jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).tolist()
+    [[0.0, -1.0, 0.0], [2.0, 0.0, 0.0]]
     """
 
     def mapped(*args: Any) -> Any:

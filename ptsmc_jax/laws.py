@@ -31,7 +31,11 @@ class Motion(NamedTuple):
 
 
 class Law:
-    """What the rollout asks of a law, and what it needs no law of its own to say."""
+    """What the rollout asks of a law, and what it needs no law of its own to say.
+
+    Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
+    and inputs' own units. A law is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
+    """
 
     model: Any  # the nominal plant
     t_f: Leaf  # prescribed time, or when the error is judged [s]
@@ -122,11 +126,11 @@ class SecondOrder(Prescribed):
     """
 
     def pull(self) -> Scalar:
-        """B after the hand-over [1/s]: 2 K1 of (29)."""
+        """The coefficient b after the hand-over [1/s]: 2 K1 of (29)."""
         return 2.0 * self.k1
 
     def influence(self, x: Any, target: Any) -> Scalar:
-        """N, what a unit of disturbance does to 2 eps'' at most."""
+        """The factor N, what a unit of disturbance does to 2 eps'' at most."""
         raise NotImplementedError
 
     def invert(self, x: Any, target: Any, wanted: Vector, d_hat: Vector) -> Vector:

@@ -17,7 +17,7 @@ from ptsmc_jax.rollout import Parts
 def gains(
     t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Kp [1/s^2] and kd [1/s] at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
+    """Gains kp [1/s^2] and kd [1/s], (times,), at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
 
     eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; (K1 + slope)/2 and one more after.
     """

@@ -64,12 +64,12 @@ def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
 
 
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
-    """B + weight (a - b), leaf by leaf: a at weight 1, b at weight 0."""
+    """Leaf by leaf b + weight (a - b): a at weight 1, b at weight 0."""
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
 
 
 def select(condition: Array, a: Any, b: Any) -> Any:
-    """A where the scalar condition holds, b elsewhere, leaf by leaf; the side not taken leaks no tangent."""
+    """Leaf by leaf a where the scalar condition holds, b elsewhere; the side not taken leaks no tangent."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 

@@ -48,7 +48,7 @@ class Observer(ABC):
     model: Plant  # the nominal plant
 
     def begin(self) -> Memory:
-        """Memory at t = 0: d_hat = 0."""
+        """Memory at t = 0: d_hat = 0 [N m]."""
         return jnp.zeros(self.model.inputs)
 
     def estimate(self, memory: Memory) -> Vector:
@@ -65,7 +65,7 @@ class Observer(ABC):
 
     @abstractmethod
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
-        """M' + A m at t in the step `span`, with A the `decay_matrix` of that step; seen: d_eff [N m]."""
+        """The forcing m' + A m at t in the step `span`, with A the `decay_matrix` of that step; seen: d_eff [N m]."""
 
     @abstractmethod
     def update_matrix(self, dt: Scalar) -> Matrix:
@@ -125,7 +125,7 @@ class _Linear(Observer):
     initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
 
     def _slope(self) -> Matrix:
-        """L J^-1 [1/s]."""
+        """The matrix l J^-1 [1/s]."""
         return self.gain[:, None] * self.model.inertia_inverse
 
     def _bound(self) -> ErrorBound:
@@ -298,7 +298,7 @@ class FiniteTimeObserver(Observer):
     sign_width: Leaf  # of the smooth sign in the continuous loop [N m s]; the digital form needs none
 
     def begin(self) -> Memory:
-        """d_hat and e0, zero."""
+        """Estimate d_hat [N m] and e0 [N m s], zero."""
         return jnp.zeros(2 * self.model.inputs)
 
     def error_bound(self) -> FiniteTimeBound:

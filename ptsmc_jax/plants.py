@@ -19,8 +19,9 @@ Scalar = Float[Array, ""]
 class Plant(ABC):
     """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = known(t, x, u) + d.
 
-    u, d and w are (m,). M is (m, m) and, unless `mass` says otherwise, the constant `inertia`, against which observers
-    read their gains. The rollout, the observers and the metrics need no more.
+    u, d and w are (m,), of a spacecraft in N m and rad/s, of others in the states' own units. M is (m, m) and, unless
+    `mass` says otherwise, the constant `inertia`, against which observers read their gains. The rollout, the observers
+    and the metrics need no more.
     """
 
     inertia: Any  # (m, m)
@@ -33,10 +34,10 @@ class Plant(ABC):
 
     @abstractmethod
     def velocity(self, x: Any) -> Float[Array, " m"]:
-        """W of a state; of a state's derivative, w'."""
+        """The velocity w of a state; of a state's derivative, w'."""
 
     def mass(self, t: Scalar, x: Any) -> Float[Array, "m m"]:
-        """M."""
+        """The matrix M."""
         return self.inertia
 
     @abstractmethod
@@ -101,11 +102,11 @@ class Spacecraft(Plant):
     inertia_inverse: Leaf  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
 
     def gyroscopic(self, w: Float[Array, "3"]) -> Float[Array, "3"]:
-        """W x J w [N m]."""
+        """The torque w x J w [N m]."""
         return jnp.cross(w, self.inertia @ w)
 
     def velocity(self, x: AttitudeState) -> Float[Array, "3"]:
-        """W [rad/s]; of a derivative, w' [rad/s^2]."""
+        """The rate w [rad/s]; of a derivative, w' [rad/s^2]."""
         return x.w
 
     def known(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -300,7 +301,7 @@ class System(Plant):
         return numerics.norm(self.velocity(x))
 
     def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
-        """D(x')/dx at an input that is held: its eigenvalues are what integration steps must follow [1/s]."""
+        """The matrix dx'/dx at an input that is held: its eigenvalues are what integration steps must follow [1/s]."""
         return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
 
     def columns(self, x: Any) -> dict[str, Any]:

@@ -29,7 +29,11 @@ def least_within(trials: int, quantile: float | None, confidence: float | None) 
 
 
 def fewest_trials(quantile: float, confidence: float) -> int:
-    """Trials with which a quantile can be shown at all: quantile^n <= 1 - confidence."""
+    """Trials with which a quantile can be shown at all: quantile^n <= 1 - confidence.
+
+    >>> fewest_trials(quantile=0.9973, confidence=0.9)
+    852
+    """
     return math.ceil(math.log(1.0 - confidence) / math.log(quantile) - 1e-9)
 
 
@@ -91,7 +95,12 @@ def verdict_text(
 
 @dataclass(frozen=True)
 class Requirement:
-    """metric <= limit in every trial, or in a share of them."""
+    """metric <= limit in every trial, or in a share of them.
+
+    >>> limit = Requirement("peak_torque", 0.5, quantile=0.75)
+    >>> print(limit.verdict(np.array([0.3, 0.4, 0.45, 0.7]), np.array([True, True, True, True])))
+    peak_torque at most 0.5 N m in 75 % of trials: worst 0.7: met, beyond it 1 of 4 trials
+    """
 
     metric: str
     limit: float

@@ -71,6 +71,13 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
     """The scenario with other values, keys written table__key, checked again: replace(s, controller__eta=4.0).
 
     None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one.
+
+    >>> faster = replace(from_tables({}), controller__t_f=20.0)
+    >>> faster.controller.t_f, faster.loop.t_end
+    (20.0, 40.0)
+    >>> replace(faster, controller__eta=1.0)
+    Traceback (most recent call last):
+    ptsmc_jax.schema.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
     tables = schema.dump(scenario)
     for name, value in changes.items():

@@ -1,8 +1,9 @@
 """What the law sees: star tracker and gyro, raw or through a gyro-propagated attitude filter; a chain's states.
 
-A sensor has a memory (noise of the sample, bias, estimate) that the rollout carries; its noise belongs to (seed,
-trial, sample). In the partial first period of the anchored clock everything a sample does is weighted by the period's
-share, so that nothing jumps where that period vanishes.
+White noise is 1 sigma per sample, density / sqrt(period) (IEEE Std 952): attitudes in rad, rates in rad/s, a chain's
+states in the states' own units. A sensor has a memory (noise of the sample, bias, estimate) that the rollout carries;
+its noise belongs to (seed, trial, sample). In the partial first period of the anchored clock everything a sample does
+is weighted by the period's share, so that nothing jumps where that period vanishes.
 """
 
 from dataclasses import dataclass, field, replace
@@ -67,7 +68,7 @@ class AttitudeFilter:
     bias_error: Leaf  # [rad/s]
 
     def begin(self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"]) -> Estimate:
-        """An estimate whose errors are those of the steady state: the filter has run before the slew."""
+        """An estimate [-, rad/s] whose errors are those of the steady state: the filter has run before the slew."""
         turned = attitude.multiply(q, attitude.from_rotation_vector(self.attitude_error * normals[:3]))
         return Estimate(turned, bias + self.bias_error * normals[3:])
 
@@ -78,7 +79,7 @@ class AttitudeFilter:
         return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
 
     def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:
-        """The estimate after a star tracker sample that counts with this weight (0: none)."""
+        """The estimate after a star tracker sample [-] that counts with this weight (0: none)."""
         off = attitude.multiply(attitude.conjugate(old.q), measured)
         residual = jnp.where(off[3] < 0.0, -2.0, 2.0) * off[:3]
         turn = self.attitude_gain * weight * residual
@@ -142,7 +143,7 @@ class Memory(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sensors:
-    """Star tracker and gyro sampled once a period, white noise, independent per axis and sample.
+    """Star tracker [rad] and gyro [rad/s] sampled once a period, white noise, independent per axis and sample.
 
     Without a filter the law sees the samples themselves; with one, its attitude and the gyro's rate less its bias.
     """
@@ -218,7 +219,7 @@ class Sensors:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StateSensor:
-    """All states of a chain sampled once a period, white noise, independent per state and sample."""
+    """All states sampled once a period, white noise in the states' own units, independent per state and sample."""
 
     sigma: Leaf  # (n,) 1 sigma of each state
 

@@ -204,7 +204,7 @@ def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array
 
 
 def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
-    """The disturbance with these in the place of `values`; what has none stays as it is."""
+    """The disturbance with these phases [rad] or amplitudes [N m], as `values` gives them; what has none stays."""
     terms, used = [], 0
     for term in disturbance.terms if isinstance(disturbance, Sum) else (disturbance,):
         field = _FIELDS[what].get(type(term))
@@ -224,6 +224,6 @@ def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:
 
 
 def time_derivative(signal: Callable, t: Time) -> Array:
-    """D signal / dt at t, exact (by automatic differentiation), in the signal's units per second."""
+    """The derivative of a signal at t [s], (its shape), per second; exact, by automatic differentiation."""
     t = jnp.asarray(t, jnp.result_type(float))
     return jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]

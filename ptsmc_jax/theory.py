@@ -60,7 +60,8 @@ def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: 
 def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
     """Closed form of law (52) on a chain of any order n before the hand-over, d = 0 and K = 0; x0: (n,) at t = 0.
 
-    s(t) = s(0) r^(eta+n-2), and y = x_1 / tau^eta obeys y^(n-1) = s(0) t_f^-(eta+n-2) / tau, integrated n-1 times.
+    In the states' own units; s(t) = s(0) r^(eta+n-2), and y = x_1 / tau^eta obeys y^(n-1) = s(0) t_f^-(eta+n-2) / tau,
+    integrated n-1 times.
     """
     n = x0.shape[0]
     s0 = _surface(t_f, eta, x0)
@@ -72,8 +73,9 @@ def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
 def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, floor: Scalar) -> tuple[Vector, Vector]:
     """Centre and half width, (n,) each, of the interval that holds x_1 .. x_n where |s|^2 <= s0^2 r^(..) + floor tau^n.
 
-    (20)-(22) and (47)-(50) with their constants, for any residual that `sliding_envelope` allows: the exact solution
-    without s is the centre, and each of the n-1 integrations of |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
+    In the states' own units. (20)-(22) and (47)-(50) with their constants, for any residual that `sliding_envelope`
+    allows: the exact solution without s is the centre, and each of the n-1 integrations of
+    |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
     """
     n, tau = x0.shape[0], t_f - t
     free, forced = _modes(t, t_f, eta, x0)
@@ -90,7 +92,7 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
 
 
 def _surface(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
-    """S of (37) at t = 0."""
+    """The surface s of (37) at t = 0."""
     c = expansion(eta, x.shape[0])
     return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
 
@@ -150,6 +152,9 @@ def first_torque(
 def later_peak_ratio(eta: Scalar) -> Scalar:
     """The braking peak of the torque over its first value [-], for small angles and 2 < eta < 3.
 
+    >>> [f"{later_peak_ratio(jnp.asarray(eta)):.2f}" for eta in (2.05, 2.2, 2.386, 2.5)]
+    ['7.37', '1.87', '1.00', '0.79']
+
     R = (eta-1)/(eta-2) exp(-(2 eta-3)/(eta-1)), at ln r = -(2 eta-3)/((eta-1)(eta-2)): 1 at eta = 2.386, 7.4 at 2.05.
     """
     return (eta - 1.0) / (eta - 2.0) * jnp.exp(-(2.0 * eta - 3.0) / (eta - 1.0))
@@ -170,6 +175,12 @@ def shortest_time(
     """Shortest t_f [s] that keeps the torque below limit [N m], from rest to a fixed reference, disturbance small.
 
     eta sqrt(2 max_i |(J n)_i| tan(theta/2) / limit) sqrt(max(1, R(eta))), with R of `later_peak_ratio`.
+
+    A turn by 90 degrees about the axis of 14 kg m^2 with 0.5 N m takes 3 sqrt(2 14 tan(45 deg) / 0.5) = 22.4 s:
+
+    >>> body, q = jnp.diag(jnp.array([10.0, 12.0, 14.0])), attitude.from_rotation_vector(jnp.array([0, 0, jnp.pi / 2]))
+    >>> f"{shortest_time(body, q, eta=jnp.asarray(3.0), limit=jnp.asarray(0.5)):.4f}"
+    '22.4499'
     """
     first = jnp.max(jnp.abs(first_torque(inertia, q, eta, jnp.ones_like(eta), q_f)))
     return jnp.sqrt(first / limit * jnp.maximum(1.0, later_peak_ratio(eta)))
@@ -298,7 +309,10 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
 
 @partial(jax.jit, static_argnames="points")
 def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
-    """Targets (2 points,) and states of a second-order law's run: along the exact motion, then on the target itself."""
+    """Targets and states of a second-order run, (2 points,) each: along the exact motion, then on the target.
+
+    States in the states' own units; half of the times close in on the hand-over.
+    """
     law = parts.controller
     assert isinstance(law, SecondOrder)
     share = jnp.linspace(0.0, 1.0, points)

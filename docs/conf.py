@@ -1,0 +1,73 @@
+"""How `make docs` builds these pages: everything offline, every warning an error."""
+
+import ast
+import inspect
+import re
+import textwrap
+from typing import Any
+
+import latex2mathml.converter
+from docutils import nodes
+from sphinx.application import Sphinx
+
+import ptsmc_jax
+
+project = "ptsmc-jax"
+author = "the ptsmc-jax developers"
+release = version = ptsmc_jax.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+html_theme = "furo"
+html_title = f"ptsmc-jax {version}"
+html_math_renderer = "mathml"
+autodoc_default_options = {"members": True, "undoc-members": False, "member-order": "bysource"}
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {"Leaf": "Leaf", "Whole": "Whole"}
+suppress_warnings = ["ref.python"]  # names of axes in shapes, taken for names of fields
+
+
+def as_written(app: Sphinx, what: str, name: str, thing: object, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text with equations in it: nothing in them is markup but `code` and indented lines."""
+    text = []
+    lines += _fields(thing) if what == "class" else []
+    for before, line in zip(["", *lines], lines, strict=False):
+        if line.startswith("    ") and not before.strip() and text:
+            text += ["::", ""] if text[-1:] != ["::"] else []
+        plain = line if line.startswith("    ") else re.sub(r"([\\*|_])", r"\\\1", line)
+        text.append(re.sub(r"`([^`]+)`", lambda code: f"``{code[1].replace(chr(92), '')}``", plain))
+    lines[:] = text
+
+
+def _fields(thing: Any) -> list[str]:
+    """What the source says of a class's fields, in comments beside them."""
+    try:
+        source = textwrap.dedent(inspect.getsource(thing))
+    except (OSError, TypeError):  # an alias of a type
+        return []
+    rows = source.splitlines()
+    found = ["", "Fields:", ""]
+    for node in ast.parse(source).body[0].body:  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(node, ast.AnnAssign) and not (name := ast.unparse(node.target)).startswith("_"):
+            _, _, comment = rows[node.lineno - 1].partition("  # ")
+            found.append(f"- `{name}`" + (f": {comment}" if comment else ""))
+    return found if len(found) > 3 else []
+
+
+def inline(self: Any, node: nodes.math) -> None:
+    """An equation in a line, as MathML, which browsers draw without a script from elsewhere."""
+    self.body.append(latex2mathml.converter.convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block(self: Any, node: nodes.math_block) -> None:
+    """An equation of its own."""
+    self.body.append(latex2mathml.converter.convert(node.astext(), display="block"))
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """What Sphinx calls."""
+    app.add_html_math_renderer("mathml", (inline, None), (block, None))
+    app.connect("autodoc-process-docstring", as_written)

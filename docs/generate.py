@@ -1,0 +1,147 @@
+"""Writes the references in docs/: scenario files and metrics from the code's types, commands from the command itself.
+
+`python docs/generate.py` writes them anew; a test fails while they differ from what the code says.
+"""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+from ptsmc_jax import keys, layouts, metrics, schema
+from ptsmc_jax.signal_tables import Attitude
+from ptsmc_jax.tables import Limit
+from ptsmc_jax.values import Table
+from tuning.cli import app
+
+HERE = Path(__file__).parent
+MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
+PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
+SCENARIOS = """\
+A scenario is a TOML file of tables; every table and every key is optional. What is not said has the default, for a
+spacecraft the paper's Case I. `hardware`, `wheels`, `filter`, `dispersion`, `requirements` and `tune` are off where
+they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name. `ptsmc new`
+writes all this into a file, to be changed.
+
+A table with a `kind` has the keys of that kind. Every command leaves the scenario that it flew, every default filled
+in, as `scenario.toml` beside its results. What follows from several keys together, such as `delta` of at least one
+control period, is said when a scenario is refused."""
+METRICS = """\
+What a run is judged by: in `summary.json`, in the rows of a campaign and in `[requirements]`. Over trials
+`window_error` pools as RMS; of the others mean, largest and quantiles are told. A run that never settles has no
+`settling_time` (null). A trial that diverged or met a singularity has a status, a reason and its first bad time, and
+breaks every requirement."""
+ERRORS = """\
+The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
+part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and
+input. `peak_wheel_momentum` is there with `[wheels]` only. Numbers of one's own: `ptsmc montecarlo --metrics`."""
+REQUIREMENTS = """\
+Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
+such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`:"""
+
+
+def scenarios() -> str:
+    """Reference of scenario files, for each kind of plant what it does not share with those before."""
+    parts = ["# Scenario files", MADE, SCENARIOS]
+    seen: dict[type[Table], str] = {}
+    for plant, title in PLANTS.items():
+        parts += [f"## {title}"]
+        for name, table in layouts.TABLES[plant].items():
+            kinds = table if isinstance(table, dict) else {"": table}
+            parts += [f"### [{name}]"]
+            if all(struct in seen for struct in kinds.values()):
+                parts += [f"As for {seen[next(iter(kinds.values()))]}."]
+                continue
+            for kind, struct in kinds.items():
+                default = " (default)" if kind == next(iter(kinds)) else ""
+                said = f'`kind = "{kind}"`{default}: ' if kind else ""
+                said = f'`kind = "{plant}"`: ' if name == "plant" else said
+                parts += [said + keys.about(struct), *_keys(name, struct, plant)]
+                seen[struct] = title[0].lower() + title[1:]
+        if plant == "spacecraft":
+            parts += ["### [requirements]", REQUIREMENTS, *_keys("requirements", Limit, plant)]
+        else:
+            parts += ["### [requirements]", "As for a spacecraft, on the metrics that the plant has."]
+    return _page(parts)
+
+
+def metric_list() -> str:
+    """Reference of the metrics."""
+    parts = ["# Metrics", MADE, METRICS]
+    for title, known in (
+        ("A spacecraft's", metrics.CATALOGUE),
+        ("Those of chains and systems", metrics.STATE_CATALOGUE),
+    ):
+        parts += [f"## {title}", _grid("metric unit meaning", [[f"`{key}`", *told] for key, told in known.items()])]
+    return _page([*parts, ERRORS])
+
+
+def commands() -> str:
+    """Reference of the commands."""
+    with mock.patch.object(sys, "argv", ["ptsmc"]):  # which the usage lines are made from
+        text = app.generate_docs(output_format="markdown")
+    text = text[text.index("## ptsmc simulate") :]
+    for made, better in {
+        " *[default: False]*": "",
+        " STR`": "`",
+        "--figures, --no-figures`: Draw figures. *[default: True]*": "--no-figures`: Draw no figures.",
+    }.items():
+        text = text.replace(made, better)
+    return _page(["# Commands", MADE, "\n".join(line.rstrip() for line in text.strip().splitlines())])
+
+
+def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
+    """The keys of a table as a table."""
+    if table == "dispersion":
+        yield from _dispersion(struct)
+        return
+    borrowed = issubclass(struct, Attitude) and table != "initial"
+    fallback = layouts.defaults(plant, 2).get(table, {}) if table == "initial" else {}
+    rows = [
+        [f"`{key.name}`", key.allowed, _default(fallback.get(key.name, key.default)), key.unit, key.meaning]
+        for key in keys.of(struct)
+        if not (borrowed and key.name in Attitude.__struct_fields__)
+    ]
+    if rows:
+        yield _grid("key allowed default unit meaning", rows)
+    if borrowed:
+        yield "And one of the attitude keys of `[initial]`."
+
+
+def _dispersion(struct: type[Table]) -> Iterator[str]:
+    rows = []
+    for key in keys.of(struct):
+        for kind, drawn in layouts.DISPERSIONS[key.name].items():
+            given = [f'`kind = "{kind}"`']
+            for k in keys.of(drawn):
+                said = [
+                    f"default {shown}" if (shown := _default(k.default)) else "",
+                    k.meaning + (f" [{k.unit}]" if k.unit else ""),
+                ]
+                given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
+            rows.append([f"`{key.name}`", key.meaning, "; ".join(given), keys.about(drawn)])
+    yield _grid("key what given how", rows)
+
+
+def _default(value: object) -> str:
+    shown = isinstance(value, bool | int | float | str | tuple | list) and value != ()
+    return f"`{schema.show(value)}`" if shown else ""
+
+
+def _grid(header: str, rows: list[list[str]]) -> str:
+    """A table; a column that is empty throughout is left out."""
+    titles = header.split()
+    used = [k for k in range(len(titles)) if any(row[k] for row in rows)]
+    lines = [titles, ["---"] * len(titles), *rows]
+    return "\n".join("| " + " | ".join(line[k].replace("|", "\\|") for k in used) + " |" for line in lines)
+
+
+def _page(parts: list[str]) -> str:
+    return "\n\n".join(parts) + "\n"
+
+
+PAGES = {"scenarios.md": scenarios, "metrics.md": metric_list, "commands.md": commands}
+
+if __name__ == "__main__":
+    for name, page in PAGES.items():
+        (HERE / name).write_text(page(), encoding="utf-8")

@@ -1,0 +1,222 @@
+"""The documentation says what the code does: references, commands, keys, code, names, docstrings; and it builds."""
+
+import doctest
+import importlib
+import inspect
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+import textwrap
+import tomllib
+import types
+
+import pytest
+from jaxtyping import Array
+
+from ptsmc_jax import layouts, metrics
+from ptsmc_jax.scenario import from_tables
+from tests.helpers import ROOT
+from tuning.cli import app
+
+DOCS = ROOT / "docs"
+GENERATE = runpy.run_path(str(DOCS / "generate.py"))
+MADE, TITLES = GENERATE["PAGES"], GENERATE["PLANTS"]
+WRITTEN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.M | re.S)
+
+
+def blocks(path, *languages):
+    """Code blocks of a page in one of these languages."""
+    return [textwrap.dedent(block) for _, language, block in FENCE.findall(path.read_text()) if language in languages]
+
+
+def commands():
+    """Command -> its options, as the command line knows them."""
+    found = {}
+    for line in app.generate_docs(output_format="markdown", usage_name="ptsmc").splitlines():
+        if line.startswith("## ptsmc "):
+            command = line.removeprefix("## ptsmc ")
+            found[command] = set()
+        elif line.startswith("* `-"):
+            found[command] |= set(re.findall(r"--?[a-z][\w-]*", line.split(":")[0]))
+    return found
+
+
+COMMANDS = commands()
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_references_are_what_the_code_says(name):
+    assert (DOCS / name).read_text(encoding="utf-8") == MADE[name](), "run `python docs/generate.py`"
+
+
+def test_the_references_name_everything():
+    scenarios, metric_list = MADE["scenarios.md"](), MADE["metrics.md"]()
+    for plant, tables in layouts.TABLES.items():
+        part = scenarios[scenarios.index(f"## {TITLES[plant]}") :]
+        for name, table in tables.items():
+            assert f"### [{name}]" in part
+            structs = table.values() if isinstance(table, dict) else [table]
+            for struct in structs:
+                assert all(f"`{key}`" in scenarios for key in struct.__struct_fields__ if key != "kind"), struct
+    for catalogue in metrics.CATALOGUES.values():
+        assert all(f"| `{metric}` | {unit} | " in metric_list for metric, (unit, _) in catalogue.items())
+
+
+def test_the_guide_names_every_command():
+    guide = (DOCS / "guide.md").read_text()
+    assert len(COMMANDS) >= 14
+    assert not [command for command in COMMANDS if not re.search(rf"`(ptsmc )?{command}\b|ptsmc {command}\b", guide)]
+
+
+@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.name)
+def test_commands_in_the_text_exist(path):
+    """Each line of a shell block that calls ptsmc is one that the command line takes; so is each `ptsmc ...`."""
+    lines = [line.split("#")[0].strip() for block in blocks(path, "", "bash", "console") for line in block.splitlines()]
+    calls = [line.removeprefix(".venv/bin/") for line in lines if re.match(r"(\.venv/bin/)?ptsmc ", line)]
+    for call in calls:
+        if "[OPTIONS]" in call or "COMMAND" in call:
+            continue
+        app.parse_args(shlex.split(call)[1:], exit_on_error=False, print_error=False)
+    text = FENCE.sub("", path.read_text())
+    for call in re.findall(r"`ptsmc ([a-z][^`]*)`", text):
+        command, *rest = call.split()
+        assert command in COMMANDS, call
+        assert {word for word in rest if word.startswith("-")} <= COMMANDS[command] | {"--help"}, call
+    known = set().union(*COMMANDS.values(), {"--help", "--version"})
+    assert set(re.findall(r"`(--[a-z][\w-]*)", text)) <= known
+
+
+@pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "toml")], ids=lambda path: path.name)
+def test_scenarios_in_the_text_are_allowed(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for block in blocks(path, "python"):
+        if "pendulum = system(" in block:
+            (tmp_path / "pendulum.py").write_text(block)
+    for block in blocks(path, "toml"):
+        table = tomllib.loads(block)
+        if "system" in table.get("plant", {}):
+            table["plant"]["system"] = f"{tmp_path}/{table['plant']['system']}"
+        from_tables(table)
+
+
+@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.name)
+def test_names_in_the_text_exist(path):
+    """`module.name` of ours, and files."""
+    text = FENCE.sub("", path.read_text())
+    modules = {
+        file.stem: f"{package}.{file.stem}"
+        for package in ("ptsmc_jax", "tuning")
+        for file in (ROOT / package).glob("*.py")
+    }
+    for module, name in re.findall(r"`(?:ptsmc_jax\.|tuning\.)?([a-z_]+)\.([A-Za-z_]\w*)(?:\([^`]*\))?`", text):
+        if module in modules and name not in "csv html ipynb json md png py toml".split():
+            assert hasattr(importlib.import_module(modules[module]), name), f"{module}.{name}"
+    for file in re.findall(r"`((?:tests|docs|scenarios|benchmarks|notebooks)/[a-z\d_./]+)`", text):
+        assert (ROOT / file).exists(), file
+    for link in re.findall(r"\]\((?!http|#)([^)#]+)", text):
+        assert (path.parent / link).exists(), link
+
+
+@pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "python")], ids=lambda path: path.name)
+def test_code_in_the_text_runs(path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    space = {}
+    for block in blocks(path, "python"):
+        exec(compile(block, str(path), "exec"), space)
+
+
+def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_path):
+    building = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
+    done = subprocess.run(building, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    pages = sorted(tmp_path.glob("*.html"))
+    assert {page.stem for page in pages} >= {path.stem for path in DOCS.glob("*.md")}
+    for page in pages:
+        loaded = re.findall(r"<(?:script|img|link|iframe)\b[^>]*?(?:src|href)=\"(https?:)?//[^\"]*", page.read_text())
+        assert not loaded, page.name
+    assert (tmp_path / "method.html").read_text().count("<math") > 50
+
+
+# --- docstrings ---
+
+PHYSICS = """attitude plants signals laws controllers baselines observers hardware sensors theory linear draws
+    dispersions clock""".split()
+ARRAYS = re.compile(r"\b(Array|Float|Int|Bool|UInt32|ndarray|ArrayLike|Leaf)\b")
+UNIT = re.compile(
+    r"\[[^][]+\]|in the (?:states'|inputs'|states' own|inputs' own) units|in the units of|unit quaternion", re.I
+)
+SHAPE = re.compile(r"\([\w ]+,[^()]*\)|\(its shape\)|\b(?:matrix|number|scalar)\b")
+SOURCE = re.compile(r"\(\d+\)|Theorem|Remark|Assumption|\b(?:19|20)\d\d\b|IEEE Std|derivative|[=<>]")
+
+
+def public(module):
+    """(name, function, docstrings that speak for it) of what a module offers: bases speak for what they declare."""
+    for name, thing in vars(module).items():
+        if name.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
+            continue
+        if inspect.isclass(thing):
+            for key, member in vars(thing).items():
+                function = member.fget if isinstance(member, property) else member
+                if key.startswith("_") or not inspect.isfunction(function):
+                    continue
+                bases = [base for base in thing.__mro__ if base is not object]
+                docs = [inspect.getdoc(vars(base)[key]) or "" for base in bases if key in vars(base)]
+                docs += [vars(base).get("__doc__") or "" for base in bases]
+                yield f"{name}.{key}", function, docs
+        elif inspect.isfunction(inspect.unwrap(thing)):
+            yield name, inspect.unwrap(thing), [inspect.getdoc(thing) or ""]
+
+
+def lacking(module, function, docs):
+    """What the docstrings of a function of arrays do not say."""
+    annotations = [str(value) for key, value in function.__annotations__.items()]
+    if not any(ARRAYS.search(annotation) for annotation in annotations):
+        return
+    text = "\n".join(docs)
+    if not UNIT.search(text):
+        yield "units"
+    if not SOURCE.search(text + (module.__doc__ or "")):
+        yield "source"
+    bare = [
+        annotation
+        for annotation in annotations
+        if re.search(r"<class '.*(?:Array|ndarray)'>|^(?:Array|np\.ndarray)$", annotation)
+    ]
+    if bare and not SHAPE.search(text):
+        yield "shapes"
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_docstrings_say_shapes_units_and_source(name):
+    module = importlib.import_module(f"ptsmc_jax.{name}")
+    seen = list(public(module))
+    assert seen
+    assert not [f"{own}: {what}" for own, function, docs in seen for what in lacking(module, function, docs)]
+
+
+def test_the_look_at_docstrings_sees_what_is_missing():
+    def silent(x: Array) -> Array:
+        """Something."""
+        return x
+
+    def telling(x: Array) -> Array:
+        """Something = x [N m], (3,)."""
+        return x
+
+    nothing = types.SimpleNamespace(__doc__="A module.")
+    assert list(lacking(nothing, silent, [silent.__doc__])) == ["units", "source", "shapes"]
+    assert not list(lacking(nothing, telling, [telling.__doc__]))
+
+
+def test_examples_in_docstrings_run():
+    tried = 0
+    for package in ("ptsmc_jax", "tuning"):
+        for file in sorted((ROOT / package).glob("*.py")):
+            failed, attempted = doctest.testmod(importlib.import_module(f"{package}.{file.stem}"))
+            assert not failed, file
+            tried += attempted
+    assert tried > 20
