@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO := scenarios/first_flight.toml
 OUT := out/tune-first_flight
 
-.PHONY: tune test setup table notebooks notebooks-kept clean
+.PHONY: tune test setup table docs notebooks notebooks-kept clean
 
 tune: $(VENV)/.installed
 	$(BIN)/ptsmc tune $(SCENARIO) --out $(OUT)
@@ -22,6 +22,12 @@ table: $(VENV)/.installed
 
 notebooks: $(VENV)/.installed-notebooks
 	$(BIN)/jupyter lab notebooks
+
+# the references made anew from the code, then all pages
+docs: $(VENV)/.installed-dev
+	$(BIN)/python docs/generate.py
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
+	@echo "Documentation: out/docs/index.html"
 
 # the notebooks executed, and kept with their outputs beside their sources
 notebooks-kept: $(VENV)/.installed-dev

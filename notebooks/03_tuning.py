@@ -25,7 +25,7 @@ from ptsmc_jax.explore import Figures
 from tuning import pareto, report, results, show
 
 flight = ptsmc.read("../scenarios/first_flight.toml")
-small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 40})  # less than the default, for a quick look
+small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
 
 # %% [markdown]
 # `ptsmc tune scenarios/first_flight.toml` is this with 64 trials and 8 starts. The table sets the tuned gains beside the
@@ -66,7 +66,7 @@ Figures({"tradeoff": made["tradeoff"]})
 # better in both. The knee is where the front bends most; `ptsmc pareto` draws it with twenty points.
 
 # %%
-front = pareto.trace(small, 0, 5)
+front = pareto.trace(small, 0, 4)
 Figures({"front": study_plots.front(front.points, front.others, 0.5, ("-", "N m"))})
 
 # %% [markdown]

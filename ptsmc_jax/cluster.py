@@ -85,7 +85,7 @@ def connected(address: str, tls: Mapping[str, str]) -> Cluster:
             raise RefusedError(f"--cluster is {address}, which is not there")
         where = {"scheduler_file": address}
     try:
-        return Cluster(Client(**where, security=security, timeout="15s", set_as_default=False), local)
+        return Cluster(Client(**where, security=security, timeout="10s", set_as_default=False), local)
     except (OSError, ValueError, TypeError) as error:
         raise RefusedError(f"--cluster is {address}, which does not answer: {_sentence(error)}") from None
 

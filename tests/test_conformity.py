@@ -138,6 +138,9 @@ ROWS: dict[str, dict] = {
 }  # fmt: skip
 
 
+UNCOMPILED = ("raw samples, full inertia, other truth", "continuous", "chain of order 3")  # a loop of each kind
+
+
 @partial(jax.jit, static_argnames="vmap")
 def batch(parts, dispersion, vmap):
     """Metrics, status and bad times of some trials, and the metrics' slopes along the law's gains."""
@@ -185,11 +188,13 @@ def singles(ready, fly):
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_compiled_or_not(name):
+def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop(name):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     metrics, *_ = compare(ready.parts, ready.dispersion, name)
     loop = singles(ready, rollout.simulate_jit)
     agree(loop, metrics, 1e-12, name)
+    if name not in UNCOMPILED:
+        return
     plain = rollout.simulate(ready.dispersion.apply(ready.parts, SEED, NUMBERS[0]), SEED, NUMBERS[0])  # no jit
     agree(jax.tree.map(np.asarray, plain.metrics._asdict()), {k: v[0] for k, v in loop.items()}, 1e-12, name)
 

@@ -34,7 +34,7 @@ def blocks(path, *languages):
 
 def commands():
     """Command -> its options, as the command line knows them."""
-    found = {}
+    found, command = {}, ""
     for line in app.generate_docs(output_format="markdown", usage_name="ptsmc").splitlines():
         if line.startswith("## ptsmc "):
             command = line.removeprefix("## ptsmc ")

@@ -66,7 +66,7 @@ FLOORS = {
         show
         show_campaign page_charts convert new
         page
-        campaign_commands
+        campaign_commands writing_commands
         cli table
     """,
 }

@@ -19,6 +19,12 @@ ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
 FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 
 
+def key_of(line):
+    """The key that a line sets, on or off; None where it sets none."""
+    found = KEY.match(line)
+    return found[1] if found else None
+
+
 def blocks(text):
     """Table -> its lines; what introduces the file is left out."""
     found, name = {}, None
@@ -26,7 +32,7 @@ def blocks(text):
         if match := TABLE.match(line):
             name = match[1]
             found[name] = []
-        elif name and KEY.match(line):
+        elif name and key_of(line):
             found[name].append(line)
     return found
 
@@ -35,7 +41,7 @@ def kinds(lines):
     """The lines of each kind of a table, that in use first; one without kinds is one."""
     found = [[]]
     for line in lines:
-        if KEY.match(line)[1] == "kind" and found[-1]:
+        if key_of(line) == "kind" and found[-1]:
             found.append([])
         found[-1].append(line)
     return found
@@ -73,7 +79,7 @@ def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
         explained = set() if name == "initial" else ATTITUDE  # there
         for lines, struct in zip(said, structs, strict=True):
             wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
-            assert {KEY.match(line)[1] for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
+            assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
     for metric in metrics.CATALOGUES[plant]:
         assert metric in text
@@ -100,7 +106,9 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
             from_tables({**base, name: hardware if name == "hardware" else {**table, **given}})
             tried += 1
     layout = layouts.TABLES[plant]
-    drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(layout["dispersion"]))
+    dispersion = layout["dispersion"]
+    assert isinstance(dispersion, type)
+    drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(dispersion))
     others = sum(len(table) if isinstance(table, dict) else 1 for table in layout.values()) - 1
     assert tried == others + drawn + 1  # [requirements] is no table of the layout
 

@@ -131,22 +131,24 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
-@pytest.mark.parametrize("stage", ["least torque: polishing", "ladder"])
-def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
+def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch):
     """The front is that of a run without it."""
     small_search(monkeypatch, 60)
     run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
     whole = command(*run, "whole")[0]
 
-    def stop(self, what, *numbers):
-        if what.startswith(stage):
-            raise KeyboardInterrupt
+    for k, stage in enumerate(["least torque: polishing", "ladder"]):
+        cut = f"cut-{k}"
 
-    with monkeypatch.context() as patch:
-        patch.setattr(show.Progress, "__call__", stop)
-        status, _, err = command(*run, "cut")
-    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
-    assert not (tmp_path / "cut" / "front.csv").exists()
-    assert command(*run, "cut")[0] == whole
-    assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
-    assert "journal.bin" not in tree(tmp_path / "cut")
+        def stop(self, what, *numbers, stage=stage):
+            if what.startswith(stage):
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(show.Progress, "__call__", stop)
+            status, _, err = command(*run, cut)
+        assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
+        assert not (tmp_path / cut / "front.csv").exists()
+        assert command(*run, cut)[0] == whole
+        assert (tmp_path / cut / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
+        assert "journal.bin" not in tree(tmp_path / cut)

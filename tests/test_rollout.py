@@ -248,7 +248,7 @@ def test_another_number_is_the_same_program():
 
 
 def test_simulate_without_jit_is_the_same():
-    run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.0)
+    run = parts(5.0, 3.0, 0.5, period=0.5, noise=(2e-5, 1e-6), t_end=6.0)
     with jax.disable_jit():
         plain = rollout.simulate(run, np.uint32(1), np.uint32(2))
     compiled = fly(run, np.uint32(1), np.uint32(2))

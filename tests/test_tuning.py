@@ -11,7 +11,7 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, gains, objective, optimise, report, results, starts, worst
+from tuning import bounds, gains, objective, optimise, refine, report, results, starts, worst
 from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -91,6 +91,9 @@ def test_bounds_map_reals_into_the_interval_and_back():
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
 
 
+measure = jax.jit(objective.measure)
+
+
 def problem(count=8, dispersion=SPREAD, **limits):
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
@@ -100,7 +103,7 @@ def problem(count=8, dispersion=SPREAD, **limits):
 
 def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
     some = problem(peak_torque=0.7, effort=5.0)
-    f, c, _ = objective.measure(some, vector([3.0, 0.7]))
+    f, c, _ = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(flown.metrics.window_error**2)), rtol=1e-10)
     np.testing.assert_allclose(c[0] + 1, flown.metrics.peak_torque / 0.7, rtol=1e-10)
@@ -110,7 +113,7 @@ def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
 @pytest.mark.parametrize("tail", [1, 3, 8])
 def test_the_tail_is_the_mean_of_the_worst(tail):
     some = replace(problem(), tail=tail)
-    f, _, _ = objective.measure(some, vector([3.0, 0.7]))
+    f, _, _ = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8))
     worst = np.sort(flown.metrics.window_error)[-tail:]
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
@@ -121,7 +124,7 @@ def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(leas
     """The largest c is that order statistic of the averaged trials; harder trials that were added do not count."""
     some = problem(peak_torque=0.7, effort=5.0)
     some = replace(objective.with_trials(some, np.arange(8, 11)), least=(least, None))
-    _, c, _ = objective.measure(some, vector([3.0, 0.7]))
+    _, c, _ = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
     expected = np.sort(flown.metrics.peak_torque[:8])[least - 1] / 0.7 - 1
     np.testing.assert_allclose(c[0].max(), expected, rtol=1e-10)
@@ -133,7 +136,7 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
 
     @jax.jit
     def value(gains):
-        f, c, _ = objective.measure(some, gains)
+        f, c, _ = measure(some, gains)
         return jnp.stack([f, c.max()])
 
     at = np.array([3.1, 0.73])
@@ -145,13 +148,13 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
 
 
 def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
-    monkeypatch.setattr(starts, "CANDIDATES", 8)
+    helpers.small_search(monkeypatch)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     largest = {}
     for tail in (None, 1):
         some = replace(problem(), tail=tail)
         found = optimise.search(Evaluator(limits), some, (), np.array([3.0, 0.5]), 2, 25, 1)
-        f, _, _ = objective.measure(replace(some, tail=1), jnp.asarray(found.gains))
+        f, _, _ = measure(replace(some, tail=1), jnp.asarray(found.gains))
         largest[tail] = float(np.exp(f))
     assert largest[1] <= largest[None] * (1 + 1e-6)
 
@@ -175,9 +178,9 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
     some = problem(dispersion=near, peak_torque=0.7)
 
     def f(at):
-        return objective.measure(some, at)[:2]
+        return measure(some, at)[:2]
 
-    (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jacfwd(f)(vector([3.0, 0.7]))
+    (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jit(jax.jacfwd(f))(vector([3.0, 0.7]))
     np.testing.assert_allclose(value, np.log(objective.FAILED))
     assert np.all(np.asarray(over) == objective.FAILED - 1)
     assert np.all(np.isfinite(slope))
@@ -185,8 +188,10 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
 
 def test_search_finds_the_constrained_optimum(monkeypatch):
     """Against a brute-force scan of the same problem, screening for harder trials left out."""
+    helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(starts, "CANDIDATES", 32)
+    monkeypatch.setattr(refine, "GENERATIONS", 15)
     some = problem(peak_torque=0.9)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)
@@ -208,7 +213,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     f, c = scan(jnp.asarray(grid))
     best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= 0.0].min())
     assert found.value <= best * 1.01
-    f, c, _ = objective.measure(final, jnp.asarray(found.gains))
+    f, c, _ = measure(final, jnp.asarray(found.gains))
     np.testing.assert_allclose(np.exp(f), found.value, rtol=1e-9)
     assert np.asarray(c).max() <= 0.0
 
@@ -242,16 +247,16 @@ def test_statistics_count_failures_and_average_the_rest():
 def test_the_goal_may_be_t_f_itself_or_another_metric():
     some = replace(problem(), names=("eta", "t_f"))
     at = vector([3.0, 19.0])
-    f, _, value = objective.measure(replace(some, goal="t_f"), at)
+    f, _, value = measure(replace(some, goal="t_f"), at)
     np.testing.assert_allclose([f, value], np.log(19.0), rtol=1e-15)
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "t_f": 19.0}), SPREAD, 3, np.arange(8))
-    f, _, value = objective.measure(replace(some, goal="peak_torque", tail=1), at)
+    f, _, value = measure(replace(some, goal="peak_torque", tail=1), at)
     np.testing.assert_allclose(np.exp([f, value]), flown.metrics.peak_torque.max(), rtol=1e-10)
 
 
 def test_a_weighted_goal_is_a_product_of_powers():
     some = replace(problem(), torque_weight=0.3)
-    f, _, value = objective.measure(some, vector([3.0, 0.7]))
+    f, _, value = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(8)).metrics
     rms = [np.sqrt(np.mean(v**2)) for v in (flown.window_error, flown.peak_torque)]
     np.testing.assert_allclose(np.exp(value), rms[0], rtol=1e-10)

@@ -78,7 +78,7 @@ def montecarlo(
     loaded, path = prepare(scenario, "montecarlo", out)
     if width is not None and not loaded.requirements:
         raise UsageError("--until-confident needs [requirements] in the scenario, whose shares it looks at")
-    from tuning import campaign_folder, campaign_summary
+    from tuning import campaign_folder
 
     folder = campaign_folder.Folder(path, loaded, key, count, metrics)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
@@ -94,6 +94,8 @@ def montecarlo(
             if dry_run:
                 campaign_folder.write_plan(folder, told)
             elif width is not None:
+                from tuning import campaign_summary  # takes a second to import, which flying need not wait for
+
                 stopped = campaign_summary.until_confident(
                     folder, width, lambda first: campaign_folder.fly(folder, share, told, elsewhere, first)
                 )
