@@ -1,6 +1,6 @@
 """Does the search find the optimum? Twenty seeds of its starts against differential evolution, on the same problem.
 
-    python benchmarks/tuning_seeds.py scenarios/first_flight.toml [SEEDS]
+    python benchmarks/tuning_seeds.py scenarios/first_flight.toml [SEEDS | FIRST:END]
 
 The training trials are those of seed 0; what changes from seed to seed are the starts. Then the gains of every seed
 that found the optimum fly 1 000 fresh trials beside the paper's.
@@ -20,14 +20,17 @@ def main() -> None:
     from ptsmc_jax import scenario
     from tuning import evolution, gains, optimise, report
 
-    path, seeds = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 20
+    path, (first, end) = sys.argv[1], (0, 20)
+    if len(sys.argv) > 2:
+        *some, last = map(int, sys.argv[2].split(":"))
+        first, end = (*some, 0)[0], last
     loaded = scenario.read(path)
     loaded = loaded if loaded.tune is not None else scenario.replace(loaded, tune={})
     table = loaded.tune
     assert table is not None
     posed = report.pose(loaded, 0)
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
-    for seed in range(seeds):
+    for seed in range(first, end):
         started, before = time.monotonic(), evaluate.gradients
         one = optimise.search(evaluate, problem, ready.requirements, own, table.starts, table.steps, seed,
                               exact=posed.exact, robust=table.worst_case)  # fmt: skip
@@ -43,7 +46,7 @@ def main() -> None:
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
     reference = min(check.value, best.value)
     near = [one.value <= 1.01 * reference for one in found]
-    print(f"within 1 % of the better of both: {sum(near)} of {seeds}; "
+    print(f"within 1 % of the better of both: {sum(near)} of {len(near)}; "
           f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
     fresh = report.seed_of_judge(0)
     paper = report.judge(gains.papers(loaded), fresh, ready.requirements)

@@ -112,7 +112,7 @@ def covers(name: str) -> bool:
     return name in _RULES
 
 
-def _alike(parts: Sequence) -> list[Array]:
+def _alike(parts: Sequence) -> list:
     """Components spread over the trials if any of them differs from trial to trial."""
     shape = max((np.shape(part) for part in parts), key=len)
     return [part if np.shape(part) == shape else lax.broadcast(part, shape) for part in parts]
@@ -178,7 +178,7 @@ def _reduction(eqn: Any, values: Sequence) -> list[Lane]:
     return [Lane(shape, object_array(shape, (_fold(operation, rows[i]) for i in np.ndindex(*shape))))]
 
 
-def _fold(operation: Callable, items: Iterable) -> Array:
+def _fold(operation: Callable, items: Iterable) -> Any:
     return reduce(lambda a, b: operation(*_alike([a, b])), items)
 
 
@@ -240,7 +240,7 @@ _ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh cbr
     shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub
     tan tanh xor""".split()
 _STRUCTURAL = """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
-    transpose""".split()
+    transpose unstack""".split()
 # An index that differs from trial to trial wants whole arrays.
 _INDEXING = """argmax argmin dynamic_slice dynamic_update_slice gather scatter scatter-add scatter-mul scatter-min
     scatter-max sort top_k""".split()

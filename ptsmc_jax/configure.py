@@ -9,6 +9,7 @@ import sys
 import warnings
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 # Compiler options for loops on a CPU, no stable interface. The first lets all outputs of a loop's body share their
 # common work, the second compiles the whole loop into one kernel, the third lets that kernel's loops over the trials
@@ -21,7 +22,18 @@ _OPTIONS = (
 )
 
 
-def configure(devices: int | None = None, cache: str | Path | None = "default", fast: bool = True) -> None:
+class NoDeviceError(ValueError):
+    """A device that JAX does not find here. Its text is one sentence."""
+
+
+def configure(
+    devices: int | None = None,
+    cache: str | Path | None = "default",
+    fast: bool = True,
+    *,
+    device: Literal["cpu", "gpu"] | None = None,
+    bits: Literal[32, 64] = 64,
+) -> None:
     """64 bit numbers, one host device per core, compiler options and a persistent compile cache.
 
     devices: number of host devices, all cores that this process may use if None; cache: folder of the compile cache,
@@ -30,8 +42,10 @@ def configure(devices: int | None = None, cache: str | Path | None = "default", 
     you need it, or where the compiler of jax 0.10.2 aborts with them, as it does on some code of one's own that
     scatters into several arrays under vmap. They are tried out in a process of its own, once for each version of JAX
     and processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
-    XLA_FLAGS that set `xla_backend_extra_options` are left as they are. Call it before anything runs on JAX; later it
-    raises RuntimeError where the backend has already started with something else.
+    XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
+    first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
+    of reach stands in docs/python.md. Call it before anything runs on JAX; later it raises RuntimeError where the
+    backend has already started with something else.
     """
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     flags = os.environ.get("XLA_FLAGS", "")
@@ -39,12 +53,19 @@ def configure(devices: int | None = None, cache: str | Path | None = "default", 
         os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
     import jax
 
-    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_x64", bits == 64)
+    if device is not None:
+        jax.config.update("jax_platforms", device)
     jax.config.update("jax_num_cpu_devices", devices or len(os.sched_getaffinity(0)))
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    if device == "gpu":
+        try:
+            jax.devices()  # starts the backend
+        except RuntimeError:
+            raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
 
 
 def _flags(options: tuple[str, ...]) -> str:

@@ -144,22 +144,10 @@ class _Lanes:
         return [Lane(out.shape[1:], dense=out) for out in dense]
 
     def without_rule(self, eqn: Any) -> None:
-        told = f"lanes have no rule for the primitive `{eqn.primitive.name}`{_place(eqn)}"
+        told = f"lanes have no rule for the primitive `{eqn.primitive.name}`{place(eqn)}"
         if self.strict:
             raise NotImplementedError(f"{told}; write it with others, or leave strict mode")
         warnings.warn(f"{told}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
-
-    def settle(self, jaxpr: Any, before: list[bool], carried: list[bool], after: list[bool]) -> list[bool]:
-        """Which carries of a loop depend on the trial: those that start so, and those that its body makes so.
-
-        before, after: the same for what stands before and after the carries among the body's inputs.
-        """
-        while True:
-            outputs = _dependence(jaxpr, [*before, *carried, *after])
-            wider = [a or b for a, b in zip(carried, outputs, strict=False)]
-            if wider == carried:
-                return carried
-            carried = wider
 
     def scan(self, eqn: Any, values: list) -> list:
         params = eqn.params
@@ -167,8 +155,8 @@ class _Lanes:
         consts = [_apart(value) for value in values[:constants]]
         init, xs = values[constants : constants + carried], values[constants + carried :]
         fixed, rowed = _which(consts), _which(xs)
-        differs = self.settle(body.jaxpr, fixed, _which(init), rowed)
-        outputs = _dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
+        differs = settle(body.jaxpr, fixed, _which(init), rowed)
+        outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
         state = _Packed(body.jaxpr.invars[constants : constants + carried], differs, self.trials)
         row = _Packed(body.jaxpr.invars[constants + carried :], rowed, self.trials)
         out = _Packed(body.jaxpr.outvars[carried:], outputs, self.trials)
@@ -216,8 +204,8 @@ class _Lanes:
         first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         values = [*(_apart(value) for value in values[:second]), *values[second:]]
         test_consts, body_consts, init = values[:first], values[first:second], values[second:]
-        differs = self.settle(body.jaxpr, _which(body_consts), _which(init), [])
-        (each,) = _dependence(test.jaxpr, [*_which(test_consts), *differs])
+        differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
+        (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])
         if each:
             differs = [True] * len(init)
         state = _Packed(body.jaxpr.outvars, differs, self.trials)
@@ -247,7 +235,7 @@ class _Lanes:
             which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
             return each.unpack(jax.tree.map(lambda *c: lax.select_n(_along(which, c[0], full=True), *c), *cases))
         operands = [_apart(value) for value in operands]
-        depends = [_dependence(branch.jaxpr, _which(operands)) for branch in branches]
+        depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
         one = _Packed(eqn.outvars, [any(d) for d in zip(*depends, strict=True)], self.trials)
         choices = [lambda branch=branch: one.pack(self.evaluate(branch, operands)) for branch in branches]
         return one.unpack(lax.switch(plain(index), choices))
@@ -303,14 +291,27 @@ def _along(on: Array, value: Array, full: bool = False) -> Array:
     return jnp.broadcast_to(shaped, value.shape) if full else shaped
 
 
-def _place(eqn: Any) -> str:
+def place(eqn: Any) -> str:
     """Where in the user's files an equation stands, as far as JAX knows."""
     trace = eqn.source_info.traceback
     frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
     return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""
 
 
-def _dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:
+def settle(jaxpr: core.Jaxpr, before: list[bool], carried: list[bool], after: list[bool]) -> list[bool]:
+    """Which carries of a loop depend on the trial: those that start so, and those that its body makes so.
+
+    before, after: the same for what stands before and after the carries among the body's inputs.
+    """
+    while True:
+        outputs = dependence(jaxpr, [*before, *carried, *after])
+        wider = [a or b for a, b in zip(carried, outputs, strict=False)]
+        if wider == carried:
+            return carried
+        carried = wider
+
+
+def dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:
     """Which outputs of a trace depend on the trial, given which inputs do: on any operand that does."""
     known = dict(zip(jaxpr.invars, inputs, strict=True))
 
@@ -321,7 +322,7 @@ def _dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:
         depends = [read(atom) for atom in eqn.invars]
         inner = eqn.params.get("jaxpr") if eqn.primitive.name in _CALLS else None
         if inner is not None and any(depends):
-            results = _dependence(getattr(inner, "jaxpr", inner), depends)
+            results = dependence(getattr(inner, "jaxpr", inner), depends)
         else:
             results = [any(depends)] * len(eqn.outvars)
         known.update(zip(eqn.outvars, results, strict=True))

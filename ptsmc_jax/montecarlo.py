@@ -19,6 +19,7 @@ from ptsmc_jax.sensors import Sensors
 FEW = 64  # trials; fewer are flown at once, by a program for their number
 CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
+ABREAST = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
 
 
 @dataclass(frozen=True)
@@ -103,17 +104,20 @@ def run(
     dispersion: Dispersion,
     seed: int,
     trials: np.ndarray,
-    block: int = BLOCK,
+    block: int | None = None,
     own: OwnMetrics | None = None,
+    kernel: bool = False,
 ) -> Trials:
     """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
 
     block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
-    any number of trials from `FEW` on. own: see `one`.
+    any number of trials from `FEW` on. own: see `one`. kernel: whole runs in one kernel, see `kernel`; on a processor
+    it is interpreted, slowly.
     """
     trials = np.asarray(trials, dtype=np.uint32)
     devices = len(jax.local_devices())
-    block = block if trials.size >= FEW else -(-trials.size // devices)
+    usual = BLOCK if jax.default_backend() == "cpu" else ABREAST
+    block = -(-trials.size // devices) if trials.size < FEW else usual if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if trials.size >= FEW else 1
     calls = []
     for k in range(0, trials.size, devices * rows * block):
@@ -123,7 +127,8 @@ def run(
         padded[:, :share] = np.resize(part, (devices, share))
         needed = jnp.int32(-(-share // block))
         shape = (devices, rows, block)
-        found = _fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices, own)
+        fly = _fly if not kernel else _fly_in_kernel
+        found = fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices, own)
         calls.append(jax.tree.map(lambda v, share=share, n=part.size: _joined(np.asarray(v), share)[:n], found))
     return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
@@ -155,6 +160,30 @@ def _fly(
             return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, fly, empty))
+
+    return spread(mine, trials, devices)
+
+
+@partial(jax.jit, static_argnames=("devices", "own"))
+def _fly_in_kernel(
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: jax.Array,
+    trials: jax.Array,
+    needed: jax.Array,
+    devices: int,
+    own: OwnMetrics | None,
+) -> Flown:
+    """The same in one kernel a device, all rows of it."""
+    from ptsmc_jax import kernel  # which nothing else needs
+
+    del needed
+
+    def mine(trials: jax.Array) -> Flown:
+        flown = kernel.vmap(
+            lambda trial: one(parts, dispersion, seed, trial, own=own), interpret=jax.default_backend() == "cpu"
+        )
+        return jax.tree.map(lambda v: v.reshape(trials.shape), flown(trials.reshape(-1)))
 
     return spread(mine, trials, devices)
 

@@ -44,7 +44,7 @@ def command(tmp_path, monkeypatch, capsys):
     from tuning import cli
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
     (tmp_path / "s.toml").write_text(SHORT)
 
     def run(*args):

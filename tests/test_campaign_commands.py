@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import numpy as np
 import polars as pl
 import pytest
@@ -331,3 +332,39 @@ def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
     assert ("initial_x3" if plant == "chain" else "disturbance_phase_3") in frame.columns
     code, said, _ = command("replay", "out/montecarlo-o", "--trial", 66, "--no-figures")
     assert code == 0, said
+
+
+def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(command, tmp_path, monkeypatch):
+    """Where 32 bits are asked for, they are set; tests set them by hand, since JAX is set up already."""
+    asked = []
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **told: asked.append(told))
+    run = ("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet")
+    assert command(*run, "--out", "whole")[0] == 0
+    with jax.enable_x64(False):
+        assert command(*run, "--out", "half", "--precision", 32)[0] == 0
+        code, _, error = command("replay", "half", "--trial", 7, "--no-figures")
+    assert (code, error) == (0, "")
+    assert asked == [{"device": "cpu", "bits": bits} for bits in (64, 32, 32)]
+    whole, half = (pl.read_parquet(tmp_path / name / "trials") for name in ("whole", "half"))
+    assert half["window_error"].dtype == pl.Float32
+    np.testing.assert_array_equal(half["status"], whole["status"])
+    np.testing.assert_allclose(half["peak_torque"], whole["peak_torque"], rtol=1e-3)
+    np.testing.assert_allclose(half["window_error"], whole["window_error"], atol=1e-5)
+    code, _, error = command(*run, "--out", "half")
+    assert code == 2
+    assert "holds a run with precision 32, not 64" in error
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--device", "tpu"], "--device is tpu, but must be cpu or gpu"),
+        (["--precision", "16"], "--precision is 16, but must be 64 or 32"),
+        (["--precision", "32", "--cluster", "local:2"], "--cluster flies on its workers' processors with 64 bits"),
+    ],
+)
+def test_devices_and_precisions_that_there_are_none_of_are_refused(command, tmp_path, options, said):
+    code, _, error = command("montecarlo", "s.toml", "--trials", 10, *options)
+    assert code == 2
+    assert error.startswith(f"ptsmc: {said}")
+    assert not (tmp_path / "out").exists()

@@ -413,7 +413,7 @@ def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
         raise ValueError("ours")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)
     monkeypatch.setattr(runs, "fly", broken)
     monkeypatch.setattr(sys, "argv", ["ptsmc", "simulate"])
     with pytest.raises(ValueError, match="ours"):

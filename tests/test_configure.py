@@ -1,10 +1,15 @@
 """Compiler options are tried out before they are used; what is refused is left out with a warning."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 
 import pytest
 
 from ptsmc_jax import configure as setup
+from tests.helpers import ROOT
 
 GOOD = setup._OPTIONS
 
@@ -64,3 +69,23 @@ def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones():
 def test_the_trial_run_refuses_other_numbers(monkeypatch):
     monkeypatch.setattr(setup, "_TRIAL", setup._TRIAL.replace("x, 100))(jnp", "1.000001 * x, 100))(jnp"))
     assert not setup._tried(())
+
+
+@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
+    """In a process of its own, as a user's first call."""
+    call = [sys.executable, "-c", "from tuning.cli import main; main()", "montecarlo", "--device", "gpu"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": ""}
+    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "ptsmc: --device is gpu, but JAX finds no GPU here; allowed is cpu, or install jax[cuda12]\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bits_and_device_are_set():
+    code = (
+        "from ptsmc_jax.configure import configure; configure(device='cpu', bits=32); "
+        "import jax; print(jax.numpy.zeros(1).dtype, jax.config.jax_platforms)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "float32 cpu\n"

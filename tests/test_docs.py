@@ -123,7 +123,7 @@ def test_names_in_the_text_exist(path):
 @pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "python")], ids=lambda path: path.name)
 def test_code_in_the_text_runs(path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
     space = {}
     for block in blocks(path, "python"):
         exec(compile(block, str(path), "exec"), space)

@@ -28,6 +28,7 @@ FLOORS = {
         rollout
         components
         lanes
+        kernel
         theory linear
         requirements
         dispersions

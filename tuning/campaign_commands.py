@@ -1,5 +1,6 @@
 """The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,7 @@ from cyclopts import Parameter
 from tuning import show, show_campaign
 from tuning.options import (
     INTERRUPTED,
+    Device,
     Figures,
     Force,
     Out,
@@ -50,6 +52,10 @@ def montecarlo(
     tls_ca: Certificate = None,
     tls_cert: Certificate = None,
     tls_key: Certificate = None,
+    device: Device = "cpu",
+    precision: Annotated[
+        str, Parameter(help="Bits of every number, 64 or 32; what 32 put out of reach stands in docs/python.md.")
+    ] = "64",
     dry_run: Annotated[
         bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
     ] = False,
@@ -75,12 +81,17 @@ def montecarlo(
         raise UsageError("--until-confident looks at all rows, and does not go with --shard or --dry-run")
     if cluster is not None and (share != (1, 1) or dry_run):
         raise UsageError("--cluster does not go with --shard or --dry-run")
-    loaded, path = prepare(scenario, "montecarlo", out)
+    if precision not in ("64", "32"):
+        raise UsageError(f"--precision is {precision}, but must be 64 or 32")
+    bits = 32 if precision == "32" else 64
+    if (bits, device) != (64, "cpu") and cluster is not None:
+        raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
+    loaded, path = prepare(scenario, "montecarlo", out, device, bits)
     if width is not None and not loaded.requirements:
         raise UsageError("--until-confident needs [requirements] in the scenario, whose shares it looks at")
     from tuning import campaign_folder
 
-    folder = campaign_folder.Folder(path, loaded, key, count, metrics)
+    folder = campaign_folder.Folder(path, loaded, key, count, metrics, bits)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
     if cluster is not None:
         from ptsmc_jax import cluster as clusters
@@ -121,9 +132,7 @@ def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figur
     Exit status: 0 every requirement met (without any: no trial failed), 1 not so or not all trials flown yet, 2 bad
     input, among it rows that are damaged.
     """
-    from ptsmc_jax.configure import configure
-
-    configure()
+    _configured(folder)
     from tuning import campaign_folder
 
     return _summarised(campaign_folder.opened(folder), quiet, figures)
@@ -142,9 +151,7 @@ def worst(
     Exit status: 0 done, 2 bad input.
     """
     count = whole("--n", n, 1, 10_000)
-    from ptsmc_jax.configure import configure
-
-    configure()
+    _configured(folder)
     from ptsmc_jax import store
     from tuning import campaign_folder, campaign_summary
 
@@ -170,9 +177,7 @@ def replay(
     Exit status: 0 the run equals its row to 1e-12 (or has none yet), 1 it does not, 2 bad input.
     """
     number = whole("--trial", trial)
-    from ptsmc_jax.configure import configure
-
-    configure()
+    _configured(folder)
     from ptsmc_jax import store
     from tuning import campaign_folder, campaign_summary, single
 
@@ -187,6 +192,17 @@ def replay(
         show.run(single.summary(found.run), opened.scenario.plant.kind, place)
         show_campaign.replayed(found.off, found.rounding)
     return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
+
+
+def _configured(folder: Path) -> None:
+    """Set JAX up with as many bits as the campaign was flown with."""
+    from ptsmc_jax.configure import configure
+
+    try:
+        bits = json.loads((folder / "versions.json").read_text(encoding="utf-8"))["precision"]
+    except (OSError, ValueError, KeyError, TypeError):  # no campaign, which is refused later
+        bits = 64
+    configure(device="cpu", bits=32 if bits == 32 else 64)
 
 
 def _summarised(folder, quiet: bool, figures: bool) -> int:

@@ -29,13 +29,14 @@ class Folder:
     seed: int
     trials: int  # that it is to have
     own: str | None = None  # where the function stands that makes metrics of one's own
+    bits: int = 64  # of every number
 
     @cached_property
     def told(self) -> dict[str, Any]:
         """By what a campaign is known again."""
         more = {} if self.own is None else {"metrics": self.own, **systems.source(self.own, "metrics_sha256")}
         system = systems.source(getattr(self.scenario.plant, "system", None))
-        return {"command": "montecarlo", "seed": self.seed, **more, **system}
+        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **system}
 
     @cached_property
     def rows(self) -> Rows:
@@ -123,7 +124,8 @@ def opened(path: Path) -> Folder:
             raise RefusedError(
                 f"{path} holds results of `ptsmc {told['command']}`, but must be one of `ptsmc montecarlo`"
             )
-        return Folder(path, scenario.read(path / "scenario.toml"), told["seed"], told["trials"], told.get("metrics"))
+        flown = scenario.read(path / "scenario.toml")
+        return Folder(path, flown, told["seed"], told["trials"], told.get("metrics"), told["precision"])
     except (OSError, ValueError, KeyError) as error:
         if isinstance(error, RefusedError):
             raise

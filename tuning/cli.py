@@ -9,7 +9,19 @@ from cyclopts import App, CycloptsError, Parameter
 
 import ptsmc_jax
 from tuning import campaign_commands, show, writing_commands
-from tuning.options import INTERRUPTED, Figures, Force, Out, Quiet, ScenarioFile, Seed, UsageError, prepare, whole
+from tuning.options import (
+    INTERRUPTED,
+    Device,
+    Figures,
+    Force,
+    Out,
+    Quiet,
+    ScenarioFile,
+    Seed,
+    UsageError,
+    prepare,
+    whole,
+)
 
 if TYPE_CHECKING:
     from ptsmc_jax.tables import Scenario
@@ -92,6 +104,7 @@ def map_(
     trials: Annotated[str, Parameter(help="Trials of each pair, a whole number from 1 to 1000000.")] = "32",
     out: Out = None,
     seed: Seed = "0",
+    device: Device = "cpu",
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -101,7 +114,7 @@ def map_(
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
     key, count = whole("--seed", seed), whole("--trials", trials, 1, 1_000_000)
-    loaded, folder = prepare(scenario, "map", out)
+    loaded, folder = prepare(scenario, "map", out, device)
     from ptsmc_jax import store
 
     store.check(folder, force)
@@ -131,6 +144,7 @@ def tune(
     global_check: Annotated[
         bool, Parameter(negative="", help="Compare with differential evolution, and report the distance.")
     ] = False,
+    device: Device = "cpu",
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -143,7 +157,7 @@ def tune(
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
     """
     key = whole("--seed", seed)
-    loaded, folder = prepare(scenario, "tune", out)
+    loaded, folder = prepare(scenario, "tune", out, device)
     from tuning import report, results
 
     loaded = _with_tune(loaded)
@@ -166,6 +180,7 @@ def pareto(
     points: Annotated[str, Parameter(help="Limits on the torque to tune for, a whole number from 3 to 100.")] = "20",
     out: Out = None,
     seed: Seed = "0",
+    device: Device = "cpu",
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -178,7 +193,7 @@ def pareto(
     interrupted.
     """
     key, count = whole("--seed", seed), whole("--points", points, 3, 100)
-    loaded, folder = prepare(scenario, "pareto", out)
+    loaded, folder = prepare(scenario, "pareto", out, device)
     from tuning import pareto as fronts
 
     loaded = _with_tune(loaded)
@@ -200,6 +215,7 @@ def compare(
     *,
     out: Out = None,
     seed: Seed = "0",
+    device: Device = "cpu",
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -213,7 +229,7 @@ def compare(
     interrupted.
     """
     key = whole("--seed", seed)
-    loaded, folder = prepare(scenario, "compare", out)
+    loaded, folder = prepare(scenario, "compare", out, device)
     from tuning import compare as comparing
 
     comparing.check(loaded)

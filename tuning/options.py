@@ -1,7 +1,7 @@
 """What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -16,6 +16,8 @@ Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
+
+Device = Annotated[str, Parameter(help="What it is flown on: cpu or gpu.")]
 
 INTERRUPTED = 130  # exit status
 
@@ -42,14 +44,21 @@ def between(option: str, value: str, least: float, most: float) -> float:
     return found
 
 
-def prepare(scenario: Path | None, command: str, out: Path | None) -> "tuple[Scenario, Path]":
+def prepare(
+    scenario: Path | None, command: str, out: Path | None, device: str = "cpu", bits: Literal[32, 64] = 64
+) -> "tuple[Scenario, Path]":
     """The checked scenario and the folder for the results; the backend is configured on the way."""
+    if device != "cpu" and device != "gpu":
+        raise UsageError(f"--device is {device}, but must be cpu or gpu")
     from ptsmc_jax import schema
 
     raw = schema.load(scenario) if scenario is not None else {}
-    from ptsmc_jax.configure import configure
+    from ptsmc_jax.configure import NoDeviceError, configure
 
-    configure()
+    try:
+        configure(device=device, bits=bits)
+    except NoDeviceError as error:
+        raise UsageError(f"--device is {device}, but {error}") from None
     from ptsmc_jax.scenario import from_tables
 
     name = scenario.stem if scenario is not None else "default"
