@@ -195,3 +195,25 @@ def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, 
         # 15 %: the notes' figures come from 64 trials
         np.testing.assert_allclose(np.sqrt(np.mean(trials.metrics.window_error**2)), rms, rtol=0.15)
         np.testing.assert_allclose(np.mean(trials.metrics.peak_torque), peak, rtol=0.15)
+
+
+def test_single_precision_keeps_what_its_documentation_says():
+    """docs/python.md: statuses the same, pooled errors to three digits, torques to 1e-3, no error below 1e-7."""
+    flight = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, controller__delta=0.5)
+    away = scenario.replace(
+        flight, hardware=None, reference={"quat_xyzw": [0.5, 0.5, 0.5, 0.5]}, controller__error="multiplicative"
+    )
+    for one, floor in ((flight, 0.0), (away, 1e-7)):
+        found = []
+        for bits in (64, 32):
+            with jax.enable_x64(bits == 64):
+                ready = scenario.study(one)
+                found.append(montecarlo.run(ready.parts, ready.dispersion, 3, np.arange(256)))
+        double, single = found
+        assert single.metrics.window_error.dtype == np.float32
+        np.testing.assert_array_equal(single.status, double.status)
+        rms = [np.sqrt(np.mean(np.square(t.metrics.window_error, dtype=float))) for t in found]
+        assert abs(rms[1] / rms[0] - 1.0) < 1e-3 + floor / rms[0]
+        np.testing.assert_allclose(single.metrics.peak_torque, double.metrics.peak_torque, rtol=1e-3)
+        off = np.abs(single.metrics.terminal_error - double.metrics.terminal_error).max()
+        assert off > 6e-8 if floor else off < 1e-7
