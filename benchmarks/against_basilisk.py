@@ -1,6 +1,8 @@
 """Many slews of one spacecraft with Basilisk's C++ modules, and with the library, on the same cores.
 
-    benchmarks/.venv/bin/python benchmarks/against_basilisk.py [RUNS]
+    python3.11 -m venv benchmarks/.venv-basilisk  # its versions of others are not those that the tests use
+    benchmarks/.venv-basilisk/bin/python -m pip install --editable . bsk==2.12.1
+    benchmarks/.venv-basilisk/bin/python benchmarks/against_basilisk.py [RUNS]
 
 Both fly the first flight's body from attitudes 20 to 140 degrees away to rest, 900 control periods of 0.05 s, one RK4
 step each, torque held over the period. Basilisk: MRP feedback on the true state, one run after the other in a process

@@ -30,6 +30,8 @@ def grow(what: str, sizes: list[int], flights: dict) -> None:
             before = list(flights)[k - 1]
             exponent = f"exponent {np.log(seconds[name] / seconds[before]) / np.log(size / sizes[k - 1]):.3f}"
         say(f"  {size:7d}  {seconds[name]:8.3f} s  {exponent}")
+    whole = np.log(seconds[list(flights)[-1]] / seconds[next(iter(flights))]) / np.log(sizes[-1] / sizes[0])
+    say(f"  from the first to the last: exponent {whole:.3f}")
 
 
 def flight(ready, trials: int):
@@ -40,9 +42,9 @@ def flight(ready, trials: int):
 if __name__ == "__main__":
     say(machine())
     noisy = study(True)
-    trials = [1024, 4096, 16384, 65536]
+    trials = [4096, 16384, 65536, 262144]
     grow("trials, first flight with noise", trials, {str(n): flight(noisy, n) for n in trials})
-    periods = [1000, 4000, 16000]
+    periods = [4000, 16000, 64000]
     longer = {n: study(True, loop__period=45.0 / n) for n in periods}
     grow("periods, 4 096 trials", periods, {str(n): flight(longer[n], 4096) for n in periods})
     orders = [2, 3, 4, 5]

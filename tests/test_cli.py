@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -553,3 +554,25 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
         assert err.startswith("ptsmc: ")
         assert "Traceback" not in err
     assert not (tmp_path / "bad").exists()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_bash_completes_commands_and_options(command, tmp_path):
+    status, script, _ = command("completion", "bash")
+    assert status == 0
+    (tmp_path / "complete.sh").write_text(script)
+    asked = """
+source complete.sh
+for words in "mo" "tune --gl" "convert-attitude --mr" "replay --tr"; do
+  COMP_WORDS=(ptsmc $words); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMPREPLY=()
+  _ptsmc; echo "${COMPREPLY[@]}"
+done
+"""
+    done = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["montecarlo", "--global-check", "--mrp", "--trial"]
+    for shell in ("zsh", "fish", "powershell"):
+        assert "convert-attitude" in command("completion", shell)[1]
+    assert command("completion", "tcsh")[::2] == (
+        2,
+        "ptsmc: the shell is tcsh, but must be bash, zsh, fish or powershell\n",
+    )

@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ptsmc_jax import layouts, metrics
 from ptsmc_jax.scenario import from_tables
 from tests.helpers import ROOT
+from tests.test_schema import COMPLETE
 from tuning.cli import app
 
 DOCS = ROOT / "docs"
@@ -65,9 +66,21 @@ def test_the_references_name_everything():
         assert all(f"| `{metric}` | {unit} | " in metric_list for metric, (unit, _) in catalogue.items())
 
 
+def test_what_others_rely_on_is_documented():
+    """The commands and keys of the contract, written down by hand: see `tests.test_schema`."""
+    promised = """reproduce simulate map montecarlo summarize worst replay tune pareto compare report new
+        convert-attitude""".split()
+    assert set(promised) <= set(COMMANDS)
+    page = (DOCS / "scenarios.md").read_text()
+    for tables in COMPLETE:
+        for name, table in tables.items():
+            keys = table if isinstance(table, dict) and name != "requirements" else {}
+            assert f"### [{name}]" in page
+            assert all(f"`{key}`" in page or key == "kind" for key in keys), name
+
+
 def test_the_guide_names_every_command():
     guide = (DOCS / "guide.md").read_text()
-    assert len(COMMANDS) >= 14
     assert not [command for command in COMMANDS if not re.search(rf"`(ptsmc )?{command}\b|ptsmc {command}\b", guide)]
 
 
