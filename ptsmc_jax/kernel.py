@@ -71,7 +71,7 @@ class _Outside:
 
     def __init__(self, value: Array):
         self.value, self.shape, self.dtype = value, jnp.shape(value), jnp.asarray(value).dtype
-        self.where: tuple[str, int] | None = None  # table, and where it begins there
+        self.where = ("", 0)  # table, and where it begins there
 
 
 class _Program:
@@ -127,7 +127,7 @@ class _Program:
         """A table (length,) for each type, as long as a power of two."""
         made = []
         for name, length in self.layout.items():
-            parts = [jnp.ravel(value.value).astype(name) for value in self.outside if value.where[0] == name]  # type: ignore
+            parts = [jnp.ravel(value.value).astype(name) for value in self.outside if value.where[0] == name]
             filled = max(16, 1 << (length - 1).bit_length())
             made.append(jnp.pad(jnp.concatenate(parts), (0, filled - length)))
         return made
@@ -181,7 +181,6 @@ class _Inside:
         if isinstance(value, core.Literal):
             return _constant(value.val)
         if isinstance(value, _Outside):
-            assert value.where is not None
             return _Held(self.refs[value.where[0]], value.where[1], value)
         return value
 
@@ -233,7 +232,7 @@ class _Inside:
             return [*state, *(_stacked(part) for part in zip(*rows, strict=True))]
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
-        differs = lanes.settle(body.jaxpr, _varies(consts), _varies(state), [False] * len(xs))
+        differs = lanes.settle(body.jaxpr, _varies(consts), _varies(state), _varies(xs))
         shapes = [v.aval.shape for v in body.jaxpr.invars[constants : constants + carried]]
 
         def step(k: Any, packed: tuple) -> tuple:
