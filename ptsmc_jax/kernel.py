@@ -71,7 +71,7 @@ class _Outside:
 
     def __init__(self, value: Array):
         self.value, self.shape, self.dtype = value, jnp.shape(value), jnp.asarray(value).dtype
-        self.where = ("", 0)  # table, and where it begins there
+        self.where: tuple[str, int] = ("", 0)  # table, and where it begins there
 
 
 class _Program:
