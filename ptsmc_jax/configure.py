@@ -56,7 +56,7 @@ def configure(
     jax.config.update("jax_enable_x64", bits == 64)
     if device is not None:
         jax.config.update("jax_platforms", device)
-    jax.config.update("jax_num_cpu_devices", devices or len(os.sched_getaffinity(0)))
+    jax.config.update("jax_num_cpu_devices", devices or _cores())
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -66,6 +66,11 @@ def configure(
             jax.devices()  # starts the backend
         except RuntimeError:
             raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _flags(options: tuple[str, ...]) -> str:

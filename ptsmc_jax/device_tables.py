@@ -18,7 +18,7 @@ class Actuators(Table, frozen=True):
     """Between the command and the plant; each device is off where it is absent.
 
     Attributes:
-        torque_limit: largest torque per body axis, or of each input [N m]
+        torque_limit: largest torque per body axis [N m]
         torque_rate_limit: largest rate of the torque [N m/s]
         torque_lag: time constant of a first-order lag [s]
         torque_step: quantisation of the torque [N m]
@@ -38,7 +38,7 @@ class Hardware(Actuators, frozen=True):
     Attributes:
         attitude_noise: of the star tracker, 1 sigma per axis and sample, a small rotation [rad]
         rate_noise: of the gyro, 1 sigma per axis and sample [rad/s]
-        rate_noise_density: the same as a density, sqrt(period) times as large [rad/s/sqrt(Hz)]
+        rate_noise_density: instead of rate_noise, which is then this / sqrt(period) [rad/s/sqrt(Hz)]
         rate_bias: of the gyro, 1 sigma per axis, constant over a run [rad/s]
         rate_bias_walk: random walk of that bias [rad/s/sqrt(s)]
         star_tracker_every: control periods between star tracker samples, with a filter
@@ -56,6 +56,9 @@ class StateHardware(Actuators, frozen=True):
     """Actuators and noise of the sampled loop; each device is off where it is absent.
 
     Attributes:
+        torque_limit: largest input [unit of u]
+        torque_rate_limit: largest rate of the input [unit of u/s]
+        torque_step: quantisation of the input [unit of u]
         state_noise: 1 sigma per sample, one number for each state
     """
 
@@ -94,10 +97,10 @@ class WheelLimits(Table, frozen=True):
 
 
 class PyramidWheels(WheelLimits, frozen=True):
-    """Four reaction wheels about the z axis, 90 degrees apart, raised toward it; sampled loop only.
+    """Four reaction wheels, 90 degrees apart about z; lag, step and rate limit of [hardware] are theirs.
 
     Attributes:
-        cant_deg: angle above the x-y plane; by default equally strong about all axes [deg]
+        cant_deg: by which their axes are tilted toward +z; by default equally strong about all axes [deg]
     """
 
     kind: Literal["pyramid"] = "pyramid"
@@ -105,7 +108,7 @@ class PyramidWheels(WheelLimits, frozen=True):
 
 
 class AxesWheels(WheelLimits, frozen=True):
-    """Any number of reaction wheels, by their axes; sampled loop only.
+    """Any number of reaction wheels; lag, step and rate limit of [hardware] are theirs.
 
     Attributes:
         axes: spin axes in body axes, three numbers each, of any length

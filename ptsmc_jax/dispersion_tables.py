@@ -14,7 +14,7 @@ class UniformAttitude(Table, frozen=True):
 
 
 class AxisAngle(Table, frozen=True):
-    """Turned about an axis uniform on the sphere, by a uniform angle; initial: away from the reference at t = 0.
+    """A uniform angle about any axis: a body's from the reference at t = 0, a reference's from its own attitude.
 
     Attributes:
         min_deg: smallest angle [deg]
@@ -79,7 +79,7 @@ class UniformPhase(Table, frozen=True):
 
 
 class RelativeNormal(Table, frozen=True):
-    """Off by a normal share, truncated at three sigma.
+    """Times 1 + a normal number, truncated at three sigma.
 
     Attributes:
         std: 1 sigma of the share
@@ -90,7 +90,7 @@ class RelativeNormal(Table, frozen=True):
 
 
 class RelativeUniform(Table, frozen=True):
-    """Off by a uniform share.
+    """Times 1 + a uniform number.
 
     Attributes:
         half_width: largest share
@@ -104,7 +104,7 @@ class NormalBias(Table, frozen=True):
     """Normal about what [disturbance] says.
 
     Attributes:
-        std: 1 sigma of each component [N m]
+        std: 1 sigma of each component [N m, or unit of d]
     """
 
     kind: Literal["normal"] = "normal"
@@ -115,7 +115,7 @@ class UniformBias(Table, frozen=True):
     """Uniform about what [disturbance] says.
 
     Attributes:
-        half_width: largest deviation of each component [N m]
+        half_width: largest deviation of each component [N m, or unit of d]
     """
 
     kind: Literal["uniform"] = "uniform"
@@ -150,10 +150,10 @@ class Dispersion(Table, frozen=True):
     Attributes:
         attitude: of the body at t = 0
         rate: of the body at t = 0
-        inertia: of the true body; the law knows that of [spacecraft] only
+        inertia: of the true body, about true_inertia; the law keeps spacecraft.inertia
         reference: the whole reference turned
         disturbance_phase: of every sinusoid, and of the orbit
-        disturbance_amplitude: of each sinusoid and constant, a factor each
+        disturbance_amplitude: of each sinusoid and constant, an independent factor on each component
         disturbance_bias: a constant torque, added
         attitude_noise: factor on hardware.attitude_noise
         rate_noise: factor on hardware.rate_noise
@@ -178,7 +178,7 @@ class StateDispersion(Table, frozen=True):
     Attributes:
         x0: initial state
         disturbance_phase: of every sinusoid
-        disturbance_amplitude: of each sinusoid and constant, a factor each
+        disturbance_amplitude: of each sinusoid and constant, an independent factor on each component
         disturbance_bias: a constant, added
         state_noise: factor on hardware.state_noise
         torque_limit: factor on hardware.torque_limit

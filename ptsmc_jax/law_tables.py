@@ -17,12 +17,12 @@ class Controller(Table, frozen=True):
     Attributes:
         error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
         t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta
+        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
         delta: hand-over to constant gains so long before t_f (Remark 1) [s]
         k1: K1, rate of s from the hand-over on, halved by (60) [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, for no observer [N m]
+        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
@@ -44,7 +44,7 @@ class Baseline(Table, frozen=True):
     Attributes:
         t_f: when the law is judged [s]
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, for no observer [N m]
+        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
@@ -116,12 +116,12 @@ class SystemController(Table, frozen=True):
 
     Attributes:
         t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta
+        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
         delta: hand-over to constant gains so long before t_f (Remark 1) [s]
         k1: K1, rate of s from the hand-over on [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [unit of d/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, for no observer [unit of d]
+        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [unit of d]
         initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
     """
 
@@ -140,11 +140,11 @@ class ChainController(SystemController, frozen=True):
     """The paper's law (52) for an integrator chain; without an observer (36) to (40).
 
     Attributes:
-        eta: power of the approach, greater than the order (Theorems 1 and 3); default: order + 1
+        eta: power of the approach; default: order + 1
         a: a_1 to a_(order-1) of the surface (39), stable; default: all poles at -1
     """
 
-    eta: Positive = 3.0
+    eta: Annotated[float, Meta(gt=0, description="a number greater than the order (Theorems 1 and 3)")] = 3.0
     a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
         1.0,
     )
@@ -182,9 +182,9 @@ class Prescribed(Table, frozen=True):
     """What a prescribed-time observer has besides its gain.
 
     Attributes:
-        mu: power of its approach: its error falls like (t_o - t)^mu
+        mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
         t_o: time by which it has converged; default: a third of t_f [s]
-        delta_o: its gains stay constant from so long before t_o; default: 0.05, or a period if that is longer [s]
+        delta_o: mu/(t_o - t) is off from so long before t_o; default: 0.05, or a period, at most t_o/4 [s]
     """
 
     mu: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
@@ -196,7 +196,7 @@ class PrescribedTimeObserver(Prescribed, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
-        gain: diagonal of l(w) from t_o on [N m s]
+        gain: diagonal of the constant part of l [N m s]
     """
 
     kind: Literal["prescribed_time"] = "prescribed_time"
@@ -207,7 +207,7 @@ class EachPrescribedTimeObserver(Prescribed, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
-        gain: from t_o on, one number for each input; default: 10 each [1/s]
+        gain: constant part, one number for each input; default: 10 each [1/s]
     """
 
     kind: Literal["prescribed_time"] = "prescribed_time"

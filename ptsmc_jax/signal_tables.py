@@ -27,7 +27,7 @@ class Attitude(Table, frozen=True):
         mrp: modified Rodrigues parameters
         dcm_body_to_inertial: rotation matrix, by rows, that takes body components to inertial ones
         euler_deg: three angles of the axes in `sequence` [deg]
-        sequence: three axes in SciPy's notation, capitals for axes that turn along
+        sequence: three axes; capitals: intrinsic, about the body's; small letters: extrinsic
     """
 
     quat_xyzw: Four | None = None

@@ -46,8 +46,8 @@ class Loop(Table, frozen=True):
     Attributes:
         mode: the law inside the integrator, or computed and held once a period
         period: control period, sampled loop only [s]
-        clock: a sample at the hand-over (smooth gradients), or from t = 0 on; sampled loop only
-        t_end: end of the run; default: t_f + 10 [s]
+        clock: a sample at t_f - delta, for tuning, or at whole periods, as a flight computer has them
+        t_end: end of the run; default: t_f + 10, or + window if that is longer [s]
         window: time after t_f over which window_error is taken [s]
         settling_angle: angle to the reference that counts as settled; of other plants |x_1| [rad]
     """
@@ -87,7 +87,7 @@ class Tune(Table, frozen=True):
 
     Attributes:
         free: the gains to find; default: eta, delta and observer_gain, of the other laws theirs
-        bounds: a table of two numbers for each gain; default: by the law's conditions, the period and t_f
+        bounds: two numbers for each gain; by default what the law, the period and t_f allow: see scenario.toml of a run
         per_axis: observer_gain as one number for each axis
         objective: minimised: RMS window error, the largest one, its CVaR, or t_f, the shortest for the requirements
         level: the CVaR is the RMS of the worst 1 - level of the trials; with "cvar" only, default: 0.9

@@ -26,7 +26,6 @@ from tuning.options import (
 MOST = 2**32  # trials: their numbers have 32 bits
 
 CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
-Certificate = Annotated[Path | None, Parameter(help="TLS certificate file of the cluster.")]
 
 
 def montecarlo(
@@ -49,9 +48,9 @@ def montecarlo(
     cluster: Annotated[
         str | None, Parameter(help="Fly on a Dask cluster: address or scheduler file; or local:N, N processes here.")
     ] = None,
-    tls_ca: Certificate = None,
-    tls_cert: Certificate = None,
-    tls_key: Certificate = None,
+    tls_ca: Annotated[Path | None, Parameter(help="TLS: certificate authority's file.")] = None,
+    tls_cert: Annotated[Path | None, Parameter(help="TLS: this client's certificate.")] = None,
+    tls_key: Annotated[Path | None, Parameter(help="TLS: this client's private key.")] = None,
     device: Device = "cpu",
     precision: Annotated[
         str, Parameter(help="Bits of every number, 64 or 32; what 32 put out of reach stands in docs/python.md.")
@@ -67,8 +66,8 @@ def montecarlo(
 
     Interrupted or killed, the same command goes on from there; with more trials it adds to what is there.
 
-    Exit status: 0 done and every requirement met (without any: no trial failed), 1 done but not so, 2 bad input or a
-    full disk, 130 interrupted.
+    Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
+    input or a full disk, 130 interrupted.
     """
     count, key = whole("--trials", trials, 1, MOST), whole("--seed", seed)
     width = None if until_confident is None else between("--until-confident", until_confident, 0.0, 1.0)
@@ -129,8 +128,8 @@ def montecarlo(
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
     """Verdicts, quantiles with intervals and figures of a campaign, from its rows.
 
-    Exit status: 0 every requirement met (without any: no trial failed), 1 not so or not all trials flown yet, 2 bad
-    input, among it rows that are damaged.
+    Exit status: 0 every requirement met (without any: no trial failed or missed t_f), 1 not so or not all trials flown
+    yet, 2 bad input, among it rows that are damaged.
     """
     _configured(folder)
     from tuning import campaign_folder

@@ -16,6 +16,7 @@ from tuning.options import (
     Force,
     Out,
     Quiet,
+    SampledFile,
     ScenarioFile,
     Seed,
     UsageError,
@@ -45,7 +46,8 @@ def simulate(
     out: Out = None,
     seed: Seed = "0",
     trial: Annotated[
-        str | None, Parameter(help="Draw this trial's dispersions; without it the run is nominal.")
+        str | None,
+        Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
     ] = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -96,7 +98,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
 
 @app.command(name="map")
 def map_(
-    scenario: ScenarioFile = None,
+    scenario: SampledFile = None,
     /,
     *,
     x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
@@ -210,7 +212,7 @@ def pareto(
 
 @app.command
 def compare(
-    scenario: ScenarioFile = None,
+    scenario: SampledFile = None,
     /,
     *,
     out: Out = None,

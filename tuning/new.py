@@ -31,7 +31,7 @@ EXAMPLES: dict[str, Any] = {
     "hardware.delay": 1,
     "hardware.attitude_noise": 2e-5,
     "hardware.rate_noise": 1e-6,
-    "hardware.rate_noise_density": 1e-6,
+    "hardware.rate_noise_density": 2e-7,
     "hardware.rate_bias": 1e-6,
     "hardware.rate_bias_walk": 1e-8,
     "hardware.star_tracker_every": 4,

@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 ScenarioFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
 ]
-Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME.")]
+SampledFile = Annotated[
+    Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
+]
+Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
 Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
