@@ -12,7 +12,7 @@ import pytest
 
 from ptsmc_jax import metrics, montecarlo, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
-from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
+from tests.helpers import PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
 from tests.pages import checked
 from tests.test_scenario import check_sentence
 from tuning import cli, single
@@ -149,14 +149,6 @@ def test_help_and_version_do_not_load_jax():
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 0, done.stderr
         assert done.stdout
-
-
-def test_the_readme_scenario_is_read(tmp_path):
-    text = (ROOT / "README.md").read_text()
-    block = next(part for part in text.split("```toml\n")[1:] if "[spacecraft]" in part).split("```")[0]
-    (tmp_path / "readme.toml").write_text(block)
-    scenario.read(tmp_path / "readme.toml")
-    scenario.read(FIRST_FLIGHT)
 
 
 @pytest.mark.parametrize(("text", "of_what", "allowed"), BAD_SCENARIOS, ids=[row[0] for row in BAD_SCENARIOS])
