@@ -189,7 +189,7 @@ def lacking(module, function, docs):
     annotations = [str(value) for key, value in function.__annotations__.items()]
     if not any(ARRAYS.search(annotation) for annotation in annotations):
         return
-    text = "\n".join(docs)
+    text = re.sub(r"^ *>>> .*(?:\n.+)*", "", "\n".join(docs), flags=re.M)  # an example is no statement
     if not UNIT.search(text):
         yield "units"
     if not SOURCE.search(text + (module.__doc__ or "")):
