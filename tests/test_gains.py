@@ -1,16 +1,17 @@
 """Gains by name: moved in parts as in the scenario, axis by axis, the time after t_f kept."""
 
 import tomllib
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, rollout, scenario, sensors
+from ptsmc_jax import montecarlo, pace, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
 from ptsmc_jax.schema import ScenarioError
-from tests.helpers import SHORT, finer, vector
+from tests.helpers import FIRST_FLIGHT, SHORT, finer, vector
 from tuning import bounds, gains, report
 
 BASE = {
@@ -131,3 +132,17 @@ def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
             scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
     with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):
         scenario.replace(base, tune={"free": ["p"], "bounds": {"p": [1.05, 1.2]}})
+
+
+@pytest.mark.parametrize(
+    ("other", "where", "needed"), [({"delta": 1.0}, "after", "11 s"), ({"t_f": 40.0}, "before", "39.95 s")]
+)
+def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, needed):
+    """Its number of samples is fixed; without them the run would end before t_end, and nobody would know."""
+    ready = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None))
+    with pytest.raises(ValueError, match=rf"needs {needed} of samples {where} the hand-over, but the parts' clock has"):
+        gains.with_gains(ready.parts, other)
+    roomy = scenario.study(ready.scenario, reach=replace(pace.reach_of(ready.scenario), t_f=40.0, delta=1.0))
+    moved = gains.with_gains(roomy.parts, other)
+    law = moved.controller
+    assert float(moved.clock.ticks(law.t_f, law.delta).t_next[-1]) == pytest.approx(float(moved.t_end))

@@ -8,10 +8,13 @@ from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
+from jax import core
 from jaxtyping import Array
 
 from ptsmc_jax import law_tables, plant_tables
 from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.clock import Anchored
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.sensors import Sensors
 from ptsmc_jax.tables import Scenario
@@ -61,7 +64,11 @@ def named(scenario: Scenario) -> tuple[str, ...]:
 
 
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
-    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept."""
+    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
+
+    Raises ValueError where the parts' anchored clock has too few samples for them, as far as they are known: under a
+    transformation such a run ends before t_end.
+    """
     gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
     if "t_f" in gains:
         parts = parts.with_t_f(gains["t_f"])
@@ -74,7 +81,26 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         assert isinstance(parts.sensors, Sensors)
         sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
         parts = replace(parts, sensors=sensors)
+    _check_clock(parts)
     return parts
+
+
+def _check_clock(parts: Parts) -> None:
+    clock, law = parts.clock, parts.controller
+    if not isinstance(clock, Anchored):
+        return
+    times = [law.t_f, law.delta, parts.t_end, clock.period]
+    if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
+        return
+    t_f, delta, t_end, period = map(float, times)
+    hand_over = t_f - delta
+    for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
+        if needed > samples * period * (1.0 + 1e-9):
+            raise ValueError(
+                f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
+                f"the parts' clock has {samples * period:g}; make the parts for them, with ptsmc_jax.replace or with "
+                "the reach of scenario.study"
+            )
 
 
 def gains_of(parts: Parts) -> dict[str, float]:
