@@ -115,10 +115,7 @@ def _dispersion(struct: type[Table]) -> Iterator[str]:
         for kind, drawn in layouts.DISPERSIONS[key.name].items():
             given = [f'`kind = "{kind}"`']
             for k in keys.of(drawn):
-                said = [
-                    f"default {shown}" if (shown := _default(k.default)) else "",
-                    k.meaning + (f" [{k.unit}]" if k.unit else ""),
-                ]
+                said = [f"default {shown}" if (shown := _default(k.default)) else "", k.told]
                 given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
             rows.append([f"`{key.name}`", key.meaning, "; ".join(given), keys.about(drawn)])
     yield _grid("key what given how", rows)

@@ -167,11 +167,8 @@ def actuators(scenario: Scenario) -> hardware.Actuators | None:
         return None
     wheels = None
     if device is not None:
-        axes = (
-            hardware.pyramid(np.deg2rad(device.cant_deg))
-            if isinstance(device, device_tables.PyramidWheels)
-            else device.axes
-        )
+        raised = isinstance(device, device_tables.PyramidWheels)
+        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if raised else device.axes
         wheels = hardware.wheels(axes, device.momentum, device.torque_limit, device.momentum_limit)
     limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
     return hardware.Actuators(limit, rate_limit, lag, step, wheels, delay)

@@ -29,12 +29,12 @@ from ptsmc_jax.tables import Scenario
 def resolve(scenario: Scenario) -> Scenario:
     """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds."""
     loop, t_f = scenario.loop, scenario.controller.t_f
-    observer, disturbance = _each("observer", scenario.observer, scenario), scenario.disturbance
+    observer, disturbance = filled("observer", scenario.observer, scenario), scenario.disturbance
     if isinstance(disturbance, signal_tables.SumDisturbance):
-        each = tuple(_each("disturbance", term, scenario) for term in disturbance.terms)
+        each = tuple(filled("disturbance", term, scenario) for term in disturbance.terms)
         disturbance = msgspec.structs.replace(disturbance, terms=each)
     else:
-        disturbance = _each("disturbance", disturbance, scenario)
+        disturbance = filled("disturbance", disturbance, scenario)
     scenario = msgspec.structs.replace(scenario, observer=observer, disturbance=disturbance)
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
@@ -51,13 +51,9 @@ def resolve(scenario: Scenario) -> Scenario:
 def inputs(scenario: Scenario) -> int:
     """How many inputs the plant has."""
     plant = scenario.plant
-    return (
-        3
-        if isinstance(plant, plant_tables.SpacecraftPlant)
-        else len(plant.x0) // 2
-        if isinstance(plant, plant_tables.SystemPlant)
-        else 1
-    )
+    if isinstance(plant, plant_tables.SystemPlant):
+        return len(plant.x0) // 2
+    return 3 if isinstance(plant, plant_tables.SpacecraftPlant) else 1
 
 
 def initial_state(scenario: Scenario) -> tuple[float, ...]:
@@ -66,7 +62,7 @@ def initial_state(scenario: Scenario) -> tuple[float, ...]:
     return scenario.plant.x0
 
 
-def _each(name: str, table: Any, scenario: Scenario) -> Any:
+def filled(name: str, table: Any, scenario: Scenario) -> Any:
     """A table with its lists of one number for each input, where they are absent, filled in."""
     known = layouts.EACH.get((name, table.kind), {})
     if isinstance(table, FINITE_TIME):
@@ -213,11 +209,8 @@ def _check_devices(scenario: Scenario) -> None:
     assert table is None or isinstance(table, device_tables.Hardware)
     for k, term in enumerate(terms(scenario)):
         if isinstance(term, signal_tables.GravityGradient):
-            name = (
-                f"disturbance.terms[{k}]"
-                if isinstance(scenario.disturbance, signal_tables.SumDisturbance)
-                else "disturbance"
-            )
+            several = isinstance(scenario.disturbance, signal_tables.SumDisturbance)
+            name = f"disturbance.terms[{k}]" if several else "disturbance"
             schema.one_attitude(name, term)
             if attitude_keys.has_attitude(term):
                 attitude_keys.quaternion(term, name)

@@ -40,7 +40,7 @@ class UniformAttitude:
     count: ClassVar[int] = 4
 
     def at(self, c: Float[Array, "4"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
+        """Attitude [-] (4,) of the body or the reference; nominal: its own; reference: the reference's at t = 0."""
         del nominal, reference
         return attitude.normalise(c)
 
@@ -56,7 +56,7 @@ class AxisAngle:
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
+        """Attitude [-] (4,) of the body or the reference; nominal: its own; reference: the reference's at t = 0."""
         del nominal
         height, azimuth = 2.0 * c[0] - 1.0, 2.0 * np.pi * c[1]
         radius = jnp.sqrt(1.0 - height * height)
@@ -75,7 +75,7 @@ class NormalAttitude:
     count: ClassVar[int] = 3
 
     def at(self, c: Float[Array, "3"], nominal: Float[Array, "4"], reference: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Attitude [-] of the body or of the reference, (4,); nominal: its own; reference: that of it at t = 0."""
+        """Attitude [-] (4,) of the body or the reference; nominal: its own; reference: the reference's at t = 0."""
         del reference
         return attitude.multiply(nominal, attitude.from_rotation_vector(self.std * c))
 

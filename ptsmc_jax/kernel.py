@@ -29,7 +29,7 @@ from ptsmc_jax.components import Lane, object_array
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
 
-_CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint custom_jvp_call custom_vjp_call".split())
+_CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
 
 
 def vmap(function: Callable, *, block: int = BLOCK, interpret: bool = False) -> Callable:
@@ -95,8 +95,7 @@ class _Program:
             if all(isinstance(value, core.Literal | _Outside) for value in read):
                 plain = [value.val if isinstance(value, core.Literal) else value.value for value in read]
                 known |= zip(eqn.outvars, map(_Outside, components.bind(eqn, plain)), strict=True)
-            elif eqn.primitive.name in _CALLS:
-                inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
+            elif (inner := _called(eqn)) is not None:
                 inside: dict[Any, Any] = dict(zip(inner.jaxpr.constvars, map(_Outside, inner.consts), strict=True))
                 inside |= zip(inner.jaxpr.invars, read, strict=True)
                 self._walk(inner.jaxpr, inside)
@@ -203,8 +202,8 @@ class _Inside:
         if name == "scan":
             return self.scan(params, values)
         values = [_lane(value) for value in values]
-        if name in _CALLS:
-            return self.evaluate(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], values)
+        if (inner := _called(eqn)) is not None:
+            return self.evaluate(inner, values)
         if name == "cond":
             return self.branch(params["branches"], values)
         if name == "iota":
@@ -218,9 +217,8 @@ class _Inside:
     def scan(self, params: Any, values: list) -> list:
         """A loop, its steps written out if they are few."""
         body, constants, carried, length = params["jaxpr"], params["num_consts"], params["num_carry"], params["length"]
+        consts, state = ([_lane(v) for v in part] for part in (values[:constants], values[constants:][:carried]))
         xs = values[constants + carried :]
-        consts, state = map(_lane, values[:constants]), map(_lane, values[constants : constants + carried])
-        consts, state = list(consts), list(state)
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= components.LARGEST):
@@ -236,11 +234,10 @@ class _Inside:
         shapes = [v.aval.shape for v in body.jaxpr.invars[constants : constants + carried]]
 
         def step(k: Any, packed: tuple) -> tuple:
-            now = [Lane(shape, object_array(shape, parts)) for shape, parts in zip(shapes, packed, strict=True)]
-            return self.pack(self.evaluate(body, [*consts, *now, *(_row(x, k) for x in xs)]), differs)
+            rows = (_row(x, k) for x in xs)
+            return self.pack(self.evaluate(body, [*consts, *_unpacked(packed, shapes), *rows]), differs)
 
-        last = lax.fori_loop(np.int32(0), np.int32(length), step, self.pack(state, differs))
-        return [Lane(shape, object_array(shape, parts)) for shape, parts in zip(shapes, last, strict=True)]
+        return _unpacked(lax.fori_loop(np.int32(0), np.int32(length), step, self.pack(state, differs)), shapes)
 
     def branch(self, branches: Sequence, values: list) -> list:
         """A branch where all trials agree, else all of them and a choice for each trial."""
@@ -254,7 +251,7 @@ class _Inside:
         else:
             which = index if index.dtype == bool else jnp.clip(index, 0, len(branches) - 1)
             chosen = jax.tree.map(lambda *each: lax.select_n(which, *each), *(case() for case in cases))
-        return [Lane(shape, object_array(shape, parts)) for shape, parts in zip(shapes, chosen, strict=True)]
+        return _unpacked(chosen, shapes)
 
     def pack(self, values: Sequence, differs: Sequence[bool]) -> tuple:
         """Components as loops and branches carry them: numbers where all trials agree, vectors elsewhere."""
@@ -262,6 +259,15 @@ class _Inside:
             tuple(jnp.broadcast_to(part, (self.block,) if each else ()) for part in value.parts.flat)
             for value, each in zip(values, differs, strict=False)
         )
+
+
+def _unpacked(packed: Sequence, shapes: Sequence) -> list[Lane]:
+    """What `_Inside.pack` packed."""
+    return [Lane(shape, object_array(shape, parts)) for parts, shape in zip(packed, shapes, strict=True)]
+
+
+def _called(eqn: Any) -> Any:
+    return eqn.params["call_jaxpr"] if eqn.primitive.name in _CUSTOM else lanes.called(eqn)
 
 
 def _constant(value: Any) -> Lane:

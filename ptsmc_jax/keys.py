@@ -20,6 +20,11 @@ class Key(NamedTuple):
     allowed: str  # in words
     default: Any  # None: off, or said in `meaning`; NODEFAULT: needed
 
+    @property
+    def told(self) -> str:
+        """Meaning and unit."""
+        return self.meaning + (f" [{self.unit}]" if self.unit else "")
+
 
 def of(struct: type[Table]) -> list[Key]:
     """The keys of a table, `kind` apart, in the order of the struct; a base's docstring speaks for what it declares."""
@@ -30,7 +35,9 @@ def of(struct: type[Table]) -> list[Key]:
     found = []
     for field in msgspec.structs.fields(struct):
         if field.name != "kind":
-            meaning, unit = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name]).groups()  # type: ignore
+            parts = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name])
+            assert parts is not None
+            meaning, unit = parts.groups()
             made = field.default_factory
             default = field.default if made is msgspec.NODEFAULT else made()
             found.append(Key(field.name, meaning, unit or "", allowed(hints[field.name]), default))

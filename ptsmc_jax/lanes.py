@@ -127,9 +127,9 @@ class _Lanes:
 
     def apply(self, eqn: Any, values: list) -> Sequence:
         """One primitive with at least one lane among its operands."""
-        name, params = eqn.primitive.name, eqn.params
-        if name in _CALLS:
-            return self.evaluate(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], values)
+        name, inner = eqn.primitive.name, called(eqn)
+        if inner is not None:
+            return self.evaluate(inner, values)
         if name in _CONTROL:
             return _CONTROL[name](self, eqn, values)
         if components.covers(name):
@@ -291,6 +291,12 @@ def _along(on: Array, value: Array, full: bool = False) -> Array:
     return jnp.broadcast_to(shaped, value.shape) if full else shaped
 
 
+def called(eqn: Any) -> Any:
+    """The trace that a call stands for; None where an equation is no call."""
+    params = eqn.params
+    return params.get("jaxpr", params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
+
+
 def place(eqn: Any) -> str:
     """Where in the user's files an equation stands, as far as JAX knows."""
     trace = eqn.source_info.traceback
@@ -320,7 +326,7 @@ def dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:
 
     for eqn in jaxpr.eqns:
         depends = [read(atom) for atom in eqn.invars]
-        inner = eqn.params.get("jaxpr") if eqn.primitive.name in _CALLS else None
+        inner = called(eqn)
         if inner is not None and any(depends):
             results = dependence(getattr(inner, "jaxpr", inner), depends)
         else:

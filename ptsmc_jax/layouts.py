@@ -85,21 +85,10 @@ TABLES: dict[str, dict[str, type[values.Table] | Kinds]] = {  # by the kind of t
     },
 }
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
-_RELATIVE: Kinds = {
-    "relative_normal": dt.RelativeNormal,
-    "relative_uniform": dt.RelativeUniform,
-}
+_RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
 DISPERSIONS: dict[str, Kinds] = {
-    "attitude": {
-        "axis_angle": dt.AxisAngle,
-        "uniform": dt.UniformAttitude,
-        "normal": dt.NormalAttitude,
-    },
-    "reference": {
-        "normal": dt.NormalAttitude,
-        "uniform": dt.UniformAttitude,
-        "axis_angle": dt.AxisAngle,
-    },
+    "attitude": {"axis_angle": dt.AxisAngle, "uniform": dt.UniformAttitude, "normal": dt.NormalAttitude},
+    "reference": {"normal": dt.NormalAttitude, "uniform": dt.UniformAttitude, "axis_angle": dt.AxisAngle},
     "rate": {"normal": dt.NormalRate, "uniform": dt.UniformRate},
     "inertia": {"relative_normal": dt.RelativeInertia},
     "disturbance_phase": {"uniform": dt.UniformPhase},

@@ -127,8 +127,8 @@ def run(
         padded[:, :share] = np.resize(part, (devices, share))
         needed = jnp.int32(-(-share // block))
         shape = (devices, rows, block)
-        fly = _fly if not kernel else _fly_in_kernel
-        found = fly(parts, dispersion, jnp.uint32(seed), jnp.asarray(padded.reshape(shape)), needed, devices, own)
+        numbers = jnp.asarray(padded.reshape(shape))
+        found = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel)
         calls.append(jax.tree.map(lambda v, share=share, n=part.size: _joined(np.asarray(v), share)[:n], found))
     return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
@@ -139,7 +139,7 @@ def _joined(v: np.ndarray, share: int) -> np.ndarray:
     return flat.reshape(-1, *flat.shape[2:])
 
 
-@partial(jax.jit, static_argnames=("devices", "own"))
+@partial(jax.jit, static_argnames=("devices", "own", "kernel"))
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -148,44 +148,30 @@ def _fly(
     needed: jax.Array,
     devices: int,
     own: OwnMetrics | None,
+    kernel: bool,
 ) -> Flown:
-    """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
-    flown = lanes.vmap(lambda trial: one(parts, dispersion, seed, trial, own=own))
+    """Results of (devices, rows, block) trials; rows from `needed` on are left zero, a kernel flies them too."""
 
-    def mine(trials: jax.Array) -> Flown:
-        row, rows = trials[0], jax.eval_shape(flown, trials[0, 0])
+    def fly(trial: jax.Array) -> Flown:
+        return one(parts, dispersion, seed, trial, own=own)
+
+    def in_blocks(trials: jax.Array) -> Flown:
+        flown, row = lanes.vmap(fly), trials[0]
+        rows = jax.eval_shape(flown, trials[0, 0])
         empty = jax.tree.map(lambda v: jnp.zeros((row.shape[0], *v.shape), v.dtype), rows)
 
-        def fly(k: jax.Array, found: Flown) -> Flown:
+        def step(k: jax.Array, found: Flown) -> Flown:
             return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))
 
-        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, fly, empty))
+        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
 
-    return spread(mine, trials, devices)
+    def in_one_kernel(trials: jax.Array) -> Flown:
+        from ptsmc_jax.kernel import vmap  # which nothing else needs
 
-
-@partial(jax.jit, static_argnames=("devices", "own"))
-def _fly_in_kernel(
-    parts: Parts,
-    dispersion: Dispersion,
-    seed: jax.Array,
-    trials: jax.Array,
-    needed: jax.Array,
-    devices: int,
-    own: OwnMetrics | None,
-) -> Flown:
-    """The same in one kernel a device, all rows of it."""
-    from ptsmc_jax import kernel  # which nothing else needs
-
-    del needed
-
-    def mine(trials: jax.Array) -> Flown:
-        flown = kernel.vmap(
-            lambda trial: one(parts, dispersion, seed, trial, own=own), interpret=jax.default_backend() == "cpu"
-        )
+        flown = vmap(fly, interpret=jax.default_backend() == "cpu")
         return jax.tree.map(lambda v: v.reshape(trials.shape), flown(trials.reshape(-1)))
 
-    return spread(mine, trials, devices)
+    return spread(in_one_kernel if kernel else in_blocks, trials, devices)
 
 
 def blocks(fly: Callable, trials: Any, block: int = BLOCK) -> Any:

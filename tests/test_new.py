@@ -159,3 +159,13 @@ def test_the_command_refuses_and_leaves_nothing(command, tmp_path, options, said
     before = sorted(tmp_path.iterdir())
     assert command("new", *options) == (2, "", f"ptsmc: {said}\n")
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_is_off_has_the_values_it_would_get(tmp_path):
+    """Other kinds too: a finite-time observer's gain is 20 times a bound, and positive where that is zero."""
+    for bound, gain in ((0.0, 0.02), (2e-3, 0.04)):
+        lines = blocks(new.text(None, {"controller": {"disturbance_rate_bound": bound}}))["observer"]
+        (shown,) = (values(group)["gain"] for group in kinds(lines) if values(group)["kind"] == "finite_time")
+        assert shown == pytest.approx([gain] * 3)
+        given = {"controller": {"disturbance_rate_bound": bound}, "observer": {"kind": "finite_time"}}
+        assert schema.dump(from_tables(given))["observer"]["gain"] == shown

@@ -4,7 +4,10 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ptsmc_jax import free_gains, keys, layouts, metrics, scenario, schema
+import msgspec
+
+from ptsmc_jax import checks, free_gains, keys, layouts, metrics, scenario, schema
+from ptsmc_jax.law_tables import Prescribed
 from ptsmc_jax.signal_tables import Attitude
 from ptsmc_jax.tables import Scenario, Tune
 from ptsmc_jax.values import Table
@@ -23,7 +26,6 @@ EXAMPLES: dict[str, Any] = {
     "initial.euler_deg": [90.0, 0.0, 0.0],
     "initial.sequence": "ZYX",
     "disturbance.terms": [{"kind": "constant"}, {"kind": "sinusoid"}],
-    "observer.delta_o": 0.05,
     "hardware.torque_limit": 0.5,
     "hardware.torque_rate_limit": 5.0,
     "hardware.torque_lag": 0.1,
@@ -55,14 +57,10 @@ class _File:
     """The lines of one scenario file."""
 
     def __init__(self, said: Scenario, resolved: Scenario):
-        self.plant = resolved.plant.kind
+        self.resolved, self.plant = resolved, resolved.plant.kind
         self.live = schema.dump(said)
         self.values = schema.dump(resolved)
         self.values.setdefault("tune", schema.plain(free_gains.resolve(resolved, Tune())))
-        states = len(getattr(resolved.plant, "x0", ()))
-        inputs = 3 if self.plant == "spacecraft" else 1 if self.plant == "chain" else max(states // 2, 1)
-        self.sizes = {"for each state": states, "for each input": inputs}
-        self.bound, self.t_f = resolved.controller.disturbance_rate_bound, resolved.controller.t_f
 
     def lines(self) -> Iterator[str]:
         """All of them."""
@@ -83,6 +81,7 @@ class _File:
         yield f"{'#' if live is None else ''}[{name}]"
         if kind is not None:
             yield from _line(live is None, "kind", kind, keys.about(struct))
+        values = {**self.defaults(name, struct), **values}
         borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # which [initial] explains
         for key in keys.of(struct):
             off = live is None or key.name not in live
@@ -95,9 +94,11 @@ class _File:
             if other != kind:
                 yield ""
                 yield from _line(True, "kind", other, keys.about(alternative))
+                defaults = self.defaults(name, alternative)
                 for key in keys.of(alternative):
                     if key.name not in borrowed:
-                        yield from _line(True, key.name, self.example(name, other, key), _meaning(key))
+                        value = defaults[key.name] if key.name in defaults else self.example(name, other, key)
+                        yield from _line(True, key.name, value, _meaning(key))
 
     def dispersion(self) -> Iterator[str]:
         """A line for each kind of each thing drawn."""
@@ -125,20 +126,24 @@ class _File:
             unit, meaning = catalogue[name]
             yield from _line(live is None, name, limit, f"{meaning} [{unit}]")
 
+    def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
+        """What the keys of a table of this kind are where they are absent, as far as they are anything."""
+        table: Any = struct()
+        if name in ("observer", "disturbance"):
+            table = checks.filled(name, table, self.resolved)
+        if isinstance(table, Prescribed):
+            t_o, delta_o = checks.prescribed_times(self.resolved, table)
+            table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
+        return {key: value for key, value in schema.plain(table).items() if value not in ([], {})}
+
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
-        """A value for a key that has none here: its default, or what it might be."""
-        sizes = {**self.sizes, "for each wheel": 4 if kind == "pyramid" else 3}
-        size = next((count for words, count in sizes.items() if key.allowed.endswith(words)), 0)
-        each = layouts.EACH.get((table, str(kind)), {}).get(key.name)
+        """A value for a key that is off, or drawn: its default, or what it might be."""
         if key.default not in (None, ()):
             return key.default
-        if table == "observer" and kind == "finite_time":
-            return [20.0 * self.bound] * (size or 3)
-        if each is not None:
-            return [each] * size
-        late = {"loop.t_end": self.t_f + 10.0, "observer.t_o": self.t_f / 3.0}
-        value = {**EXAMPLES, **late}[f"{table}.{key.name}"]
-        return [value] * size if size else value
+        value = EXAMPLES[f"{table}.{key.name}"]
+        if key.allowed.endswith("for each state"):
+            return [value] * len(checks.initial_state(self.resolved))
+        return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
 
 
 def text(plant: str | None, raw: Mapping[str, Any]) -> str:
@@ -153,14 +158,14 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
     said = schema.parse(given, metrics.CATALOGUES)
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
-    # a system stands in a file that its user has yet to write
-    resolved = said if kind == "system" and not raw else scenario.from_tables(given)
+    # a system stands in a file that its user has yet to write: it cannot be checked
+    resolved = checks.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
     return "\n".join(_File(said, resolved).lines()) + "\n"
 
 
 def _meaning(key: keys.Key) -> str:
     choice = f"{key.allowed.replace(' or ', ' | ')}: " if key.allowed.startswith('"') and " or " in key.allowed else ""
-    return f"{choice}{key.meaning}" + (f" [{key.unit}]" if key.unit else "")
+    return choice + key.told
 
 
 def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
