@@ -3,7 +3,9 @@
     python benchmarks/accelerator.py [LARGEST]
 
 Prints trajectory-steps a second of the first flight, without noise and with it, all metrics, from 1e3 to LARGEST (1e6)
-trials. Needs a GPU that JAX finds (`pip install 'jax[cuda12]'`); without one it says so and ends.
+trials, and of the same with slopes along eta. The floor is what the device would do if a step were its arithmetic
+alone, at 40 % of the rate that a kernel of multiply-adds reaches here. Needs a GPU that JAX finds (`pip install
+'jax[cuda12]'`); without one it says so and ends.
 """
 
 import sys
@@ -15,37 +17,66 @@ try:
 except NoDeviceError as error:
     sys.exit(f"nothing to measure: {error}")
 
+from functools import partial
+
 import jax
+import jax.numpy as jnp
 import numpy as np
-from common import medians, say, steps, study
+from common import medians, peak_rate, row, say, step_operations, steps, study
 
-from ptsmc_jax import montecarlo
+from ptsmc_jax import kernel, lanes, montecarlo
+from tuning.gains import with_gains
+
+ATTAINABLE = 0.4  # of the rate of multiply-adds
 
 
-def rates(noise: bool, trials: int) -> dict[str, float]:
-    """Million trajectory-steps a second of scan and kernel."""
-    ready = study(noise)
-    numbers = np.arange(trials)
+def primal(ready, trials: int):
+    """What flies so many trials as campaigns do, by scan and by kernel."""
 
-    def flight(kernel: bool):
+    def flight(whole: bool):
+        block = min(trials, montecarlo.ABREAST)
         return lambda: (
-            montecarlo.run(
-                ready.parts, ready.dispersion, 0, numbers, block=min(trials, montecarlo.ABREAST), kernel=kernel
-            ).metrics
+            montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials), block=block, kernel=whole).metrics
         )
 
-    seconds = medians({"scan": flight(False), "kernel": flight(True)}, repeats=5)
-    return {name: trials * steps(ready.parts) / s / 1e6 for name, s in seconds.items()}
+    return {"scan": flight(False), "kernel": flight(True)}
+
+
+def slopes(ready, trials: int):
+    """Metrics and their slopes along eta, by scan and by kernel."""
+
+    def along(trial, eta):
+        parts = with_gains(ready.parts, {"eta": eta})
+        return montecarlo.one(parts, ready.dispersion, jnp.uint32(0), trial).metrics
+
+    def both(trial):
+        eta = ready.parts.controller.eta
+        return jax.jvp(partial(along, trial), (eta,), (jnp.ones_like(eta),))
+
+    numbers = jnp.arange(trials, dtype=jnp.uint32)
+    return {name: partial(jax.jit(way(both)), numbers) for name, way in (("scan", lanes.vmap), ("kernel", kernel.vmap))}
+
+
+def main(largest: int) -> None:
+    """Print the rates."""
+    device = jax.devices()[0].device_kind
+    say(f"{device}, jax {jax.__version__}")
+    for bits in (32, 64):
+        with jax.enable_x64(bits == 64):
+            peak = peak_rate()
+            say(f"{bits} bits: {peak / 1e12:.2f} T operations a second of multiply-adds")
+            for noise in (False, True):
+                ready = study(noise)
+                floor = ATTAINABLE * peak / step_operations(ready)
+                for what, fly in (("metrics", primal), ("slopes", slopes)):
+                    for trials in (n for n in (1_000, 10_000, 100_000, 1_000_000, 10_000_000) if n <= largest):
+                        seconds = medians(fly(ready, trials), repeats=5)
+                        rate = {name: trials * steps(ready.parts) / s for name, s in seconds.items()}
+                        told = f"{bits} bits, {what}, {'noise' if noise else 'quiet'}, {trials:,d} trials"
+                        if what == "metrics":
+                            told += f", kernel at {rate['kernel'] / floor:.0%} of the floor"
+                        row(f"{device}: {told}: scan, kernel", rate["scan"] / 1e6, rate["kernel"] / 1e6)
 
 
 if __name__ == "__main__":
-    largest = int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000
-    say(f"{jax.devices()[0].device_kind}, jax {jax.__version__}")
-    for bits in (32, 64):
-        with jax.enable_x64(bits == 64):
-            for noise in (False, True):
-                for trials in (n for n in (1_000, 10_000, 100_000, 1_000_000, 10_000_000) if n <= largest):
-                    found = rates(noise, trials)
-                    ratio = found["kernel"] / found["scan"]
-                    told = f"{bits} bits, {'noise' if noise else 'quiet'}, {trials:9,d} trials"
-                    say(f"{told}: scan {found['scan']:.1f} M, kernel {found['kernel']:.1f} M, {ratio:.1f} times")
+    main(int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000)

@@ -9,7 +9,7 @@ configure()
 
 from functools import partial  # noqa: E402
 
-from common import C_METRICS, Program, machine, medians, say, steps, study  # noqa: E402
+from common import C_METRICS, Program, machine, medians, row, say, steps, study  # noqa: E402
 
 from ptsmc_jax import montecarlo, rollout  # noqa: E402
 
@@ -50,7 +50,8 @@ def batch(metrics: bool) -> None:
     for name, s in seconds.items():
         say(f"  {name:22s} {total / s / 1e6:7.1f} M trial-steps/s")
     for name in fly:
-        say(f"  ptsmc_jax is {seconds[name] / seconds['ptsmc_jax']:.2f} of {name}")
+        row(f"{name}, {'all metrics' if metrics else 'largest torque only'}",
+            total / seconds[name] / 1e6, total / seconds["ptsmc_jax"] / 1e6)  # fmt: skip
     say(f"  noise on takes {seconds['ptsmc_jax, noise on'] / seconds['ptsmc_jax']:.2f} times noise off")
 
 

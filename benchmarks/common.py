@@ -7,21 +7,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
 
-from ptsmc_jax import scenario
+from ptsmc_jax import kernel, montecarlo, scenario
 from ptsmc_jax.clock import Anchored
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study
 
 HERE = Path(__file__).parent
 SCENARIO = HERE.parent / "scenarios" / "first_flight.toml"
+MOVES = {"broadcast_in_dim", "convert_element_type", "get", "pjit", "jit"}  # equations that compute nothing
 C_METRICS = (
     "peak_torque terminal_error terminal_angle window_error hold_error effort settling_time chattering peak_rate "
     "peak_momentum"
@@ -59,6 +62,53 @@ def steps(parts: Parts) -> int:
     """Control periods of a run, those of length zero included."""
     assert isinstance(parts.clock, Anchored)
     return parts.clock.before + parts.clock.after
+
+
+def step_operations(ready: Study) -> int:
+    """Operations on numbers in a control period, at least: those of the whole-run kernel, of the shorter branches."""
+
+    def loops(jaxpr) -> Iterator:
+        for eqn in jaxpr.eqns:
+            inner = [value for v in eqn.params.values() for value in (v if isinstance(v, tuple | list) else (v,))]
+            bodies = [b for b in (getattr(value, "jaxpr", value) for value in inner) if hasattr(b, "eqns")]
+            if eqn.primitive.name == "scan" and eqn.params["length"] == steps(ready.parts):
+                yield from bodies
+            for body in bodies:
+                yield from loops(body)
+
+    def count(jaxpr) -> int:
+        branches = [eqn.params["branches"] for eqn in jaxpr.eqns if eqn.primitive.name == "cond"]
+        mine = sum(eqn.primitive.name not in MOVES for eqn in jaxpr.eqns) - len(branches)
+        return mine + sum(min(count(branch.jaxpr) for branch in each) for each in branches)
+
+    def fly(trial):
+        return montecarlo.one(ready.parts, ready.dispersion, jnp.uint32(0), trial).metrics
+
+    traced = jax.make_jaxpr(kernel.vmap(fly))(jnp.arange(kernel.BLOCK, dtype=jnp.uint32))
+    (body,) = loops(traced.jaxpr)
+    return count(body)
+
+
+def peak_rate(interpret: bool = False, rounds: int = 4096, blocks: int = 16_384) -> float:
+    """Operations a second of a kernel that multiplies and adds, two operations each, as many bits as are set."""
+    chains, unrolled = 8, 16
+
+    def body(given, result):
+        x = [given[...] + k for k in range(chains)]
+
+        def step(_, x):
+            for _ in range(unrolled):
+                x = [v * 0.999 + 0.001 for v in x]
+            return x
+
+        result[...] = sum(jax.lax.fori_loop(0, rounds, step, x))
+
+    across = pl.BlockSpec((kernel.BLOCK,), lambda k: (k,))
+    x = jnp.ones(blocks * kernel.BLOCK)
+    run = jax.jit(pl.pallas_call(body, out_shape=jax.ShapeDtypeStruct(x.shape, x.dtype), grid=(blocks,),
+                                 in_specs=[across], out_specs=across, interpret=interpret,
+                                 compiler_params=triton.CompilerParams(num_warps=kernel.BLOCK // 32)))  # fmt: skip
+    return 2.0 * x.size * chains * unrolled * rounds / medians({"": lambda: run(x)}, repeats=5)[""]
 
 
 @dataclass
@@ -104,6 +154,11 @@ class Program:
             return out
 
         return fly
+
+
+def row(other: str, theirs: float, ours: float) -> None:
+    """A row of the table that `speed_table.py` gathers: million trial-steps a second, measured in one run."""
+    say(f"| {other} | {theirs:.3g} | {ours:.3g} | {ours / theirs:.3g} |")
 
 
 def say(text: str) -> None:

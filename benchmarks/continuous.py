@@ -8,7 +8,7 @@ configure()
 
 from functools import partial  # noqa: E402
 
-import diffrax  # noqa: E402
+import diffrax  # noqa: E402  # pyright: ignore[reportMissingImports]
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, say  # noqa: E402

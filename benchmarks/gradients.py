@@ -7,9 +7,12 @@ from ptsmc_jax.configure import configure
 configure()
 
 import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
 from ptsmc_jax import montecarlo  # noqa: E402
+from ptsmc_jax.requirements import Requirement  # noqa: E402
+from tuning import objective  # noqa: E402
 from tuning.objective import Problem, measure  # noqa: E402
 
 GAINS = ("eta", "delta", "observer_gain")
@@ -19,9 +22,8 @@ LENGTHS = (1_000, 10_000, 100_000)
 
 def problem(ready, trials: int) -> Problem:
     """The first flight's tuning problem on so many trials."""
-    numbers = jnp.arange(trials, dtype=jnp.uint32)
-    return Problem(ready.parts, ready.dispersion, jnp.uint32(0), numbers, jnp.asarray([0.5]), trials, GAINS,
-                   ("peak_torque",))  # fmt: skip
+    limit = Requirement("peak_torque", 0.5)
+    return objective.problem(ready.parts, ready.dispersion, 0, np.arange(trials), GAINS, [limit])
 
 
 @jax.jit
@@ -73,6 +75,7 @@ def memory() -> None:
     for steps in LENGTHS:
         some = problem(study(True, loop__period=45.0 / steps), 128)
         told = value_and_gradient.lower(some, AT).compile().memory_analysis()
+        assert told is not None
         say(f"  {steps:7d} periods: {told.temp_size_in_bytes / 1e6:.2f} MB")
 
 

@@ -4,7 +4,7 @@ What a trial is does not depend on the parts, so that shards, clusters and inter
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -36,10 +36,10 @@ class Campaign:
     seed: int
     own: OwnMetrics | None = None  # metrics of one's own
 
-    def fly(self, first: int, count: int) -> pl.DataFrame:
-        """Rows of the trials from `first` on."""
+    def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
+        """Rows of these trials."""
         # never so few that another program flies them: rows are then the same to the last digit
-        wanted = np.resize(np.arange(first, first + count, dtype=np.uint32), max(count, montecarlo.FEW))
+        wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, wanted, own=self.own)
         named = [rollout.STATUS[int(code)] for code in flown.status]
         heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
@@ -50,14 +50,14 @@ class Campaign:
             **flown.own,
         }
         frame = pl.DataFrame({"trial": wanted, **heading, **numbers})
-        return frame.head(count).with_columns(pl.col(pl.Float64).fill_nan(None))
+        return frame.head(len(trials)).with_columns(pl.col(pl.Float64).fill_nan(None))
 
-    def draw(self, first: int, count: int) -> pl.DataFrame:
-        """What the trials from `first` on would fly with."""
-        trials = np.arange(first, first + count, dtype=np.uint32)
-        padded = np.resize(trials, PART)
+    def draw(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
+        """What these trials would fly with."""
+        wanted = np.asarray(trials, dtype=np.uint32)
+        padded = np.resize(wanted, -(-wanted.size // PART) * PART)
         drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), padded)
-        return pl.DataFrame({"trial": trials, **{name: np.asarray(v)[:count] for name, v in drawn.items()}})
+        return pl.DataFrame({"trial": wanted, **{name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}})
 
     def own_names(self) -> list[str]:
         """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
@@ -121,17 +121,22 @@ def verdicts(requirements: Iterable[Requirement], frame: pl.DataFrame) -> list[V
     return [r.verdict(frame[r.metric].to_numpy().astype(float), ok) for r in requirements]
 
 
-def here(make: Callable[[int, int], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
+def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
     """Make the wanted parts on this machine, and write each while the next one is made.
 
-    Yields each part that is on the disk, and how many of its trials did not end well. make: first trial, count -> rows.
+    Yields each part that is on the disk, and how many of its trials did not end well. make: numbers of trials -> rows.
+    Accelerators, which fly more than a part at a time, make several in one go.
     """
+    together = max(1, montecarlo.abreast() * len(jax.local_devices()) // PART)
     writing: deque[tuple[Any, int]] = deque()
     with ThreadPoolExecutor(1) as writer:
-        for first, count in wanted:
-            frame = make(first, count)
-            bad = failures(frame) if "status" in frame.columns else 0
-            writing.append((writer.submit(rows.write, first, frame), bad))
+        for k in range(0, len(wanted), together):
+            group = wanted[k : k + together]
+            made, begin = make(np.concatenate([np.arange(first, first + count) for first, count in group])), 0
+            for first, count in group:
+                frame, begin = made.slice(begin, count), begin + count
+                bad = failures(frame) if "status" in frame.columns else 0
+                writing.append((writer.submit(rows.write, first, frame), bad))
             while writing and (len(writing) > WAITING or writing[0][0].done()):
                 done, bad = writing.popleft()
                 yield done.result(), bad

@@ -108,6 +108,6 @@ def _fly(recipe: tuple[Any, tuple], first: int, count: int) -> tuple:
     make, told = recipe
     with _one_at_a_time:
         campaign, rows = _campaign(make, told)
-        frame = campaign.fly(first, count)
+        frame = campaign.fly(range(first, first + count))
     part = rows.write(first, frame)
     return first, count, part.path.name, failures(frame), store.packages()

@@ -126,7 +126,7 @@ def trials(
     _whole("seed", seed)
     _whole("count", count, 1)
     known = what if isinstance(what, Scenario) else scenario.read(what)
-    return campaign.Campaign(scenario.study(known), seed, own).fly(0, count)
+    return campaign.Campaign(scenario.study(known), seed, own).fly(range(count))
 
 
 def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:

@@ -116,8 +116,7 @@ def run(
     """
     trials = np.asarray(trials, dtype=np.uint32)
     devices = len(jax.local_devices())
-    usual = BLOCK if jax.default_backend() == "cpu" else ABREAST
-    block = -(-trials.size // devices) if trials.size < FEW else usual if block is None else block
+    block = -(-trials.size // devices) if trials.size < FEW else abreast() if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if trials.size >= FEW else 1
     calls = []
     for k in range(0, trials.size, devices * rows * block):
@@ -174,13 +173,18 @@ def _fly(
     return spread(in_one_kernel if kernel else in_blocks, trials, devices)
 
 
-def blocks(fly: Callable, trials: Any, block: int = BLOCK) -> Any:
-    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block` trials each.
+def abreast() -> int:
+    """How many trials a device flies at a time, unless it is told."""
+    return BLOCK if jax.default_backend() == "cpu" else ABREAST
+
+
+def blocks(fly: Callable, trials: Any) -> Any:
+    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `abreast()` trials each.
 
     trials: what `fly` takes, a number or a tree of arrays, with a leading axis over the trials.
     """
     count = jax.tree.leaves(trials)[0].shape[0]
-    rows = max(1, -(-count // block))
+    rows = max(1, -(-count // abreast()))
     size = -(-count // rows)
     if rows == 1:
         return lanes.vmap(fly)(trials)

@@ -19,7 +19,7 @@ TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name !=
 @pytest.fixture(scope="module")
 def flown():
     made = campaign.Campaign(scenario.study(scenario.from_tables(TABLES)), 3)
-    return made, made.fly(0, 300)
+    return made, made.fly(range(300))
 
 
 def test_a_row_says_everything_of_its_trial(flown):
@@ -40,7 +40,7 @@ def test_a_row_says_everything_of_its_trial(flown):
 @pytest.mark.parametrize(("first", "count"), [(0, 1), (7, 63), (44, 256)])
 def test_rows_do_not_depend_on_the_parts(flown, first, count):
     made, frame = flown
-    same(made.fly(first, count), frame[first : first + count])
+    same(made.fly(range(first, first + count)), frame[first : first + count])
 
 
 @pytest.mark.parametrize(("block", "capacity", "devices"), [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)])
@@ -50,12 +50,12 @@ def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, cap
     monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=block))
     found = jax.local_devices()[:devices]
     monkeypatch.setattr(jax, "local_devices", lambda: found)
-    same(made.fly(0, 300), frame)
+    same(made.fly(range(300)), frame)
 
 
 def test_the_plan_is_what_is_flown(flown):
     made, frame = flown
-    plan = made.draw(0, 300)
+    plan = made.draw(range(300))
     assert plan.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
     same(plan, frame.select(plan.columns))
 
@@ -64,7 +64,7 @@ def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
     """Gains beyond what the period allows: a third of the trials comes upon the law's singularity, or tumbles."""
     wild = scenario.replace(scenario.from_tables(TABLES), controller__eta=8.75, controller__delta=0.1)
     made = campaign.Campaign(scenario.study(wild), 0)
-    frame = made.fly(0, 600)
+    frame = made.fly(range(600))
     bad = frame.filter(pl.col("status").is_in(["diverged", "singular"]))
     assert 0.2 < bad.height / 600 < 0.5
     assert {"singular", "diverged"} == set(bad["status"])
@@ -108,15 +108,37 @@ def test_parts_are_written_while_others_are_flown(flown, tmp_path, monkeypatch):
     same(rows.read(kept.parts()[0]), frame)
 
 
+@pytest.mark.parametrize("together", [2, 3, 16])
+def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, together):
+    """As accelerators make them: some of a shard's, which do not follow one another, and the last one is short."""
+    made, frame = flown
+    monkeypatch.setattr(campaign, "PART", 40)
+    monkeypatch.setattr(montecarlo, "abreast", lambda: 40 * together // len(jax.local_devices()))
+    flights = []
+
+    def make(trials):
+        flights.append(len(trials))
+        return made.fly(trials)
+
+    kept = rows.Rows(tmp_path / "trials", b"k")
+    wanted = campaign.missing([], 300, (2, 2))
+    assert wanted == [(40, 40), (120, 40), (200, 40), (280, 20)]
+    landed = [part for part, _ in campaign.here(make, kept, wanted)]
+    assert flights == {2: [80, 60], 3: [120, 20], 16: [140]}[together]
+    assert [(part.first, part.count) for part in landed] == wanted
+    for part in landed:
+        same(rows.read([part]), frame[part.first : part.end])
+
+
 def test_what_was_flown_is_kept_when_a_part_fails(flown, tmp_path, monkeypatch):
     made, _ = flown
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
 
-    def make(first, count):
-        if first == 200:
+    def make(trials):
+        if trials[0] == 200:
             raise KeyboardInterrupt
-        return made.fly(first, count)
+        return made.fly(trials)
 
     with pytest.raises(KeyboardInterrupt):
         campaign.follow(campaign.here(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None)
@@ -143,7 +165,7 @@ def test_metrics_of_ones_own_stand_in_the_rows(flown):
     made, frame = flown
     own = replace(made, own=overshoot)
     assert own.own_names() == ["overshoot", "rows"]
-    more = own.fly(0, 100)
+    more = own.fly(range(100))
     same(more.drop("overshoot", "rows"), frame[:100])
     log = runs.fly(made.ready, 3, 42).log
     after = np.linalg.norm(log.error, axis=1)[log.t > 5.0].max()

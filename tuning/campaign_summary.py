@@ -154,7 +154,7 @@ class Replay:
 
 def replay(folder: Folder, trial: int) -> Replay:
     """A trial's row as the campaign flies it, and its run in full."""
-    run, row = runs.fly(folder.campaign.ready, folder.seed, trial), folder.campaign.fly(trial, 1)
+    run, row = runs.fly(folder.campaign.ready, folder.seed, trial), folder.campaign.fly([trial])
     there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
     kept = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial) if there else None
     again = row.row(0, named=True)
