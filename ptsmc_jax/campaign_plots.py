@@ -62,7 +62,7 @@ def distributions(found: Mapping[str, tuple[str, np.ndarray, float | None]]) -> 
             ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
             ranks = ranks[ranks <= known]
             share = (ranks - 0.5) / n
-            axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0])
+            axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0], marker="." if known < 50 else None)
             axes.set_yscale("logit")
             edge = 0.3 / n
             axes.set_ylim(edge, 1.0 - edge)

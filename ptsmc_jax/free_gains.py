@@ -3,6 +3,7 @@
 import math
 
 import msgspec
+import numpy as np
 
 from ptsmc_jax import device_tables, law_tables, plant_tables, schema, sensors, tables
 from ptsmc_jax.schema import ScenarioError, wrong
@@ -144,7 +145,7 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         if "t_f" in free:  # below every t_f
             t_f = (tune.bounds.get("t_f") or _default(scenario, tune, "t_f", free))[0]
         lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
-        return lower, min(max(5.0, 4 * lower), (lower + t_f) / 2)
+        return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
         own = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
         return 0.1 * own, max(own, min(10.0 * own, 1.0 / _interval(scenario)))
@@ -158,9 +159,15 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
     if name == "p" and "gamma" not in free and hasattr(scenario.controller, "gamma"):
         least = _least_p(scenario)
         return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
+    if name == "observer_gain":
+        low, high, each = 0.5, 300.0, getattr(scenario.observer, "gain", None) or (10.0,)
+        if scenario.spacecraft is not None:  # these [N m s] for a mean moment of 12 kg m^2
+            moments = np.asarray(scenario.spacecraft.inertia)
+            size = float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
+            low, high = size * low, size * high
+        return min(low, 0.5 * min(each)), max(high, 2.0 * max(each))
     return {
-        "observer_gain": (0.5, 300.0),
-        "k1": (0.1, 10.0),
+        "k1": (3.5 / t_f, 350.0 / t_f),
         "sign_width": (1e-5, 1e-1),
         **dict.fromkeys(("k_p", "k"), (2.0 / t_f**2, 2000.0 / t_f**2)),
         "k_d": (0.3 / t_f, 100.0 / t_f),

@@ -86,12 +86,13 @@ def largest_index(eta: float, late: float = 0.0) -> float:
     return _last(stable, 1e-6, 4.0)
 
 
-def smallest_delta(eta: float, h: float, late: float = 0.0) -> float:
-    """Smallest delta [s] for which the last sample before the hand-over, tau = delta + h, is stable.
+def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True) -> float:
+    """Smallest delta [s] for which the last sample before the hand-over is stable.
 
-    Without delay (eta - 3/2) h; never below 0.
+    On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
+    may lie at the hand-over itself: (eta - 1/2) h.
     """
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - 1.0) * h)
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - float(anchored)) * h)
 
 
 @dataclass(frozen=True)

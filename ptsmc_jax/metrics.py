@@ -204,7 +204,7 @@ def finish(running: Running, judged: Judged) -> Metrics:
         hold_error=jnp.maximum(late.hold_error, terminal_error),
         peak_torque=running.peak_torque,
         peak_torque_delivered=running.peak_torque_delivered,
-        saturated=running.saturated_for / judged.t_end,
+        saturated=jnp.where(jnp.isnan(running.effort), jnp.nan, running.saturated_for / judged.t_end),
         effort=running.effort,
         settling_time=jnp.where(jnp.isfinite(running.settled_at), running.settled_at, jnp.nan),
         chattering=chattering,

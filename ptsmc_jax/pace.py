@@ -149,8 +149,10 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     if key == "plant.system":
         return ScenarioError(f"plant.system is too fast, in its own modes or in time: {asks}")
     table, _, name = key.partition(".")
-    if key == "controller.eta":  # over a short t_f
-        asks += f" at controller.t_f = {scenario.controller.t_f}"
+    if key == "controller.eta":  # over a short t_f: eta itself may have no room below
+        eta = f"with controller.eta = {scenario.controller.eta}"
+        shorter = ", or loop.period shorter" if scenario.loop.mode == "sampled" else ""
+        return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
     value = getattr(getattr(scenario, table), name, None)
     if value is None:  # of a term in a sum
         value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]

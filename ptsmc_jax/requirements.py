@@ -25,6 +25,7 @@ def least_within(trials: int, quantile: float | None, confidence: float | None) 
 
     within = np.arange(1, trials + 1)
     reached = beta.ppf(1.0 - confidence, within, trials - within + 1) >= quantile
+    reached[-1] = True  # whatever rounding says: there are as many as it takes
     return int(within[np.argmax(reached)])
 
 
@@ -45,7 +46,7 @@ class Verdict:
     limit: float
     unit: str
     worst: float  # largest value, NaN if a trial failed
-    margin: float  # factor on the limit with which it would just be met: met up to 1; NaN if none is enough
+    margin: float  # factor on the limit with which it would just be met: met up to 1; NaN or infinite: none is enough
     failures: int  # trials beyond the limit or without a value
     trials: int
     quantile: float | None = None  # share of trials that must keep the limit; None: every one
@@ -111,12 +112,13 @@ class Requirement:
     def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
         """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
 
-        A single run is judged by the limit alone.
+        A single run, numbers (), is judged by the limit alone.
         """
+        single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
         within = ok & (values <= self.limit)
         worst = float(np.max(np.where(ok, values, np.nan)))
-        share = (self.quantile, self.confidence) if values.size > 1 else (None, None)
+        share = (None, None) if single else (self.quantile, self.confidence)
         least = least_within(values.size, *share)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan

@@ -58,11 +58,12 @@ def begun(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) ->
 def begin(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any], *, fresh: bool) -> Path:
     """Make the folder of a run that can go on where it was interrupted; returns the path of its journal.
 
-    fresh: forget what the folder's journal holds.
+    fresh: forget what the folder's journal holds, and the summary of what was there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if fresh:
         end(folder)
+        (folder / "summary.json").unlink(missing_ok=True)  # it would pass for this run's
     write_toml(folder / "scenario.toml", scenario)
     write_json(folder / "versions.json", versions(**told))
     (folder / JOURNAL).touch()

@@ -178,8 +178,8 @@ BAD = [
     ("observer = { kind = 'none', gain = [1, 1, 1] }", "observer.gain is not a known key", "observer.kind"),
     (CHAIN + "plant.order = 5\ncontroller.t_f = 60", "controller.sign_width is 0.001", "0 for the exact sign"),
     # the slew itself asks for too many steps
-    ("controller.eta = 1e6", "controller.eta is 1000000.0", "lower"),
-    ("controller = { t_f = 1e-4, delta = 1e-5 }", "controller.eta is 3.0", "at controller.t_f = 0.0001"),
+    ("controller.eta = 1e6", "controller.t_f is 30.0", "longer with controller.eta = 1000000.0"),
+    ("controller = { t_f = 1e-4, delta = 1e-5 }", "controller.t_f is 0.0001", "longer with controller.eta = 3.0"),
     (SAMPLED + "controller.eta = 1e6", "controller.eta is 1000000.0", "integration steps a period"),
     ("initial.rate = [1e5, 0, 0]", "initial.rate is [100000.0, 0.0, 0.0]", "lower"),
     # devices

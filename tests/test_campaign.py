@@ -71,6 +71,9 @@ def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
     assert bad["bad_time"].null_count() == 0
     assert bad["bad_time"].is_between(0.0, 6.5).all()
     assert "" not in set(bad["reason"])
+    lost = bad.filter(pl.col("effort").is_null())
+    assert lost.height > 0
+    assert lost["saturated"].null_count() == lost.height  # no command, no share of the time in which it is cut
     good = frame.filter(~pl.col("status").is_in(["diverged", "singular"]))
     alone = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, good["trial"].to_numpy())
     for name in made.ready.catalogue:

@@ -93,3 +93,20 @@ def test_only_t_f_and_what_follows_it_is_changed():
     np.testing.assert_array_equal(
         back.clock.ticks(vector(20.0), vector(1.0)).t, parts.clock.ticks(vector(20.0), vector(1.0)).t
     )
+
+
+SPINNING = {
+    "initial": {"rotvec_deg": [0, 50, 30]},
+    "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.1]},  # its q4 vanishes at 31.4 s
+    "controller": {"t_f": 28.0, "delta": 0.5},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 29.5},
+}
+
+
+@pytest.mark.parametrize(("limit", "flown"), [(5.0, True), (0.14, False)])
+def test_a_reference_that_the_law_cannot_follow_for_longer_costs_only_the_flown_time(limit, flown):
+    """The time after t_f stays what it was; where the law cannot follow for t_f itself, theory is left."""
+    found = design.shortest_time(scenario.from_tables(SPINNING), limit, 0, np.arange(1))
+    assert found.theory is not None
+    assert (found.theory < 20.0) == flown
+    assert (found.simulated is not None) == flown

@@ -118,6 +118,37 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
     np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("inertia", "gain", "expected"),
+    [
+        ([10.0, 12.0, 14.0], 10.0, (0.5, 300.0)),
+        ([0.01, 0.012, 0.014], 0.01, (0.0005, 0.3)),
+        ([[1e7, 3e6, -2e6], [3e6, 2e7, 1e6], [-2e6, 1e6, 1.5e7]], 1e7, (6.25e5, 3.75e8)),
+        ([10.0, 12.0, 14.0], 0.1, (0.05, 300.0)),  # the scenario's own is inside
+        ([10.0, 12.0, 14.0], 500.0, (0.5, 1000.0)),
+    ],
+)
+def test_default_bounds_of_the_observers_gain_go_with_the_body_and_hold_the_scenarios_own(inertia, gain, expected):
+    tables = {"spacecraft": {"inertia": inertia}, "observer": {"gain": [gain] * 3}, "tune": {}}
+    made = from_tables({**tables, "disturbance": {"kind": "none"}})
+    assert made.tune is not None
+    np.testing.assert_allclose(made.tune.bounds["observer_gain"], expected, rtol=1e-12)
+
+
+def test_default_bounds_of_delta_and_k1_go_with_t_f():
+    made = {}
+    for t_f in (3.5, 35.0, 4000.0):
+        law = {"t_f": t_f, "delta": 0.01 * t_f, "error": "multiplicative"}
+        tune = {"free": ["delta", "k1"]}
+        one = from_tables({"controller": law, "loop": {"t_end": t_f + 10.0}, "tune": tune})
+        assert one.tune is not None
+        made[t_f] = one.tune.bounds
+    assert {t_f: tuple(b["delta"]) for t_f, b in made.items()} == {
+        3.5: (0.05, 1.775), 35.0: (0.05, 5.0), 4000.0: (0.05, 500.0),
+    }  # fmt: skip
+    np.testing.assert_allclose([b["k1"] for b in made.values()], [(3.5 / t_f, 350.0 / t_f) for t_f in made])
+
+
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
     from tuning import bounds, gains
 
@@ -146,3 +177,22 @@ def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, neede
     moved = gains.with_gains(roomy.parts, other)
     law = moved.controller
     assert float(moved.clock.ticks(law.t_f, law.delta).t_next[-1]) == pytest.approx(float(moved.t_end))
+
+
+def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
+    """Spinning at 0.6 rad/s, the paper's eta of 3 overshoots past 180 degrees; 6 does not."""
+    fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
+    law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
+    own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
+    found, refused = report.beside(own)
+    assert found == {"before": own}
+    assert refused is not None
+    assert refused.startswith("initial.rotvec_deg is")
+    quick = {"t_f": 0.04, "delta": 0.01}  # shorter than the paper's delta
+    tiny = from_tables(
+        {"controller": quick, "loop": {"mode": "sampled", "period": 0.001, "t_end": 0.05, "window": 0.01}}
+    )
+    found, refused = report.beside(tiny)
+    assert refused is None
+    assert found["paper"].controller.delta == 0.02
+    assert list(report.beside(found["paper"])[0]) == ["paper"]

@@ -56,6 +56,7 @@ def test_borders_are_those_of_the_theory_notes():
     for eta in (2.2, 3.0, 5.0, 8.0):
         np.testing.assert_allclose(linear.largest_index(eta), 2.0, rtol=1e-9)
         np.testing.assert_allclose(linear.smallest_delta(eta, 0.05), max(0.0, (eta - 1.5) * 0.05), rtol=1e-8)
+        np.testing.assert_allclose(linear.smallest_delta(eta, 0.05, anchored=False), (eta - 0.5) * 0.05, rtol=1e-8)
         assert 0.74 < linear.largest_index(eta, 1.0) < 0.85  # "about 0.75"
         assert linear.largest_index(eta, 2.0) < linear.largest_index(eta, 1.0)
 

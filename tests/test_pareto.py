@@ -13,7 +13,7 @@ from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import SHORT, small_search, tree
 from tests.pages import checked
-from tuning import pareto, report, show
+from tuning import pareto, report, show, told
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
@@ -58,6 +58,30 @@ def test_only_what_is_beaten_beyond_its_interval_is_dominated():
     assert {p.peak for p in marked if p.dominated} == {0.4}
     assert sum(p.knee for p in marked) == 1
     assert not any(p.knee and p.dominated for p in marked)
+
+
+def test_more_failures_or_too_few_trials_beat_nothing():
+    """Half the error at less torque, but from trials of which some failed; from too few; where nothing is drawn."""
+    rng = np.random.default_rng(0)
+    errors = rng.lognormal(0.0, 0.5, 400)
+    better = point(0.2, 0.5), trials(0.5 * errors * rng.normal(1.0, 0.05, 400))
+    worse = point(0.3, 1.0), trials(errors)
+    assert pareto._beats(better, worse)
+    assert not pareto._beats((point(0.2, 0.5, failures=1), better[1]), worse)
+    assert pareto._beats((point(0.2, 0.5, failures=1), better[1]), (point(0.3, 1.0, failures=2), worse[1]))
+    for count, beats in ((5, False), (1, True)):
+        few = [(one[0], trials(np.asarray(one[1].metrics.window_error)[:count])) for one in (better, worse)]
+        assert pareto._beats(few[0], few[1]) == beats
+
+
+def test_a_front_with_gains_that_never_fly_can_be_told():
+    lost = {"gains": {"eta": 3.0}, "peak": None, "mean_peak": None, "rms": None, "interval": None, "failures": 9,
+            "knee": False, "meets": False, "dominated": False}  # fmt: skip
+    summary = {"plant": "spacecraft", "points": [lost], "requirements": [], "paper": lost, "paper_refused": None}
+    assert told.front(summary).rows == [
+        ("", "-", "-", "-", "-", "3", "9 failed or missed"),
+        ("paper", "-", "-", "-", "-", "3", "9 failed or missed"),
+    ]
 
 
 def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):

@@ -126,6 +126,23 @@ def test_a_single_run_is_judged_by_the_limit_alone():
     assert str(told) == "peak_torque at most 0.5 N m: 0.4: met"
 
 
+def test_a_campaign_of_one_trial_shows_no_share():
+    told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.array([0.4]), np.array([True]))
+    assert not told.met
+    assert str(told).endswith("0.4: NOT shown, which takes at least 230 trials")
+
+
+@pytest.mark.parametrize("trials", [2, 3, 10])
+@pytest.mark.parametrize("quantile", [0.05, 0.3, 0.5])
+def test_as_many_trials_as_it_takes_are_enough_whatever_rounding_says(trials, quantile):
+    """A confidence for which quantile^n is 1 - confidence exactly, but for the last digits."""
+    for digits in (-2, -1, 0, 1, 2):
+        confidence = float(1.0 - quantile**trials * (1.0 + digits * 2.0**-52))
+        needed = fewest_trials(quantile, confidence)
+        assert needed in (trials, trials + 1)
+        assert least_within(needed, quantile, confidence) == needed
+
+
 def test_a_share_in_words():
     values = np.linspace(0.1, 0.4, 1000)
     share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)

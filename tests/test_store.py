@@ -272,7 +272,12 @@ def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path
     assert not store.begun(folder, {"controller": {"eta": 3.1}}, TOLD)
     assert store.previous(folder, tables, TOLD) is None
     assert store.begin(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
+    (folder / "summary.json").write_text("{}")
+    assert store.previous(folder, tables, TOLD) == {}
+    assert store.begin(folder, tables, TOLD, fresh=False)
+    assert (folder / "summary.json").exists()
     assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
+    assert not (folder / "summary.json").exists()  # of another run, which a run that is stopped must not be taken for
     made = json.loads((folder / "versions.json").read_text())
     (folder / "versions.json").write_text(json.dumps({**made, "jax": "0.0.1"}))
     assert not store.begun(folder, tables, TOLD)  # other versions may round otherwise

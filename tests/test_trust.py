@@ -27,7 +27,9 @@ def quiet():
 
 
 def test_sensitivities_of_the_first_torque_are_its_powers(quiet):
-    found = trust.sensitivities(quiet, np.array([3.3, 1.0, 19.0]), ("peak_torque", "window_error", "settling_time"))
+    found = trust.sensitivities(
+        quiet, BOUNDS, np.array([3.3, 1.0, 19.0]), ("peak_torque", "window_error", "settling_time")
+    )
     powers = found["peak_torque"]
     # central differences of a power p in logs: p atanh(h) / h, off by h^2 / 3 for a relative step h of 0.01
     np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
@@ -48,10 +50,29 @@ def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
     np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
 
 
+def test_sensitivities_at_a_bound_are_taken_inside_it(quiet):
+    """The clock has no samples beyond; a power p is the same to one side: off by p (p - 1) h / 2 for a step of h."""
+    for at in (0, 1):
+        gains = np.array([3.3, (BOUNDS.lower, BOUNDS.upper)[at][1], (BOUNDS.upper, BOUNDS.lower)[at][2]])
+        powers = trust.sensitivities(quiet, BOUNDS, gains, ("peak_torque",))["peak_torque"]
+        np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
+
+
 @pytest.mark.parametrize(("ratio", "flat"), [(1.0, True), (1.005, True), (1.02, False), (3.0, False)])
-def test_what_moves_a_goal_by_less_than_a_percent_is_flat(ratio, flat):
-    ones = np.ones(3)
-    assert trust.Profile(ones, np.array([2.0, 2.0 * ratio, 2.0]), ones).flat == flat
+def test_what_moves_goal_and_limits_by_less_than_a_percent_is_flat(ratio, flat):
+    ones, moved = np.ones(3), np.array([2.0, 2.0 * ratio, 2.0])
+    assert trust.Profile(ones, moved, ones, np.log(moved)).flat == flat
+    assert trust.Profile(ones, ones, moved, 0.0 * ones).flat == flat  # t_f, say, which other gains leave as it is
+    assert trust.Profile(ones, ones, ones, np.log(moved)).flat == flat  # what the torque weighs
+    assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).flat == flat  # no requirement
+
+
+def test_without_a_requirement_there_is_no_limit_to_move(quiet):
+    free = objective.problem(quiet.parts, SPREAD, 3, np.arange(8), BOUNDS.names)
+    found = trust.profiles(
+        Evaluator(BOUNDS), replace(free, goal="peak_torque"), BOUNDS.free(np.array([3.3, 1.0, 19.0]))
+    )
+    assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
 
 
 def test_slopes_are_checked_against_differences():

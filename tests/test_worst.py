@@ -133,7 +133,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
     roomy = optimise._with_room(problem)
     assert roomy.trials.size == 8 + optimise.SPARE
-    given = optimise._add(roomy, np.asarray([7]), {name: v.tolist() for name, v in own.items()})
+    given = optimise._add(roomy, 0, np.asarray([7]), {name: v.tolist() for name, v in own.items()})
     at = vector([3.2, 0.9])
     measure = jax.jit(objective.measure)
     f, c, _ = measure(more, at)
@@ -141,3 +141,50 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     np.testing.assert_allclose(f, f_roomy, rtol=1e-12)
     np.testing.assert_allclose(c_roomy[0, 8], c[0, 8], rtol=1e-12)
     np.testing.assert_allclose(c_roomy[0, 9:], c[0, 0], rtol=1e-12)
+
+
+def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
+    problem, _ = posed(dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0))))
+    problem = optimise._with_room(objective.with_trials(problem, np.arange(100, 108)))
+    joined = 0
+    for count in (8, 3, 8, 1):
+        new = np.arange(200 + joined, 200 + joined + count)
+        problem, joined = optimise._add(problem, joined, new), joined + count
+        # the last 16 of those screened first and those that joined since, in whatever order
+        kept = [*range(100, 108), *range(200, 200 + joined)][-16:]
+        assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)
+        np.testing.assert_array_equal(problem.trials[:8], np.arange(8))
+    own = objective.coordinates_of(problem.dispersion, 5, np.asarray(problem.trials))
+    np.testing.assert_array_equal(problem.coordinates["initial_attitude"], own["initial_attitude"])
+
+
+def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
+    """Only the true inertia is drawn; at rest the law's first torque does not know of it, what follows does."""
+    body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
+    spread = dispersions.Dispersion(inertia=dispersions.RelativeInertia(*body))
+    problem, wanted = posed(spread, Requirement("peak_rate", 0.1))
+    at = np.array([ETA, 1.0])
+    found = worst.hardest(problem, wanted, at)
+    trials, ratio = worst.screen(problem, wanted, at)
+    assert found.moved == ()
+    assert found.trial == trials[np.argmax(ratio)]
+    np.testing.assert_allclose([found.ratio, found.screened], ratio.max(), rtol=1e-9)
+    assert np.ptp(ratio) > 0.0
+
+
+def test_a_trial_without_a_value_is_the_hardest():
+    """Nearer ones settle, farther ones not before the end."""
+    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.01), vector(2.0)))
+    problem, wanted = posed(spread, Requirement("settling_time", 19.0))
+    problem = replace(problem, parts=replace(problem.parts, settling_angle=vector(1e-4)))
+    at = np.array([ETA, 1.0])
+    _, ratio = worst.screen(problem, wanted, at)
+    assert 0 < np.isinf(ratio).sum() < ratio.size
+    assert not np.isnan(ratio).any()
+    found = worst.hardest(problem, wanted, at)
+    assert found.status in ("ok", "missed")
+    assert (found.ratio, found.beyond, found.unbounded) == (np.inf, True, False)
+    slopes = jax.jacfwd(lambda gains: objective.measure(problem, gains)[:2])(vector(at))
+    value, over = (np.asarray(v) for v in objective.measure(problem, vector(at))[:2])
+    assert all(np.isfinite(v).all() for v in (value, over, *map(np.asarray, slopes)))
+    assert (over == objective.FAILED - 1.0).any()

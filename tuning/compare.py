@@ -42,11 +42,12 @@ class Contender:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All contenders on the same trials: the paper's gains first, then the tuned laws."""
+    """All contenders on the same trials: the paper's gains first where they can fly, then the tuned laws."""
 
     contenders: dict[str, Contender]
     fresh_seed: int
     interrupted: bool
+    paper_refused: str | None = None  # why the paper's gains are not among them
 
     @property
     def status(self) -> str:
@@ -106,7 +107,8 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
             study(posed)
         except ScenarioError as error:  # before hours of search, not after
             raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
-    made = {"paper": _papers(report.as_flown(gains.papers(scenario)), fresh_seed)}
+    others, refused = report.beside(scenario)
+    made = {"paper": _papers(report.as_flown(others["paper"]), fresh_seed)} if "paper" in others else {}
     stopped = False
     for law, posed in rivals.items():
 
@@ -118,7 +120,7 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
         stopped = tuned.search.interrupted
         if stopped:
             break
-    return Comparison(made, fresh_seed, stopped)
+    return Comparison(made, fresh_seed, stopped, refused)
 
 
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
@@ -180,6 +182,8 @@ def summary(made: Comparison) -> dict[str, Any]:
         "status": made.status,
         "seed": made.fresh_seed,
         "trials": int(first.trials.status.size),
+        "paper_refused": made.paper_refused,
+        "judged_on": report.judged_on(made.contenders.get(OURS, first).flown),
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(one) for law, one in made.contenders.items()},
     }

@@ -9,6 +9,7 @@ import numpy as np
 from ptsmc_jax import montecarlo, scenario, theory
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.rollout import Parts
+from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 from tuning.gains import with_gains
 
@@ -33,7 +34,7 @@ class ShortestTime:
 def text(limit: float, by_theory: float | None, simulated: float | None) -> str:
     """A `ShortestTime` in one line."""
     if by_theory is None:
-        return f"no t_f keeps these gains below the limit of {limit:g}"
+        return f"no t_f up to {FARTHEST:g} times the scenario's keeps these gains below the limit of {limit:g}"
     said = f"shortest t_f for a limit of {limit:g} with these gains: {by_theory:.4g} s by theory"
     return said + (f", {simulated:.4g} s as flown" if simulated is not None else "; none found by simulation")
 
@@ -57,7 +58,12 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
         return ShortestTime(limit, None, None, len(trials))
 
     longest = max(1.5 * rule, own)
-    roomy = scenario.study(scenario.replace(flown, controller__t_f=longest, loop__t_end=None))
+    try:
+        roomy = scenario.study(scenario.replace(
+            flown, controller__t_f=longest, loop__t_end=longest + float(ready.parts.t_end) - own
+        ))  # fmt: skip
+    except ScenarioError:  # a reference that runs into the law's singularity later, say
+        return ShortestTime(limit, rule, None, len(trials))
 
     def simulated(t_f: float) -> float:
         parts = with_gains(roomy.parts, {"t_f": t_f})

@@ -14,7 +14,7 @@ from tuning.starts import EDGE, Report, logit
 POPULATION = 40  # points for each gain
 GENERATIONS = 80
 SPREAD = 1e-4  # of F in the population, at which it ends
-FORBIDDEN = 10.0  # beside F, for a point that breaks a limit
+FORBIDDEN = 100.0  # beside F, for a point that breaks a limit: beyond every F
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Check:
     gains: dict[str, float]
     value: float  # its goal
     distance: float  # the search's F less this one's: about the share by which the search is worse
+    kept: bool  # whether it keeps every limit
     rollouts: int  # trials flown for it
 
 
@@ -71,5 +72,6 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
         gains=dict(zip(problem.names, np.asarray(evaluate.bounds.gains(jnp.asarray(z[first]))).tolist(), strict=True)),
         value=float(np.exp(seen.value[first])),
         distance=float(own.f[0] - seen.f[first]),
+        kept=bool(seen.c[first].max(initial=-1.0) <= SLACK),
         rollouts=evaluate.rollouts - before,
     )

@@ -180,12 +180,13 @@ def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray,
         return {}
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
-    lines = {"$\\delta = (\\eta - 3/2) h$": 0.0, "the same with a period of delay": 1.0}
+    anchored = scenario.loop.clock == "anchored"
+    lines = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
     if delay > 1:
         lines[f"with {delay} periods of delay"] = float(delay)
     found = {}
     for label, late in lines.items():
-        delta = np.array([linear.smallest_delta(eta, float(period), late) for period in h])
+        delta = np.array([linear.smallest_delta(eta, float(period), late, anchored=anchored) for period in h])
         found[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return found
 

@@ -15,7 +15,7 @@ from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import Parts
 from tuning.gains import with_gains
 
-FAILED = 1e3  # stands for the window error, and for metric / limit, of a trial that failed
+FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
 T_F = "t_f"
 
 
@@ -107,7 +107,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
     worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
     only some trials must keep a limit, c of the others is cut down to that of the last one that must. A trial that
-    fails counts with a metric of `FAILED`, and as that many times over its limits.
+    fails, or has no value, counts as `judged` says.
     """
     named = dict(zip(problem.names, gains, strict=True))
     parts = with_gains(problem.parts, named)
@@ -118,13 +118,12 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
         trial, coordinates = case
         metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
-        ok = (status == rollout.OK) | (status == rollout.MISSED)
         over = [
-            jnp.where(ok, getattr(metrics, name) / limit, FAILED) - 1.0
+            judged(getattr(metrics, name) / limit, status) - 1.0
             for name, limit in zip(problem.metrics, problem.limits, strict=True)
         ]
         goal = metrics.window_error if problem.goal == T_F else getattr(metrics, problem.goal)
-        square, torque = (jnp.where(ok, v, FAILED) ** 2 for v in (goal, metrics.peak_torque))
+        square, torque = (judged(v, status) ** 2 for v in (goal, metrics.peak_torque))
         return square, torque, jnp.stack(over) if over else jnp.zeros(0)
 
     squares, torques, over = montecarlo.blocks(fly, (problem.trials, problem.coordinates))
@@ -138,6 +137,12 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
     return weighted, constraints, value
+
+
+def judged(value: Array, status: Array) -> Array:
+    """A trial's metric, or its share of a limit, as it counts: `FAILED` where the trial failed or has no value."""
+    ended = (status == rollout.OK) | (status == rollout.MISSED)
+    return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
 
 
 def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:

@@ -99,11 +99,11 @@ def search(
     try:
         if sure:  # screened as flown
             middle = np.asarray(evaluate.bounds.gains(jnp.zeros(len(problem.names))))
-            problem = _with_room(_add_screened(problem, sure, middle))
+            problem = _with_room(with_trials(problem, _hardest(problem, *worst_case.screen(problem, sure, middle))))
         z = starting_points(evaluate, problem, own, starts, seed, report)
         run.descend(problem, z, steps, "searching")
         run.settle(problem, np.random.default_rng(seed))
-        rounds = 0
+        rounds = joined = 0
         while sure:
             found = run.gains
             if robust:
@@ -111,12 +111,14 @@ def search(
                 hardest = worst_case.hardest(flown(problem), sure, found)
                 if hardest.unbounded or not hardest.beyond or rounds == ROUNDS:
                     break
-                problem = _add(problem, np.asarray([hardest.trial]), hardest.coordinates)
+                problem = _add(problem, joined, np.asarray([hardest.trial]), hardest.coordinates)
+                joined, hardest = joined + 1, None  # it was the worst case of gains that are searched on from
             else:
                 trials, ratio = worst_case.screen(flown(problem), sure, found)
                 if np.all(ratio <= 1.0) or rounds == ROUNDS:
                     break
-                problem = _add_screened(problem, sure, found, (trials, ratio))
+                more = _hardest(problem, trials, ratio)
+                problem, joined = _add(problem, joined, more), joined + more.size
             rounds += 1
             again = max(20, steps // 3)
             run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
@@ -137,29 +139,28 @@ def _with_room(problem: Problem) -> Problem:
     return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], SPARE))
 
 
-def _add(problem: Problem, trials: np.ndarray, coordinates: dict | None = None) -> Problem:
-    """The problem with these trials in the places that repeat the first one; with more trials, if none is left."""
-    spare = [k for k in range(problem.averaged, problem.trials.size) if problem.trials[k] == problem.trials[0]]
-    if len(spare) < len(trials):
-        spare = list(range(problem.averaged, problem.trials.size))[: len(trials)]  # those that joined first
-    places = jnp.asarray(spare[: len(trials)])
-    numbers = jnp.asarray(trials, dtype=jnp.uint32)
+def _add(problem: Problem, joined: int, trials: np.ndarray, coordinates: dict | None = None) -> Problem:
+    """The problem with these trials in the places left for them, and then in those of the ones that joined first.
+
+    joined: how many have been added to `_with_room`'s.
+    """
+    places = problem.trials.size - problem.averaged
+    at = problem.averaged + (places - SPARE + joined + np.arange(len(trials))) % places
     if coordinates is None:
         own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
         own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
-        trials=problem.trials.at[places].set(numbers),
-        coordinates={name: v.at[places].set(own[name]) for name, v in problem.coordinates.items()},
+        trials=problem.trials.at[at].set(jnp.asarray(trials, dtype=jnp.uint32)),
+        coordinates={name: v.at[at].set(own[name]) for name, v in problem.coordinates.items()},
     )
 
 
-def _add_screened(problem: Problem, requirements, gains: np.ndarray, screened: tuple | None = None) -> Problem:
-    trials, ratio = screened or worst_case.screen(problem, requirements, gains)
+def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Of screened trials those nearest to a limit that are not in the problem yet."""
     known = set(np.asarray(problem.trials).tolist())
-    hardest = np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)
-    return with_trials(problem, hardest) if screened is None else _add(problem, hardest)
+    return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)
 
 
 class Run:

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import drawing, metrics, schema, store, study_plots, systems
+from ptsmc_jax import drawing, metrics, schema, statistics, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.scenario import replace as changed
@@ -59,6 +59,7 @@ class Front:
 
     points: list[Point]
     others: dict[str, Point]
+    paper_refused: str | None  # why the paper's gains are not among them
     fresh_seed: int
     trials: int
     rollouts: int
@@ -88,6 +89,7 @@ def trace(
     assert table is not None
     posed = report.pose(limited, seed, journal)
     ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
+    others, refused = report.beside(limited)
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:
@@ -124,15 +126,12 @@ def trace(
         if all(np.abs(best[k][2] - other[2]).max() >= APART for other in climbed.values()):
             climbed[float(ladder[k])] = best[k]
     judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
-    others = {"paper": gains.papers(limited)}
-    if gains.differ(limited, others["paper"]):
-        others["before"] = limited
     fixed = {}
     for name, other in others.items():
         trials, values = report.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
         fixed[name] = _point(np.nan, values, np.nan, trials, ready.requirements)
     count = next(iter(judged.values()))[1].status.size if judged else 0
-    return Front(_marked(judged), fixed, fresh_seed, count, evaluate.rollouts, evaluate.gradients)
+    return Front(_marked(judged), fixed, refused, fresh_seed, count, evaluate.rollouts, evaluate.gradients)
 
 
 def check(scenario: Scenario) -> None:
@@ -194,7 +193,7 @@ def _point(limit, named, trained, trials: Trials, requirements: Sequence[Require
         trained=trained,
         rms=float(trust.rms(errors)) if errors.size else np.nan,
         interval=trust.interval(errors, trust.rms),
-        peak=float(np.quantile(peaks, quantile)) if peaks.size else np.nan,
+        peak=statistics.value_at(np.sort(peaks), quantile) if peaks.size else np.nan,
         mean_peak=float(np.mean(peaks)) if peaks.size else np.nan,
         failures=int(np.sum(~trials.ok)),
         meets=all(v.met for v in verdicts) and bool(np.all(trials.ok)),
@@ -215,13 +214,17 @@ def _marked(judged: dict[float, tuple[Point, Trials]]) -> list[Point]:
 
 
 def _beats(one: tuple[Point, Trials], other: tuple[Point, Trials]) -> bool:
-    """Whether a point asks for no more torque than another and is more accurate, beyond the interval of the ratio."""
-    if one[0] is other[0] or not (one[0].peak <= other[0].peak and one[0].rms < other[0].rms):
+    """Whether a point asks for no more torque than another and is more accurate, beyond the interval of the ratio.
+
+    One more of whose trials fail beats none. A trial where nothing is drawn has no interval.
+    """
+    (a, flown), (b, _) = one, other
+    if a is b or a.failures > b.failures or not (a.peak <= b.peak and a.rms < b.rms):
         return False
     both = one[1].finished & other[1].finished
     errors = (np.asarray(pair[1].metrics.window_error)[both] for pair in (other, one))
     interval = trust.ratio_interval(*errors)
-    return interval is None or interval[0] > 1.0
+    return flown.status.size == 1 if interval is None else interval[0] > 1.0
 
 
 def knee_of(points: np.ndarray) -> int:
@@ -257,6 +260,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "gradients": front.gradients,
         "points": [said(point) for point in front.points],
         **{name: said(point) for name, point in front.others.items()},
+        "paper_refused": front.paper_refused,
     }
 
 

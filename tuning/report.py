@@ -14,6 +14,7 @@ from ptsmc_jax.pace import Reach, reach_of
 from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_within
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, replace, study
+from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
 from tuning import evolution, gains, objective, trust
@@ -51,7 +52,8 @@ class Tuning:
     search: Search
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials as they were trained on
-    fresh: dict[str, Trials]  # by whose gains: "tuned", "paper" and, where they differ from it, "before"
+    fresh: dict[str, Trials]  # by whose gains: "tuned" and those it is set `beside`
+    paper_refused: str | None  # why the paper's are not among them
     seed: int
     fresh_seed: int
     judged_gains: dict[str, dict[str, float]]  # the gains of each of them
@@ -95,6 +97,7 @@ def tune(
     report("compiling", 0, 0, np.nan, 0.0)
     posed = pose(scenario, seed, journal)
     ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
+    others, refused = beside(scenario)
     found = search(
         evaluate,
         problem,
@@ -116,11 +119,8 @@ def tune(
     trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
-    candidates = {"tuned": tuned, "paper": gains.papers(scenario)}
-    if gains.differ(scenario, candidates["paper"]):
-        candidates["before"] = scenario
     fresh, judged_gains = {}, {}
-    for name, candidate in candidates.items():
+    for name, candidate in {"tuned": tuned, **others}.items():
         fresh[name] = judge(candidate, fresh_seed, ready.requirements)
         judged_gains[name] = gains.gains_of(study(as_flown(candidate)).parts)
     verdicts = verdicts_of(ready.requirements, fresh["tuned"])
@@ -139,7 +139,7 @@ def tune(
                 trust.slope_error(evaluate, found.smooth, found.z),
             ),
             profiles=trust.profiles(evaluate, found.problem, found.z),
-            sensitivities=trust.sensitivities(found.problem, found.gains, wanted),
+            sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, wanted),
         )
     return Tuning(
         tuned=tuned,
@@ -148,6 +148,7 @@ def tune(
         at_bound=evaluate.bounds.at_bound(found.gains),
         training=training,
         fresh=fresh,
+        paper_refused=refused,
         seed=seed,
         fresh_seed=fresh_seed,
         judged_gains=judged_gains,
@@ -214,6 +215,19 @@ def seed_of_judge(seed: int) -> int:
     return draws.derive(seed, "fresh trials")
 
 
+def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
+    """What tuned gains are set beside: "paper", the paper's, and "before", the scenario's own where they differ.
+
+    And why the scenario cannot be flown with the paper's, which are then not among them.
+    """
+    try:
+        found, refused = {"paper": gains.papers(scenario)}, None
+        study(as_flown(found["paper"]))
+    except ScenarioError as error:
+        return {"before": scenario}, str(error)
+    return found | ({"before": scenario} if gains.differ(scenario, found["paper"]) else {}), refused
+
+
 def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
     """A scenario's gains on fresh trials, as flown; as many as every quantile that is asked for takes."""
     flown = study(as_flown(scenario))
@@ -223,7 +237,10 @@ def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requiremen
 
 def verdicts_of(requirements: Sequence[Requirement], trials: Trials) -> list[Verdict]:
     """One for each requirement over these trials."""
-    return [r.verdict(getattr(trials.metrics, r.metric), trials.finished) for r in requirements]
+    alone = trials.status.size == 1  # nothing is drawn: no share of the trials to speak of
+    finished = trials.finished[0] if alone else trials.finished
+    values = [getattr(trials.metrics, r.metric) for r in requirements]
+    return [r.verdict(v[0] if alone else v, finished) for r, v in zip(requirements, values, strict=True)]
 
 
 def as_flown(scenario: Scenario) -> Scenario:
@@ -236,6 +253,14 @@ def as_flown(scenario: Scenario) -> Scenario:
     ):
         changes["controller__sign_width"] = 0.0
     return replace(scenario, **changes)
+
+
+def judged_on(flown: Scenario) -> str:
+    """What a scenario was flown on to be judged, in words."""
+    if flown.loop.mode != "sampled":
+        return "the continuous loop"
+    width = getattr(flown.controller, "sign_width", 0.0)
+    return "flight clock, " + (f"sign {width:g} wide" if width else "exact sign")
 
 
 def trials_of(ready: Study, wanted: int) -> int:

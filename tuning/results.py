@@ -13,7 +13,7 @@ from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.tables import Scenario
 from tuning import gains as gain_names
 from tuning import trust
-from tuning.report import GOALS, Trust, Tuning
+from tuning.report import GOALS, Trust, Tuning, judged_on
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 
@@ -49,25 +49,21 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     groups = {
         name: {"gains": tuning.judged_gains[name], **statistics(trials, kind)} for name, trials in tuning.fresh.items()
     }
-    tuned, paper = (groups[name]["window_error"] for name in ("tuned", "paper"))
-    both = tuning.fresh["tuned"].finished & tuning.fresh["paper"].finished
-    errors = {name: np.asarray(tuning.fresh[name].metrics.window_error)[both] for name in ("paper", "tuned")}
     checked = None if tuning.check is None else asdict(tuning.check)
     return {
         "status": tuning.status,
         "plant": kind,
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
-        "accuracy_gain_over_paper": paper["rms"] / tuned["rms"] if tuned and paper else None,
-        "accuracy_gain_interval": trust.ratio_interval(errors["paper"], errors["tuned"]),
+        **_accuracy_gain(tuning.fresh),
         "interval_confidence": trust.CONFIDENCE,
         "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
         "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
-        "paper": {"seed": tuning.fresh_seed, **groups["paper"]},
-        **({"before": {"seed": tuning.fresh_seed, **groups["before"]}} if "before" in groups else {}),
+        **{name: {"seed": tuning.fresh_seed, **group} for name, group in groups.items() if name != "tuned"},
+        "paper_refused": tuning.paper_refused,
         "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
-        "judged_on": "flight clock, exact sign" if tuning.tuned.loop.mode == "sampled" else "the continuous loop",
+        "judged_on": judged_on(tuning.tuned),
         "search": {
             "objective": tuning.tuned.tune.objective,
             "goal": found.value,
@@ -76,6 +72,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rounds_with_harder_trials": found.rounds,
             "dropped_starts": found.dropped,
             "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
+            "worst_case": tuning.tuned.tune.worst_case,
             "hardest": None
             if found.hardest is None
             else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
@@ -87,6 +84,18 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": checked,
+    }
+
+
+def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
+    """How many times the paper's accuracy, over the trials that both fly to the end."""
+    both = fresh["tuned"].finished & fresh["paper"].finished if "paper" in fresh else np.zeros(0, bool)
+    if not both.any():
+        return {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
+    paper, tuned = (np.asarray(fresh[name].metrics.window_error)[both] for name in ("paper", "tuned"))
+    return {
+        "accuracy_gain_over_paper": trust.rms(paper) / trust.rms(tuned),
+        "accuracy_gain_interval": trust.ratio_interval(paper, tuned),
     }
 
 
@@ -117,7 +126,8 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     store.write_json(folder / "versions.json", store.versions(**known_by))
     store.write_json(folder / "summary.json", summary(tuning))
     assert scenario.tune is not None
-    goal = {"t_f": "t_f"}.get(scenario.tune.objective, f"{scenario.tune.objective}_window_error")
+    objective = scenario.tune.objective
+    goal = objective if objective == "t_f" else f"{objective}_window_error"
     over = [f"{m}_over_limit" for m in scenario.requirements]
     rows = [
         [step, start, row.value[start], *row.gains[start], *row.worst[start]]

@@ -66,9 +66,10 @@ def grid(cells: list[Any], folder: Path) -> None:
     print(f"{len(flown)} of {len(cells)} pairs flown, {sum(cell.failures > 0 for cell in flown)} with failed trials")
     known = [cell for cell in flown if cell.window_error == cell.window_error]
     if known:
-        best = min(known, key=lambda cell: cell.window_error)
+        best = min(known, key=lambda cell: (cell.failures, cell.window_error))
         where = f"{best.x:.4g} (across) and {best.y:.4g} (up)"
-        print(f"smallest RMS window error {best.window_error:.3g} at {where}, mean peak {best.peak_torque:.3g}")
+        failed = f", where {best.failures} trials failed" if best.failures else ""
+        print(f"smallest RMS window error {best.window_error:.3g} at {where}, mean peak {best.peak_torque:.3g}{failed}")
     print(f"results in {folder}")
 
 
@@ -92,7 +93,7 @@ def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
-    alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, flight clock, exact sign"
+    alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
     table(told.comparison(summary))
     say(*told.comparison_lines(summary), f"results in {folder}")

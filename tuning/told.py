@@ -31,7 +31,8 @@ def verdict(told: Summary) -> str:
     text += f"; within it {100 * told['share']:.6g} % (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
     if told["quantile"] is not None and told["confidence"] is not None:
         text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
-        text += f"; with so many failures {told['fewest_trials']} trials would do"
+        if told["share"] > told["quantile"]:
+            text += f"; with so many failures {told['fewest_trials']} trials would do"
     return text
 
 
@@ -72,7 +73,7 @@ def tuning(summary: Summary) -> Table:
     from ptsmc_jax.metrics import CATALOGUES
     from tuning.gains import UNITS, base
 
-    groups = {"paper": summary["paper"], "before": summary.get("before"), "tuned": summary["fresh"]}
+    groups = {"paper": summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     rows: list[tuple[str, ...]] = []
     kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
@@ -104,12 +105,22 @@ def accuracy(summary: Summary) -> Iterator[str]:
     """How accurate the tuned gains are."""
     times = summary["accuracy_gain_over_paper"]
     if times is not None:
-        yield f"accuracy: {times:.1f} times the paper's gains'" + _between(summary.get("accuracy_gain_interval"), ".1f")
+        yield f"accuracy: {times:.3g} times the paper's gains'" + _between(summary.get("accuracy_gain_interval"), ".3g")
+    yield from paper_refused(summary)
     trained, fresh = summary["training"]["window_error"], summary["fresh"]["window_error"]
+    before = summary.get("before")
+    if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
+        yield "the scenario's own gains are more accurate than these: see tune.bounds and the requirements"
     if trained and fresh:
         both = [f"{where} {one['rms']:.3e}" + _between(one.get("rms_interval"), ".3e")
                 for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
         yield f"RMS window error: {', '.join(both)}"
+
+
+def paper_refused(summary: Summary) -> Iterator[str]:
+    """Why nothing is set beside the paper's gains, if so."""
+    if summary.get("paper_refused"):
+        yield f"the paper's gains cannot fly this, and are left out: {summary['paper_refused']}"
 
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
@@ -122,18 +133,21 @@ def search(summary: Summary) -> Iterator[str]:
     if found["dropped_starts"]:
         yield f"starts dropped, since they met a number that is not finite: {found['dropped_starts']}"
     for metric, ratio in found.get("largest_over_limit", {}).items():
-        if ratio > 1.0:
-            yield f"no gains found within the bounds keep {metric}: at best {ratio:.3g} times its limit in training"
+        if ratio is None or ratio > 1.0:
+            far = "has no value" if ratio is None else f"reaches {ratio:.3g} times its limit"
+            yield f"no gains found within the bounds keep every limit: with these {metric} {far} in training"
     hardest = found.get("hardest")
     if hardest is not None and hardest["unbounded"]:
-        moved = " and ".join(name.replace("_", " ") for name in hardest["moved"])
+        moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
+        reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
         yield (
-            f"worst case: {hardest['metric']} has none over {moved}, which reach a singularity of the law; "
+            f"worst case: {hardest['metric']} has none over {moved}, which {reach}; "
             f"ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
     elif hardest is not None:
-        said = f"worst case inside the dispersions: {hardest['metric']} {hardest['ratio']:.3f} times its limit"
-        yield said + ("; tune.worst_case = true tunes for it" if hardest["beyond"] else "")
+        far = "has no value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+        advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
+        yield f"worst case inside the dispersions: {hardest['metric']} {far}{advice}"
     if "rollouts" in found:
         yield (
             f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
@@ -145,10 +159,12 @@ def search(summary: Summary) -> Iterator[str]:
         yield f"descended under the smooth sign, settled under the exact one: their goals differ by {off:+.2g} % here"
     checked = summary.get("differential_evolution")
     if checked is not None:
-        yield (
-            f"differential evolution: {checked['value']:.4e}, the search is {100 * checked['distance']:+.2f} % from it "
-            f"({checked['rollouts']} rollouts)"
-        )
+        kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
+        beside = f"the search is {100 * checked['distance']:+.2f} % from it"
+        if not checked["kept"] or not kept:
+            beside = "keeps every limit, unlike the search" if checked["kept"] else "keeps not every limit either"
+            beside = "breaks a limit, which the search keeps" if kept else beside
+        yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
 
 
 def trust(summary: Summary) -> Iterator[str]:
@@ -159,7 +175,7 @@ def trust(summary: Summary) -> Iterator[str]:
         yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
     for gain, how in influence.items():
         if how == "none":
-            yield f"{gain} has no influence: the goal changes by less than 1 % between its bounds"
+            yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
     if believed is None:
         return
     off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
@@ -206,6 +222,7 @@ def comparison(summary: Summary) -> Table:
 
 def comparison_lines(summary: Summary) -> Iterator[str]:
     """The gains of each law, and trials that went wrong."""
+    yield from paper_refused(summary)
     for law, found in summary["laws"].items():
         gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
         bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
@@ -225,19 +242,21 @@ def front(summary: Summary) -> Table:
     names = list(kept[0]["gains"]) if kept else []
     rows: list[tuple[str, ...]] = []
     for name, point in [("", p) for p in kept] + [(n, summary[n]) for n in ("paper", "before") if n in summary]:
-        low, high = point["interval"] or (point["rms"], point["rms"])
+        low, high = point["interval"] or (None, None)
         marks = [word for word in ("knee", "meets") if point[word]]
         if point["failures"]:
             marks.append(f"{point['failures']} failed or missed")
         cells = (f"{point['gains'].get(gain, float('nan')):.4g}" for gain in names)
-        rows.append((name, f"{point['peak']:.4g}", f"{point['mean_peak']:.4g}", f"{point['rms']:.3e}",
-                     f"{50 * (high - low) / point['rms']:.1f} %", *cells, ", ".join(marks)))  # fmt: skip
+        within = "-" if low is None or high is None else f"{50 * (high - low) / point['rms']:.1f} %"
+        numbers = (_digits(point["peak"], ".4g"), _digits(point["mean_peak"], ".4g"), _digits(point["rms"], ".3e"))
+        rows.append((name, *numbers, within, *cells, ", ".join(marks)))
     torque, error = units["peak_torque"][0], units["window_error"][0]
     return Table(("", f"peak {torque}", "mean", f"error {error}", "+-", *names, ""), rows)
 
 
 def front_lines(summary: Summary) -> Iterator[str]:
     """What is left out of a front, and whether anything on it will do."""
+    yield from paper_refused(summary)
     kept = [point for point in summary["points"] if not point["dominated"]]
     lost = len(summary["points"]) - len(kept)
     if lost:
@@ -267,9 +286,11 @@ def campaign(summary: Summary) -> Table:
 
 
 def _number(value: float | None) -> str:
-    if value is None or value != value:
-        return "-"
-    return "none" if value in (float("inf"), float("-inf")) else f"{value:.3g}"
+    return "none" if value in (float("inf"), float("-inf")) else _digits(value, ".3g")
+
+
+def _digits(value: float | None, form: str) -> str:
+    return "-" if value is None or value != value else f"{value:{form}}"
 
 
 def campaign_counts(summary: Summary) -> Iterator[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from ptsmc_jax import montecarlo
+from tuning.bounds import Bounds
 from tuning.evaluate import Evaluator
 from tuning.gains import with_gains
 from tuning.objective import Problem
@@ -18,7 +19,7 @@ DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
 STEP = 1e-2  # of the gains, relative, for sensitivities
 SMALLEST = 1e-6  # slopes of ln F below this are none
 ACROSS = 15  # gains looked at between the bounds of each, besides the one found
-FLAT = 0.01  # a goal that changes by less than this share between the bounds does not depend on the gain
+FLAT = 0.01  # what changes by less than this share between the bounds does not depend on the gain
 CONFIDENCE = 0.95  # of intervals
 RESAMPLED = 2000  # times, for an interval
 
@@ -42,12 +43,14 @@ class Profile:
 
     gain: np.ndarray  # (points,)
     value: np.ndarray  # (points,) the goal
-    over: np.ndarray  # (points,) largest metric / limit; -inf without a requirement
+    over: np.ndarray  # (points,) largest metric / limit; zero without a requirement
+    f: np.ndarray  # (points,) F: ln of the goal, with what the torque weighs in it
 
     @property
     def flat(self) -> bool:
-        """Whether the goal does not depend on the gain."""
-        return bool(self.value.max() <= (1.0 + FLAT) * self.value.min())
+        """Whether neither F nor the nearest limit depends on the gain."""
+        steady = self.f.max() - self.f.min() <= np.log1p(FLAT)
+        return bool(steady and self.over.max() <= (1.0 + FLAT) * self.over.min())
 
 
 def profiles(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> dict[str, Profile]:
@@ -58,17 +61,22 @@ def profiles(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> dict[str, 
         points[k, :, k] = np.sort(np.append(np.log(share / (1.0 - share)), z[k]))
     flown = evaluate.fly(problem, points.reshape(-1, z.size))
     gains = np.asarray(jax.vmap(evaluate.bounds.gains)(jnp.asarray(points.reshape(-1, z.size))))
-    over = flown.c.max(axis=(1, 2), initial=-np.inf) + 1.0
+    over = flown.c.max(axis=(1, 2), initial=-1.0) + 1.0
     shape = (z.size, ACROSS + 1)
-    rows = zip(problem.names, range(z.size), np.exp(flown.value).reshape(shape), over.reshape(shape), strict=True)
-    return {name: Profile(gains.reshape(*shape, -1)[k, :, k], value, most) for name, k, value, most in rows}
+    gains, value, over, f = (v.reshape(*shape, -1) for v in (gains, np.exp(flown.value), over, flown.f))
+    return {
+        name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0]) for k, name in enumerate(problem.names)
+    }
 
 
-def sensitivities(problem: Problem, gains: np.ndarray, names: Sequence[str]) -> dict[str, dict[str, float]]:
+def sensitivities(
+    problem: Problem, bounds: Bounds, gains: np.ndarray, names: Sequence[str]
+) -> dict[str, dict[str, float]]:
     """D ln(metric) / d ln(gain), percent by percent, of each metric's RMS over the averaged trials; by metric and gain.
 
-    Central differences of the program that judges, which has every metric: one that slopes are compiled for takes
-    longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is left out.
+    Central differences inside the bounds, of the program that judges, which has every metric: one that slopes are
+    compiled for takes longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is
+    left out.
     """
     trials = np.asarray(problem.trials)[: problem.averaged]
 
@@ -77,9 +85,12 @@ def sensitivities(problem: Problem, gains: np.ndarray, names: Sequence[str]) -> 
         flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
         return np.asarray([rms(getattr(flown.metrics, name)[flown.finished]) for name in names])
 
-    steps = np.diag(STEP * gains)
+    less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        rows = [np.log(statistics(gains + step) / statistics(gains - step)) / (2.0 * STEP) for step in steps]
+        rows = [
+            np.log(statistics(more[k]) / statistics(less[k])) / np.log(more[k, k] / less[k, k])
+            for k in range(gains.size)
+        ]
     return {
         metric: dict(zip(problem.names, row.tolist(), strict=True))
         for metric, row in zip(names, np.transpose(rows), strict=True)

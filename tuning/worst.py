@@ -14,7 +14,7 @@ from ptsmc_jax import lanes, montecarlo, rollout
 from ptsmc_jax.dispersions import INERTIA, Coordinates
 from ptsmc_jax.requirements import Requirement
 from tuning.gains import with_gains
-from tuning.objective import FAILED, Problem, coordinates_of
+from tuning.objective import Problem, coordinates_of, judged
 
 SCREENED = 4096  # trials looked through
 CLIMBERS = 8  # of the hardest ones, from which is climbed
@@ -52,8 +52,8 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
     flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
-    ratios = [np.where(flown.finished, getattr(flown.metrics, r.metric) / r.limit, np.inf) for r in requirements]
-    return trials, np.max(ratios, axis=0)
+    ratios = np.stack([getattr(flown.metrics, r.metric) / r.limit for r in requirements])
+    return trials, np.max(np.where(flown.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
 
 def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Hardest:
@@ -68,11 +68,12 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     coordinates = coordinates_of(problem.dispersion, int(problem.seed), chosen)
     moved = tuple(name for name in coordinates if name != INERTIA)
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
-    y = np.concatenate([_charted(problem, name, np.asarray(coordinates[name])) for name in moved], axis=1)
+    charted = [_charted(problem, name, np.asarray(coordinates[name])) for name in moved]
+    y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)
     case = (parts, problem.dispersion, problem.seed, jnp.asarray(chosen), coordinates, limits)
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
     state, best, best_y = optimiser.init(jnp.asarray(y)), np.full(len(y), -np.inf), y.copy()
-    for _ in range(STEPS + 1):
+    for _ in range(STEPS + 1 if moved else 0):
         value, slope = (np.asarray(v) for v in _climb(*case, jnp.asarray(y), moved, names))
         better = value > best
         best[better], best_y[better] = value[better], y[better]
@@ -84,7 +85,8 @@ def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.nda
     found = {**coordinates, **_moved(problem.dispersion, coordinates, jnp.asarray(best_y), moved)}
     one = {name: v[first] for name, v in found.items()}
     metrics, code, _, values, _ = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
-    ratios = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
+    reached = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
+    ratios = [np.inf if np.isnan(one) else one for one in reached]  # it has no value: it never settles, say
     worst = int(np.argmax(ratios))
     return Hardest(
         metric=names[worst],
@@ -132,9 +134,8 @@ def _climb(parts, dispersion, seed, trials, coordinates, limits, y, moved, names
         def fly(case: tuple) -> jax.Array:
             trial, own = case
             metrics, status, *_ = montecarlo.one(parts, dispersion, seed, trial, own)
-            ok = (status == rollout.OK) | (status == rollout.MISSED)
-            ratios = jnp.stack([getattr(metrics, name) for name in names]) / limits
-            return jnp.where(ok, jnp.max(ratios), FAILED)
+            ratios = jnp.stack([judged(getattr(metrics, name) / limits[k], status) for k, name in enumerate(names)])
+            return jnp.max(ratios)
 
         return lanes.vmap(fly)((trials, {**coordinates, **_moved(dispersion, coordinates, y, moved)}))
 
