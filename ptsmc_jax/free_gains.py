@@ -135,9 +135,13 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
 
 
 def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, ...]) -> tuple[float, float]:
+    """Default bounds, which hold the scenario's own gain wherever the law allows it."""
     t_f, delta = scenario.controller.t_f, hand_over(scenario)
+    own = getattr(scenario.controller, name, None)
     if name == "eta":
-        return least_eta(scenario) + 0.05, least_eta(scenario) + 6.0
+        least = least_eta(scenario)
+        eta = float(own or least + 1.0)  # a law without it is refused later
+        return min(least + 0.05, (least + eta) / 2), max(least + 6.0, eta + 1.0)
     if name == "t_f":
         least = delta if "delta" not in free else 4.0 * _shortest_delta(scenario)
         return max(0.5 * t_f, 1.05 * least, 1.05 * _t_o(scenario)), 2.0 * t_f
@@ -145,14 +149,14 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         if "t_f" in free:  # below every t_f
             t_f = (tune.bounds.get("t_f") or _default(scenario, tune, "t_f", free))[0]
         lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
-        return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
+        return lower, min(max(5.0, t_f / 8, 4 * lower, 2 * delta), (lower + t_f) / 2)
     if name == "filter_bandwidth":
-        own = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
-        return 0.1 * own, max(own, min(10.0 * own, 1.0 / _interval(scenario)))
+        width = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
+        return 0.1 * width, max(width, min(10.0 * width, 1.0 / _interval(scenario)))
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
         assert scenario.observer.gain is not None
-        own = min(scenario.observer.gain), max(scenario.observer.gain)
-        return max(scenario.controller.disturbance_rate_bound, 0.05 * own[0]), 50.0 * own[1]
+        each = scenario.observer.gain
+        return max(scenario.controller.disturbance_rate_bound, 0.05 * min(each)), 50.0 * max(each)
     if name == "gamma":
         least = 1.0 + 1.0 / (tune.bounds.get("p") or _default(scenario, tune, "p", free))[0]
         return least + 0.05, least + 2.0
@@ -166,7 +170,7 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
             size = float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
             low, high = size * low, size * high
         return min(low, 0.5 * min(each)), max(high, 2.0 * max(each))
-    return {
+    low, high = {
         "k1": (3.5 / t_f, 350.0 / t_f),
         "sign_width": (1e-5, 1e-1),
         **dict.fromkeys(("k_p", "k"), (2.0 / t_f**2, 2000.0 / t_f**2)),
@@ -177,6 +181,9 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         "m": (1.05, 3.0),
         "n": (0.05, 0.95),
     }[name]
+    if own and name not in _POWERS:
+        return min(low, 0.5 * own), max(high, 2.0 * own)
+    return low, high
 
 
 def _least_p(scenario: Scenario) -> float:

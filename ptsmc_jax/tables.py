@@ -87,7 +87,7 @@ class Tune(Table, frozen=True):
 
     Attributes:
         free: the gains to find; default: eta, delta and observer_gain, of the other laws theirs
-        bounds: two numbers for each gain; by default what the law, the period and t_f allow: see scenario.toml of a run
+        bounds: two numbers for each gain; by default from law, period, t_f and body: see scenario.toml of a run
         per_axis: observer_gain as one number for each axis
         objective: minimised: RMS window error, the largest one, its CVaR, or t_f, the shortest for the requirements
         level: the CVaR is the RMS of the worst 1 - level of the trials; with "cvar" only, default: 0.9

@@ -14,6 +14,7 @@ from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.scenario import replace, study
 from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.statistics import value_at
 from ptsmc_jax.tables import Scenario
 from tuning import gains, report, trust
 from tuning.journal import Journal
@@ -164,7 +165,7 @@ def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
 
 def _quantile(late: np.ndarray, q: float) -> float | None:
     """Of settling times [s], infinite where a trial never settles; None: that is never."""
-    found = float(np.quantile(late, q, method="inverted_cdf"))
+    found = value_at(np.sort(late), q)
     return found if np.isfinite(found) else None
 
 

@@ -36,6 +36,9 @@ APART = 1e-3  # free reals of two points, at least
 RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
 
 
+Found = tuple[float, float, np.ndarray]  # F, goal, free reals
+
+
 @dataclass(frozen=True)
 class Point:
     """Gains on the front, or off it."""
@@ -111,20 +114,9 @@ def trace(
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
-    known = [free.z, least.z]
-    best: dict[int, tuple[float, float, np.ndarray]] = {}  # rung: F, goal, free reals
-    rungs = [*range(points - 1, -1, -1), *range(points)]
-    for done, k in enumerate(rungs):
-        tell("ladder", done, len(rungs), np.nan, 0.0)
-        found = _step(evaluate, under(float(ladder[k])), np.unique(np.asarray(known), axis=0), posed.exact)
-        if found is not None and (k not in best or found[0] < best[k][0]):
-            best[k] = found
-            known.append(found[2])
+    climbed = _climb([under(limit) for limit in ladder], evaluate, [free.z, least.z], posed.exact, tell)
+    climbed = {float(ladder[k]): found for k, found in climbed.items()}
     fresh_seed = report.seed_of_judge(seed)
-    climbed: dict[float, tuple[float, float, np.ndarray]] = {}
-    for k in sorted(best):  # one rung of those that a limit does not hold back, and whose gains are the same
-        if all(np.abs(best[k][2] - other[2]).max() >= APART for other in climbed.values()):
-            climbed[float(ladder[k])] = best[k]
     judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
     fixed = {}
     for name, other in others.items():
@@ -158,9 +150,29 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _step(
-    evaluate: Evaluator, problem: Problem, known: np.ndarray, exact: bool
-) -> tuple[float, float, np.ndarray] | None:
+def _climb(
+    ladder: Sequence[Problem], evaluate: Evaluator, known: list[np.ndarray], exact: bool, tell: Report
+) -> dict[int, Found]:
+    """What is found on each rung, down the ladder and up again, each from what is known by then.
+
+    One rung of those that a limit does not hold back, and whose gains are the same.
+    """
+    best: dict[int, Found] = {}
+    rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
+    for done, k in enumerate(rungs):
+        tell("ladder", done, len(rungs), np.nan, 0.0)
+        found = _step(evaluate, ladder[k], np.unique(np.asarray(known), axis=0), exact)
+        if found is not None and (k not in best or found[0] < best[k][0]):
+            best[k] = found
+            known.append(found[2])
+    apart: dict[int, Found] = {}
+    for k in sorted(best):
+        if all(np.abs(best[k][2] - other[2]).max() >= APART for other in apart.values()):
+            apart[k] = best[k]
+    return apart
+
+
+def _step(evaluate: Evaluator, problem: Problem, known: np.ndarray, exact: bool) -> Found | None:
     """F, goal and free reals of the best gains that keep these limits, from the most promising known ones."""
     flown = evaluate.fly(with_sign(problem, 0.0) if exact else problem, known)
     over = flown.c.max(axis=(1, 2), initial=0.0)
