@@ -58,7 +58,7 @@ def test_shortest_time_from_rest_is_the_rule():
 def test_a_limit_below_the_disturbance_cannot_be_kept():
     found = design.shortest_time(scenario.from_tables({}), 0.009, 0, np.arange(1))
     assert (found.theory, found.simulated) == (None, None)
-    assert str(found) == "no t_f keeps these gains below the limit of 0.009"
+    assert str(found) == "no t_f up to 100 times the scenario's keeps these gains below the limit of 0.009"
 
 
 def test_shortest_time_of_a_chain():
