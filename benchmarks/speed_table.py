@@ -4,8 +4,8 @@
 
 Makes an environment for each under benchmarks/ (a C compiler and a package index are needed; --keep: takes those that
 are there as they are), runs the scripts one after the other, and prints a Markdown table: million trial-steps a second
-of both, measured in one run, and their ratio. What cannot be measured here stands in it with the reason. Takes about
-ten minutes, and as long again on a machine with a GPU; leave the machine alone meanwhile.
+of both, measured in one run, and their ratio. What cannot be measured here stands in it with the reason. Leave the
+machine alone meanwhile.
 """
 
 import datetime
