@@ -51,10 +51,14 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     if free is None:
         law = _BASELINES.get(scenario.controller.kind, ("eta", "delta"))
         free = (*law, "observer_gain") if _has_gain(scenario) else law
-    bounds = {**{key: _default(scenario, tune, key, free) for key in free if key not in tune.bounds}, **tune.bounds}
-    bounds = {key: bounds[key] for key in (*free, *(key for key in bounds if key not in free)) if key in bounds}
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
-    return msgspec.structs.replace(tune, free=free, bounds=bounds, level=level)
+    tune = msgspec.structs.replace(tune, free=free, level=level)
+    bounds = dict(tune.bounds)
+    for key in sorted(free, key=lambda name: name not in ("t_f", "p")):  # those first that bounds of others go by
+        if key not in bounds:
+            bounds[key] = _default(scenario, msgspec.structs.replace(tune, bounds=bounds), key)
+    given = (key for key in bounds if key not in free)
+    return msgspec.structs.replace(tune, bounds={key: bounds[key] for key in (*free, *given)})
 
 
 def check(scenario: Scenario, tune: tables.Tune) -> None:
@@ -134,43 +138,58 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
     return 0.0, math.inf, False
 
 
-def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, ...]) -> tuple[float, float]:
-    """Default bounds, which hold the scenario's own gain wherever the law allows it."""
-    t_f, delta = scenario.controller.t_f, hand_over(scenario)
-    own = getattr(scenario.controller, name, None)
-    if name == "eta":
-        least = least_eta(scenario)
-        eta = float(own or least + 1.0)  # a law without it is refused later
-        return min(least + 0.05, (least + eta) / 2), max(least + 6.0, eta + 1.0)
+def _default(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, float]:
+    """The usual bounds, moved where the law allows the scenario's own gain outside them.
+
+    Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
+    """
+    (low, high), own = _usual(scenario, tune, name), _own(scenario, name)
+    if own:  # a gain that the law does not have is refused later
+        least, most, _ = _range(scenario, tune, name)
+        if least < min(own) < low:
+            low = (least + min(own)) / 2
+        if high < max(own) < most:
+            high = min(2 * max(own) - least, (max(own) + most) / 2)
+    return low, high
+
+
+def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
+    """The scenario's gain of this name, on each axis where it has several; none if it has none."""
+    if name == "observer_gain":
+        return getattr(scenario.observer, "gain", None) or ()
+    value = getattr(scenario.controller, name, None)
+    return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)
+
+
+def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, float]:
+    t_f, free = scenario.controller.t_f, tune.free or ()
+    least = least_eta(scenario)
     if name == "t_f":
-        least = delta if "delta" not in free else 4.0 * _shortest_delta(scenario)
-        return max(0.5 * t_f, 1.05 * least, 1.05 * _t_o(scenario)), 2.0 * t_f
-    if name == "delta":
-        if "t_f" in free:  # below every t_f
-            t_f = (tune.bounds.get("t_f") or _default(scenario, tune, "t_f", free))[0]
+        shortest = 4.0 * _shortest_delta(scenario) if "delta" in free else hand_over(scenario)
+        return max(0.5 * t_f, 1.05 * shortest, 1.05 * _t_o(scenario)), 2.0 * t_f
+    if name == "delta":  # below every t_f
+        t_f = tune.bounds.get("t_f", (t_f,))[0]
         lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
-        return lower, min(max(5.0, t_f / 8, 4 * lower, 2 * delta), (lower + t_f) / 2)
+        return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
         width = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
         return 0.1 * width, max(width, min(10.0 * width, 1.0 / _interval(scenario)))
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
-        assert scenario.observer.gain is not None
-        each = scenario.observer.gain
-        return max(scenario.controller.disturbance_rate_bound, 0.05 * min(each)), 50.0 * max(each)
+        own = _own(scenario, name)
+        return max(scenario.controller.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
     if name == "gamma":
-        least = 1.0 + 1.0 / (tune.bounds.get("p") or _default(scenario, tune, "p", free))[0]
-        return least + 0.05, least + 2.0
+        above = 1.0 + 1.0 / tune.bounds.get("p", (getattr(scenario.controller, "p", 1.05),))[0]
+        return above + 0.05, above + 2.0
     if name == "p" and "gamma" not in free and hasattr(scenario.controller, "gamma"):
-        least = _least_p(scenario)
-        return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
-    if name == "observer_gain":
-        low, high, each = 0.5, 300.0, getattr(scenario.observer, "gain", None) or (10.0,)
-        if scenario.spacecraft is not None:  # these [N m s] for a mean moment of 12 kg m^2
-            moments = np.asarray(scenario.spacecraft.inertia)
-            size = float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
-            low, high = size * low, size * high
-        return min(low, 0.5 * min(each)), max(high, 2.0 * max(each))
-    low, high = {
+        above = _least_p(scenario)
+        return above + 0.05 * (2.0 - above), 2.0 - 0.05 * (2.0 - above)
+    size = 1.0
+    if scenario.spacecraft is not None:  # beside a mean moment of 12 kg m^2
+        moments = np.asarray(scenario.spacecraft.inertia)
+        size = float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
+    return {
+        "eta": (least + 0.05, least + 6.0),
+        "observer_gain": (0.5 * size, 300.0 * size),
         "k1": (3.5 / t_f, 350.0 / t_f),
         "sign_width": (1e-5, 1e-1),
         **dict.fromkeys(("k_p", "k"), (2.0 / t_f**2, 2000.0 / t_f**2)),
@@ -181,9 +200,6 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str, free: tuple[str, 
         "m": (1.05, 3.0),
         "n": (0.05, 0.95),
     }[name]
-    if own and name not in _POWERS:
-        return min(low, 0.5 * own), max(high, 2.0 * own)
-    return low, high
 
 
 def _least_p(scenario: Scenario) -> float:

@@ -143,10 +143,10 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
         one = from_tables({"controller": law, "loop": {"t_end": t_f + 10.0}, "tune": tune})
         assert one.tune is not None
         made[t_f] = one.tune.bounds
-    assert {t_f: tuple(b["delta"]) for t_f, b in made.items()} == {
-        3.5: (0.05, 1.775), 35.0: (0.05, 5.0), 4000.0: (0.05, 500.0),
+    assert {t_f: tuple(b["delta"]) for t_f, b in made.items()} == {  # that of 3.5 s moved to hold the scenario's own
+        3.5: (0.0175, 1.775), 35.0: (0.05, 5.0), 4000.0: (0.05, 500.0),
     }  # fmt: skip
-    np.testing.assert_allclose(made[3.5]["k1"], (0.5, 100.0))  # the scenario's own of 1 is inside
+    np.testing.assert_allclose(made[3.5]["k1"], (1.0, 100.0))
     np.testing.assert_allclose(made[35.0]["k1"], (0.1, 10.0))
     np.testing.assert_allclose(made[4000.0]["k1"], (3.5 / 4000.0, 2.0))
 
@@ -157,12 +157,15 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
         ({"eta": 12.0}, "eta", 12.0),
         ({"eta": 2.03}, "eta", 2.03),
         ({"delta": 9.0}, "delta", 9.0),
+        ({"delta": 0.02}, "delta", 0.02),
         ({"sign_width": 0.5, "delta": 0.5}, "sign_width", 0.5),
         ({"kind": "pd", "k_d": 40.0}, "k_d", 40.0),
+        ({"kind": "terminal", "p": 1.98}, "p", 1.98),
+        ({"kind": "fixed_time", "n": 0.97}, "n", 0.97),
     ],
 )
 def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
-    made = from_tables({"controller": law, "loop": {"mode": "sampled", "period": 0.05}, "tune": {"free": [gain]}})
+    made = from_tables({"controller": law, "loop": {"mode": "sampled", "period": 0.01}, "tune": {"free": [gain]}})
     assert made.tune is not None
     low, high = made.tune.bounds[gain]
     assert low < value < high

@@ -145,7 +145,7 @@ def figures_of(one: Contender) -> dict[str, Any]:
         "at_bound": one.at_bound,
         "met": one.met,
         "counts": trials.counts(),
-        "window_error": float(np.sqrt(np.mean(errors**2))) if done.any() else None,
+        "window_error": float(trust.rms(errors)) if done.any() else None,
         "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
         **mean,
         "largest_peak_torque": float(np.max(trials.metrics.peak_torque[done])) if done.any() else None,

@@ -228,7 +228,7 @@ def _marked(judged: dict[float, tuple[Point, Trials]]) -> list[Point]:
 def _beats(one: tuple[Point, Trials], other: tuple[Point, Trials]) -> bool:
     """Whether a point asks for no more torque than another and is more accurate, beyond the interval of the ratio.
 
-    One more of whose trials fail beats none. A trial where nothing is drawn has no interval.
+    A point with more failed trials does not. One trial, where nothing is drawn, has no interval.
     """
     (a, flown), (b, _) = one, other
     if a is b or a.failures > b.failures or not (a.peak <= b.peak and a.rms < b.rms):

@@ -29,7 +29,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
             continue
         summary[name] = {
             "mean": known.mean(),
-            "rms": np.sqrt(np.mean(known**2)),
+            "rms": trust.rms(known),
             "median": np.median(known),
             "q99": np.quantile(known, 0.99),
             "max": known.max(),

@@ -160,10 +160,12 @@ def search(summary: Summary) -> Iterator[str]:
     checked = summary.get("differential_evolution")
     if checked is not None:
         kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
-        beside = f"the search is {100 * checked['distance']:+.2f} % from it"
-        if not checked["kept"] or not kept:
-            beside = "keeps every limit, unlike the search" if checked["kept"] else "keeps not every limit either"
-            beside = "breaks a limit, which the search keeps" if kept else beside
+        beside = {
+            (True, True): f"the search is {100 * checked['distance']:+.2f} % from it",
+            (True, False): "breaks a limit, which the search keeps",
+            (False, True): "keeps every limit, unlike the search",
+            (False, False): "keeps not every limit either",
+        }[kept, checked["kept"]]
         yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
 
 
