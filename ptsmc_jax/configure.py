@@ -61,6 +61,8 @@ def configure(
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        # entries appear byte by byte: what another process is still writing is compiled here
+        warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
     if device == "gpu":
         try:
             jax.devices()  # starts the backend

@@ -60,6 +60,22 @@ def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
     assert setup._accepted(tmp_path / "file") == GOOD
 
 
+def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(tmp_path):
+    """As another process sees them that starts at the same time."""
+    code = (
+        "import sys; from ptsmc_jax.configure import configure; configure(1, sys.argv[1], fast=False); "
+        "import jax; print(float(jax.jit(lambda x: 3.0 * x + 1.0)(2.0)))"
+    )
+    call = [sys.executable, "-c", code, str(tmp_path)]
+    for _ in range(2):
+        done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert (done.stdout, done.stderr) == ("7.0\n", "")
+        entries = list(tmp_path.glob("*-cache"))
+        assert entries
+        for entry in entries:
+            entry.write_bytes(entry.read_bytes()[:-20])
+
+
 def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones():
     """In processes of their own, as a user's first call: an unknown flag ends the process, wrong numbers too."""
     assert setup._tried(GOOD)
