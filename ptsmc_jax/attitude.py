@@ -32,8 +32,9 @@ def normalise(q: Quaternion) -> Quaternion:
 
 def rotate(q: Quaternion, y: Vector) -> Vector:
     """The vector y, given in the axes that q turns to, in the axes that it turns from: R(q) y, in the units of y."""
-    u = 2.0 * jnp.cross(q[:3], y)
-    return y + q[3] * u + jnp.cross(q[:3], u)
+    v, s = q[:3], q[3]
+    # one cross product: XLA writes out nested ones again for every use, two million lines behind a moving reference
+    return (1.0 - 2.0 * jnp.dot(v, v)) * y + 2.0 * (jnp.dot(v, y) * v + s * jnp.cross(v, y))
 
 
 def t_matrix(q: Quaternion) -> Float[Array, "3 3"]:

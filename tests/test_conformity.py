@@ -141,7 +141,11 @@ ROWS: dict[str, dict] = {
 UNCOMPILED = ("raw samples, full inertia, other truth", "continuous", "chain of order 3")  # a loop of each kind
 
 
-@partial(jax.jit, static_argnames="vmap")
+# a program that flies once: compiling it well takes three times as long, and its numbers are held to 1e-12 either way
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+
+@partial(jax.jit, static_argnames="vmap", compiler_options=QUICKLY)
 def batch(parts, dispersion, vmap):
     """Metrics, status and bad times of some trials, and the metrics' slopes along the law's gains."""
     names = [name for name in parts.controller.free if name not in ("sign_width", "t_f", "k1")]

@@ -156,7 +156,8 @@ def search(summary: Summary) -> Iterator[str]:
     smooth = found.get("goal_under_the_smooth_sign")
     if smooth is not None:
         off = 100 * (smooth / found["goal"] - 1)
-        yield f"descended under the smooth sign, settled under the exact one: their goals differ by {off:+.2g} % here"
+        shown = f"{off:+.0f}" if abs(off) >= 10.0 else f"{off:+.2g}"
+        yield f"descended under the smooth sign, settled under the exact one: their goals differ by {shown} % here"
     checked = summary.get("differential_evolution")
     if checked is not None:
         kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
