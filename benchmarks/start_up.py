@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 PTSMC = Path(sys.executable).with_name("ptsmc")
-FIRST_FLIGHT = str(Path(__file__).parent.parent / "scenarios" / "first_flight.toml")
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
+FIRST_FLIGHT, HARD_FLIGHT = (str(SCENARIOS / f"{name}_flight.toml") for name in ("first", "hard"))
 COMMANDS = {
     "--version": ["--version"],
     "--help": ["--help"],
@@ -42,13 +43,15 @@ def compiling() -> None:
     import jax.numpy as jnp
     from common import study
 
-    from ptsmc_jax import montecarlo, rollout
+    from ptsmc_jax import montecarlo, rollout, scenario
 
     devices = {f"torque_{name}": value for name, value in (("limit", 0.5), ("rate_limit", 5.0), ("lag", 0.1))}
     every = {f"hardware__{k}": v for k, v in {**devices, "delay": 1, "torque_step": 1e-4, "rate_bias": 1e-6}.items()}
-    for name, ready in (("noise off", study()), ("noise on", study(True)), ("every device", study(True, **every))):
+    hard = scenario.study(scenario.read(HARD_FLIGHT))
+    cases = {"noise off": study(), "noise on": study(True), "every device": study(True, **every), "hard flight": hard}
+    for name, ready in cases.items():
         trials = jnp.arange(512, dtype=jnp.uint32).reshape(2, -1, montecarlo.BLOCK)
-        batch = (ready.parts, ready.dispersion, jnp.uint32(0), trials, jnp.int32(2), 2)
+        batch = (ready.parts, ready.dispersion, jnp.uint32(0), trials, jnp.int32(2), 2, None, False)
         for what, function, args in (("batch", montecarlo._fly, batch), ("one run", rollout.simulate_jit,
                                                                          (ready.parts, 0, 0))):  # fmt: skip
             start = time.perf_counter()
