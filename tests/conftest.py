@@ -17,11 +17,9 @@ ROOT = Path(__file__).parent.parent
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # not what walks through programs, equation by equation: it took longer to check every call than to compile
 UNCHECKED = {"lanes", "components", "kernel"}
-packages = [(name, ROOT / name) for name in ("ptsmc_jax", "tuning")]
-hook = install_import_hook(
-    [f"{name}.{path.stem}" for name, folder in packages for path in folder.glob("*.py") if path.stem not in UNCHECKED],
-    "beartype.beartype",
-)
+modules = [path for name in ("ptsmc_jax", "tuning") for path in (ROOT / name).glob("*.py")]
+checked = [f"{path.parent.name}.{path.stem}" for path in modules if path.stem not in UNCHECKED]
+hook = install_import_hook(checked, "beartype.beartype")
 
 MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
