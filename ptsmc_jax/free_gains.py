@@ -139,14 +139,17 @@ def _range(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
 
 
 def _default(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, float]:
-    """The usual bounds, or further out to half and twice what the scenario's own gain keeps from the least allowed."""
+    """The usual bounds, moved where the law allows the scenario's own gain outside them.
+
+    Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
+    """
     (low, high), own = _usual(scenario, tune, name), _own(scenario, name)
     if own:  # a gain that the law does not have is refused later
         least, most, _ = _range(scenario, tune, name)
-        if least < min(own):
-            low = min(low, (least + min(own)) / 2)
-        if max(own) < most:
-            high = max(high, min(2 * max(own) - least, (max(own) + most) / 2))
+        if least < min(own) < low:
+            low = (least + min(own)) / 2
+        if high < max(own) < most:
+            high = min(2 * max(own) - least, (max(own) + most) / 2)
     return low, high
 
 

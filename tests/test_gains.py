@@ -146,7 +146,7 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
     assert {t_f: tuple(b["delta"]) for t_f, b in made.items()} == {  # that of 3.5 s moved to hold the scenario's own
         3.5: (0.0175, 1.775), 35.0: (0.05, 5.0), 4000.0: (0.05, 500.0),
     }  # fmt: skip
-    np.testing.assert_allclose(made[3.5]["k1"], (0.5, 100.0))  # the scenario's own of 1 is inside
+    np.testing.assert_allclose(made[3.5]["k1"], (1.0, 100.0))
     np.testing.assert_allclose(made[35.0]["k1"], (0.1, 10.0))
     np.testing.assert_allclose(made[4000.0]["k1"], (3.5 / 4000.0, 2.0))
 
