@@ -104,6 +104,8 @@ class _Course(NamedTuple):
 
     judged: metrics.Judged
     x0: Any
+    first: Any  # the reference at t = 0
+    arrival: Any  # and at t_f
     whole: Array  # what clearances from the law's singularity are counted in
 
 
@@ -128,7 +130,7 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
     whole = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
-    course = _Course(judged, x0, jax.lax.stop_gradient(whole))
+    course = _Course(judged, x0, target, parts.reference(judged.t_f), jax.lax.stop_gradient(whole))
     loop = _continuous if isinstance(parts.clock, Graded) else _sampled
     return loop(parts, ticks, course, seed, trial, record)
 
@@ -174,7 +176,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
 
     def period(carry: tuple[_State, _Flight], tick: tuple) -> tuple[tuple[_State, _Flight], Any]:
         (now, dt_before, partial), (state, flight) = tick, carry
-        dt = now.t_next - now.t
+        dt, target = now.t_next - now.t, parts.reference(now.t)
         seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
         w = parts.plant.velocity(seen)
         told = (state.u, None) if flight.applied is None else flight.applied
@@ -183,13 +185,13 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         memory = observer.update(jnp.where(partial, first_matrix, matrix), state.memory, impulse, now.t, dt_before)
         memory = jnp.where(dt_before > 0.0, memory, state.memory)
         d_hat = observer.estimate(memory)
-        u, s = controller.torque(now.t, now.hold, seen, parts.reference(now.t), d_hat, k2(now.t))
+        u, s = controller.torque(now.t, now.hold, seen, target, d_hat, k2(now.t))
         drive, queue = actuators.command(flight.acting, u, w, dt, now.noise_weight)
         pushed = flight.pushed
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         delivered = actuators.torque(drive, jnp.zeros_like(dt))
-        row = _row(parts, now.t, state.x, d_hat, delivered, u, s, dt > 0.0, pushed) if record else None
+        row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed) if record else None
         x = fly(state.x, now.t, drive, pushed, dt)
         if actuators.moves:
             weights = (1 / 6, 4 / 6, 1 / 6)
@@ -203,7 +205,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         def until(t: Scalar) -> Any:
             return fly(start, now.t, drive, pushed, t - now.t)
 
-        state = _advance(parts, course, state, now, x, memory, span, until, dt / parts.substeps)
+        state = _advance(parts, course, state, now, target, x, memory, span, until, dt / parts.substeps)
         told = None if actuators.holds else actuators.over(drive, jnp.zeros_like(dt), dt)
         return (state, _Flight(sensing, seen, told, acting, pushed)), row
 
@@ -238,7 +240,7 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
 
     def step(state: _State, tick: tuple) -> tuple[_State, Any]:
         now, linear = tick
-        dt = now.t_next - now.t
+        dt, target = now.t_next - now.t, parts.reference(now.t)
 
         def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
             u, s = controller.torque(t, now.hold, x, parts.reference(t), observer.estimate(memory), k2(t))
@@ -248,12 +250,12 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
 
         x, memory, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, state.memory, dt)
         d_hat = observer.estimate(state.memory)
-        row = _row(parts, now.t, state.x, d_hat, u, u, s, dt > 0.0) if record else None
+        row = _row(parts, now.t, state.x, target, d_hat, u, u, s, dt > 0.0) if record else None
         x = parts.plant.normalise(x)
         _, _, (u_end, _) = rate(now.t_next, x, memory)
         torques = (u, u_middle, u_end)
         span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
-        return _advance(parts, course, state, now, x, memory, span, lambda t: x, dt), row
+        return _advance(parts, course, state, now, target, x, memory, span, lambda t: x, dt), row
 
     state = _begin(parts, course)
     first = state.sight
@@ -264,7 +266,7 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
 def _begin(parts: Parts, course: _Course) -> _State:
     judged, x0 = course.judged, course.x0
     zero, none = jnp.zeros_like(judged.t_f), jnp.zeros(parts.plant.inputs)
-    sight = _sight(parts, zero, x0)
+    sight = _sight(parts, course.first, x0)
     state = _State(
         x=x0,
         memory=parts.observer.begin(),
@@ -274,7 +276,7 @@ def _begin(parts: Parts, course: _Course) -> _State:
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
-    status, bad_time = _watch(parts, course, state, zero, zero, x0, none)
+    status, bad_time = _watch(parts, course, state, course.first, zero, zero, none)
     return state._replace(status=status, bad_time=bad_time)
 
 
@@ -288,32 +290,31 @@ class _Torques(NamedTuple):
     wheel_momentum: Array | None
 
 
-def _advance(parts, course, state: _State, now: Ticks, x, memory, torques: _Torques, until, step) -> _State:
+def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torques: _Torques, until, step) -> _State:
     """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
     step: longest integration step taken in it [s].
     """
-    law, reference, judged = parts.controller, parts.reference, course.judged
-    sight = _sight(parts, now.t_next, x)
+    law, judged, target_next = parts.controller, course.judged, parts.reference(now.t_next)
+    sight = _sight(parts, target_next, x)
 
     def errors() -> tuple:
-        return law.errors(state.x, reference(now.t)), law.errors(x, reference(now.t_next))
+        return law.errors(state.x, target), law.errors(x, target_next)
 
     def arrival() -> tuple:
-        reached, target = until(judged.t_f), reference(judged.t_f)
-        return law.errors(reached, target)[0], law.angle(reached, target)
+        reached = until(judged.t_f)
+        return law.errors(reached, course.arrival)[0], law.angle(reached, course.arrival)
 
     span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
-    status, bad_time = _watch(parts, course, state, now.t_next, step, x, torques.delivered[-1])
-    return _State(
+    after = state._replace(
         x=x,
         memory=memory,
         u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
         sight=sight,
         running=metrics.update(state.running, span, judged),
-        status=status,
-        bad_time=bad_time,
     )
+    status, bad_time = _watch(parts, course, after, target_next, now.t_next, step, torques.delivered[-1])
+    return after._replace(status=status, bad_time=bad_time)
 
 
 def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, held: bool) -> Result:
@@ -325,7 +326,7 @@ def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, hel
         d_hat = parts.observer.estimate(state.memory)
         u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
         u = state.u if held else u
-        last = _row(parts, judged.t_end, state.x, d_hat, u, u, s, jnp.asarray(True), pushed)
+        last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
@@ -333,24 +334,24 @@ def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, hel
     return Result(metrics.finish(state.running, judged), status, bad_time, log)
 
 
-def _sight(parts: Parts, t: Scalar, x: Any) -> metrics.Sight:
-    angle = parts.controller.angle(x, parts.reference(t))
+def _sight(parts: Parts, target: Any, x: Any) -> metrics.Sight:
+    angle = parts.controller.angle(x, target)
     return metrics.Sight(angle, parts.plant.speed(x), numerics.norm(parts.plant.momentum(x)))
 
 
 def _watch(
-    parts: Parts, course: _Course, state: _State, t: Scalar, dt: Scalar, x: Any, u: Array
+    parts: Parts, course: _Course, state: _State, target: Any, t: Scalar, dt: Scalar, u: Array
 ) -> tuple[Array, Array]:
-    """Status and first bad time after an interval; the first thing that goes wrong stays."""
-    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((x, u))))
-    fast = parts.plant.too_fast(x, dt)
-    near = ~(parts.controller.clearance(x, parts.reference(t)) / course.whole >= SINGULAR_CLEARANCE)
+    """Status and first bad time of the state at t; the first thing that goes wrong stays."""
+    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
+    fast = parts.plant.too_fast(state.x, dt)
+    near = ~(parts.controller.clearance(state.x, target) / course.whole >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (state.status == OK) & (code != OK)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)
 
 
-def _row(parts: Parts, t, x, d_hat, u, commanded, s, lasts, pushed=None) -> Log:
-    target, d = parts.reference(t), parts.disturbance(t, x)
+def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, lasts, pushed=None) -> Log:
+    d = parts.disturbance(t, x)
     error, _ = parts.controller.errors(x, target)
     return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, lasts)
