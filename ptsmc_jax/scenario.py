@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from ptsmc_jax import (
@@ -82,7 +83,7 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
     tables = schema.dump(scenario)
     for name, value in changes.items():
         table, _, key = name.partition("__")
-        if value is None:
+        if value is None and _is_known(scenario, table, key):
             removed = tables if not key else tables.get(table, {})
             removed.pop(key or table, None)
         elif not key:
@@ -92,6 +93,14 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
         else:
             tables[table] = {**tables.get(table, {}), key: value}
     return from_tables(tables)
+
+
+def _is_known(scenario: Scenario, table: str, key: str) -> bool:
+    """Whether there is such a table or key; one that is not known is handed on, and refused as in a file."""
+    now = getattr(scenario, table) if table in scenario.__struct_fields__ else None
+    if not key or now is None:
+        return table in scenario.__struct_fields__
+    return key in now.__struct_fields__ if isinstance(now, msgspec.Struct) else True
 
 
 def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = None, *, drawn: bool = True) -> Study:

@@ -335,6 +335,8 @@ def test_replace_adds_a_table():
         ({"controller__delta": 40.0}, "controller.delta is 40.0", "less than controller.t_f, 30.0"),
         ({"controller__etta": 3.0}, "controller.etta is not a known key", "controller.eta"),
         ({"contrller__eta": 3.0}, "[contrller] is not a known table", "[controller]"),
+        ({"controller__etta": None}, "controller.etta is not a known key", "controller.eta"),
+        ({"contrller__eta": None}, "[contrller] is not a known table", "[controller]"),
         ({"controller__t_f": 45.0}, "loop.t_end is 40.0", "at least controller.t_f + loop.window, 46.0"),
         ({"initial__mrp": [0.0, 0.0, 0.0]}, "initial has the attitude keys quat_xyzw and mrp", ONE_KEY),
         ({"hardware__rate_noise": 1e-6}, "hardware.rate_noise needs the sampled loop", 'loop.mode is "continuous"'),
