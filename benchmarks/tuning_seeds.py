@@ -44,10 +44,11 @@ def main() -> None:
     check = evolution.check(evaluate, best, 1)
     print(f"differential evolution: goal {check.value:.5e}, {check.rollouts} rollouts, "
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
-    reference = min(check.value, best.value)
-    near = [one.value <= 1.01 * reference for one in found]
-    print(f"within 1 % of the better of both: {sum(near)} of {len(near)}; "
-          f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
+    references = {"differential evolution's": check.value, "the better of both": min(check.value, best.value)}
+    for name, reference in references.items():
+        near = [one.value <= 1.01 * reference for one in found]
+        print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
+              f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
     fresh = report.seed_of_judge(0)
     paper = report.judge(gains.papers(loaded), fresh, ready.requirements)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
