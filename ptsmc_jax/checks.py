@@ -27,7 +27,7 @@ from ptsmc_jax.tables import Scenario
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds."""
+    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs."""
     loop, t_f = scenario.loop, scenario.controller.t_f
     observer, disturbance = filled("observer", scenario.observer, scenario), scenario.disturbance
     if isinstance(disturbance, signal_tables.SumDisturbance):
@@ -43,9 +43,7 @@ def resolve(scenario: Scenario) -> Scenario:
         key = _spread(dispersion.x0)
         width = getattr(dispersion.x0, key) or (1.0,) * len(initial_state(scenario))
         dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
-    scenario = msgspec.structs.replace(scenario, loop=loop, dispersion=dispersion)
-    tune = None if scenario.tune is None else free_gains.resolve(scenario, scenario.tune)
-    return msgspec.structs.replace(scenario, tune=tune)
+    return msgspec.structs.replace(scenario, loop=loop, dispersion=dispersion)
 
 
 def inputs(scenario: Scenario) -> int:
@@ -78,8 +76,6 @@ def check(scenario: Scenario) -> None:
     _check_observer(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
-    if scenario.tune is not None:
-        free_gains.check(scenario, scenario.tune)
 
 
 def _spread(x0: dispersion_tables.UniformState | dispersion_tables.NormalState) -> str:

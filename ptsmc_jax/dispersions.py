@@ -141,8 +141,8 @@ class RelativeInertia:
     """True inertia whose principal moments are each off by a normal share, and whose axes are turned.
 
     Truncated, not clipped: the first of `CANDIDATES` draws no moment of which is more than `FARTHEST` standard
-    deviations off and that a body can have (each moment at most the sum of the other two). The nominal body where
-    none is, which happens to a body in one plane once in a million draws.
+    deviations off and that a body can have (each moment at most the sum of the other two). Where none is, which happens
+    to slender bodies, the first one, brought back toward the nominal body until it is.
     """
 
     moments: Leaf  # (3,) nominal principal moments [kg m^2]
@@ -154,7 +154,7 @@ class RelativeInertia:
 
     def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Inertia [kg m^2] and its inverse, (3, 3) each."""
-        found = self.moments
+        found = self._brought_back(c[:3])
         for share in c[: 3 * CANDIDATES].reshape(CANDIDATES, 3)[::-1]:  # so that the first one stays
             moments = self.moments * (1.0 + self.std * share)
             physical = (2.0 * jnp.max(moments) <= jnp.sum(moments)) & (jnp.min(moments) > 0.0)
@@ -162,6 +162,14 @@ class RelativeInertia:
         q = attitude.from_rotation_vector(self.turn * c[3 * CANDIDATES :])
         axes = self.axes @ jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
         return (axes @ jnp.diag(found)) @ axes.T, (axes @ jnp.diag(1.0 / found)) @ axes.T
+
+    def _brought_back(self, share: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Moments as far along the way from the nominal ones to these as a body can have, and `FARTHEST` allows."""
+        change = self.moments * self.std * share
+        left, closing = (jnp.sum(v) - 2.0 * v for v in (self.moments, -change))  # of each inequality; by all the way
+        shortest = jnp.min(jnp.where(closing > 0.0, left / jnp.where(closing > 0.0, closing, 1.0), 1.0))
+        way = jnp.minimum(shortest, FARTHEST / jnp.maximum(jnp.max(jnp.abs(share)), FARTHEST))
+        return self.moments + jnp.clip(way, 0.0, 1.0) * (1.0 - 1e-9) * change  # not beyond by rounding
 
 
 @jax.tree_util.register_dataclass

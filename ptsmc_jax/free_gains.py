@@ -46,23 +46,29 @@ def gyro_noise(table: device_tables.Hardware, period: float) -> float:
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
-    """The table with its defaults: gains, bounds, level."""
+    """The table with its defaults: gains, bounds, level; of a scenario that is checked but for it.
+
+    Raises ScenarioError where it asks for what cannot be tuned.
+    """
     free = tune.free
     if free is None:
         law = _BASELINES.get(scenario.controller.kind, ("eta", "delta"))
         free = (*law, "observer_gain") if _has_gain(scenario) else law
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
+    _check(scenario, tune)
     bounds = dict(tune.bounds)
     for key in sorted(free, key=lambda name: name not in ("t_f", "p")):  # those first that bounds of others go by
         if key not in bounds:
             bounds[key] = _default(scenario, msgspec.structs.replace(tune, bounds=bounds), key)
-    given = (key for key in bounds if key not in free)
-    return msgspec.structs.replace(tune, bounds={key: bounds[key] for key in (*free, *given)})
+    tune = msgspec.structs.replace(tune, bounds={key: bounds[key] for key in free})
+    for name in free:
+        _check_bounds(scenario, tune, name, bounds[name])
+    return tune
 
 
-def check(scenario: Scenario, tune: tables.Tune) -> None:
-    """Raise ScenarioError where the table asks for what cannot be tuned."""
+def _check(scenario: Scenario, tune: tables.Tune) -> None:
+    """Raise ScenarioError where the table asks for what cannot be tuned, before defaults are computed from it."""
     free = tune.free
     assert free is not None  # `resolve` filled it in
     if len(set(free)) < len(free):
@@ -145,8 +151,8 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, f
     """
     (low, high), own = _usual(scenario, tune, name), _own(scenario, name)
     if own:  # a gain that the law does not have is refused later
-        least, most, _ = _range(scenario, tune, name)
-        if least < min(own) < low:
+        least, most, closed = _range(scenario, tune, name)
+        if min(own) < low and (least <= min(own) if closed else least < min(own)):
             low = (least + min(own)) / 2
         if high < max(own) < most:
             high = min(2 * max(own) - least, (max(own) + most) / 2)
@@ -173,7 +179,7 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
         return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
         width = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
-        return 0.1 * width, max(width, min(10.0 * width, 1.0 / _interval(scenario)))
+        return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / _interval(scenario)))
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
         own = _own(scenario, name)
         return max(scenario.controller.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)

@@ -82,7 +82,7 @@ class Drive(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Actuators:
-    """Delay, then per axis or per wheel: quantisation, limits, and the slower of rate limit and first-order lag."""
+    """Delay, the limit per axis, then per axis or per wheel: quantisation, limits, rate limit and first-order lag."""
 
     torque_limit: Leaf | None = None  # per body axis [N m]
     rate_limit: Leaf | None = None  # [N m/s]
@@ -126,6 +126,8 @@ class Actuators:
             wanted = self.wheels.allocation @ (wanted + jnp.cross(w, self.wheels.axes @ state.h))
         if self.step is not None:
             wanted = quantise(wanted, self.step)
+            if self.torque_limit is not None and self.wheels is None:  # a step may lie beyond it
+                wanted = jnp.clip(wanted, -self.torque_limit, self.torque_limit)
         cut = wanted
         if self.wheels is not None:
             cut = self._within_wheels(self.wheels, wanted, state, dt)

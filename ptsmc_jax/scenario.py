@@ -18,6 +18,7 @@ from ptsmc_jax import (
     clock,
     controllers,
     dispersions,
+    free_gains,
     metrics,
     observers,
     pace,
@@ -65,7 +66,9 @@ def from_tables(raw: Mapping[str, Any]) -> Scenario:
     """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence."""
     scenario = checks.resolve(schema.parse(raw, metrics.CATALOGUES))
     checks.check(scenario)
-    return scenario
+    if scenario.tune is None:
+        return scenario
+    return msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
 
 
 def replace(scenario: Scenario, **changes: Any) -> Scenario:

@@ -406,6 +406,21 @@ BAD = [
         "goes with a quantile only",
     ),
     ("tune = { objective = 'worst', level = 0.9 }", "tune.level is 0.9", 'tune.objective = "cvar" only'),
+    (
+        SAMPLED + "filter.kind = 'steady_state'\ntune.free = ['eta', 'filter_bandwidth']",
+        "filter.bandwidth is absent",
+        "attitude_noise or rate_noise of [hardware] is 0",
+    ),
+    (
+        SAMPLED + "controller.kind = 'fixed_time'\ntune = { free = ['p', 'gamma'], bounds = { p = [0.0, 1.5] } }",
+        "tune.bounds.p is [0.0, 1.5]",
+        "above 1.0 and below 2.0",
+    ),
+    (
+        "plant.kind = 'chain'\nobserver = { kind = 'finite_time', gain = [] }\ntune.free = ['eta', 'observer_gain']",
+        "observer.gain is []",
+        "a list of 1 number",
+    ),
     ("tune.free = ['filter_bandwidth']", 'tune.free is ["filter_bandwidth"]', '[filter] of kind "steady_state"'),
     (
         "observer.kind = 'prescribed_time'\ntune.free = ['t_f']",

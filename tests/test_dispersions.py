@@ -213,6 +213,16 @@ def test_every_drawn_body_is_physical(moments):
     assert on_the_edge < 1e-3  # the nominal body once in 2^16 draws; clipping would put half of them here
 
 
+@pytest.mark.parametrize(("moments", "std"), [([10.0, 10.0, 0.1], 0.05), ([20.0, 20.0, 1.0], 0.2)])
+def test_slender_bodies_are_dispersed_too(moments, std):
+    """One draw in nine is a body: where none of sixteen is, the first one goes as far as a body can."""
+    inertia, _ = bodies(moments, std)
+    found = np.diagonal(inertia, axis1=1, axis2=2)
+    assert not np.any(np.all(found == moments, axis=1))
+    assert np.all(2.0 * found.max(axis=1) <= found.sum(axis=1))
+    assert np.all(np.abs(found / moments - 1.0) <= dispersions.FARTHEST * std * (1 + 1e-12))
+
+
 def test_principal_axes_are_turned_by_a_normal_rotation_vector():
     rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
     inertia, _ = bodies([5.0, 10.0, 14.0], 0.0, turn=0.01, axes=rotation.as_matrix())

@@ -171,6 +171,12 @@ def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
     assert low < value < high
 
 
+def test_default_bounds_hold_a_delta_of_one_period_which_is_the_least():
+    made = from_tables({"controller": {"delta": 0.02}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})
+    assert made.tune is not None
+    assert made.tune.bounds["delta"] == (0.02, 5.0)
+
+
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
     from tuning import bounds, gains
 

@@ -74,11 +74,13 @@ def test_commands_arrive_whole_periods_later(delay):
     np.testing.assert_array_equal(log.u[delay:-1], log.commanded[: -1 - delay])
 
 
-def test_limits_and_steps_as_delivered():
-    device = hardware.Actuators(torque_limit=vector(0.11), step=vector(0.01))
+@pytest.mark.parametrize("step", [0.01, 0.03])
+def test_limits_and_steps_as_delivered(step):
+    """The step next to what is cut off at 0.11 N m may lie beyond it."""
+    device = hardware.Actuators(torque_limit=vector(0.11), step=vector(step))
     result = fly(with_device(device), np.uint32(1), np.uint32(2), record=True)
     log = jax.tree.map(np.asarray, result.log)
-    expected = np.round(np.clip(log.commanded, -0.11, 0.11) / 0.01) * 0.01
+    expected = np.clip(np.round(np.clip(log.commanded, -0.11, 0.11) / step) * step, -0.11, 0.11)
     np.testing.assert_allclose(log.u[:-1], expected[:-1], atol=1e-15)
     assert float(result.metrics.peak_torque) > 0.11
     np.testing.assert_allclose(result.metrics.peak_torque_delivered, 0.11)

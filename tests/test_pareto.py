@@ -84,6 +84,14 @@ def test_a_front_with_gains_that_never_fly_can_be_told():
     ]
 
 
+def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
+    each = {"gains": {"observer_gain_1": 5.0, "observer_gain_2": 6.0}, "peak": 0.3, "mean_peak": 0.2, "rms": 1e-5,
+            "interval": None, "failures": 0, "knee": False, "meets": True, "dominated": False}  # fmt: skip
+    others = {"paper": {**each, "gains": {"observer_gain": 10.0}}, "before": {**each, "gains": {}}}
+    rows = told.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
+    assert [row[5:7] for row in rows] == [("5", "6"), ("10", "10"), ("-", "-")]
+
+
 def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     small_search(monkeypatch, 60)
     text = SHORT.replace("peak_torque = 30.0", "peak_torque = 10.0").replace("steps = 4", "steps = 20")
@@ -121,7 +129,8 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("change", "value"), [("objective = \"t_f\"", 'tune.objective is "t_f"'),
-                                               ("torque_weight = 0.5", "tune.torque_weight is 0.5")])  # fmt: skip
+                                               ("torque_weight = 0.5", "tune.torque_weight is 0.5"),
+                                               ("worst_case = true", "tune.worst_case is true")])  # fmt: skip
 def test_a_front_of_something_else_is_refused(command, tmp_path, change, value):
     text = SHORT.replace('free = ["eta", "delta"]', f'free = ["eta", "delta", "t_f"]\n{change}')
     (tmp_path / "s.toml").write_text(text)

@@ -125,6 +125,15 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
 
+def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin():
+    """With a quantile no single trial counts: `robust` finds nothing to do."""
+    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
+    problem, wanted = posed(spread, Requirement("peak_torque", 1.9, quantile=0.9))
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 1, 1, 0, robust=True)
+    assert found.margin == optimise.MARGIN
+
+
 def test_coordinates_given_are_flown_as_drawn_ones():
     """A case that joined by its coordinates counts in the constraints like the trial that has them."""
     spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))

@@ -89,7 +89,7 @@ def search(
     report is called after every step. Interrupted, it returns the best so far once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
-    margin = SURE_MARGIN if robust or problem.trials.size == 1 else MARGIN
+    margin = SURE_MARGIN if (robust and sure) or problem.trials.size == 1 else MARGIN
     run = Run(evaluate, margin, exact, report)
     interrupted, hardest = False, None
 

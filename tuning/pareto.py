@@ -134,6 +134,8 @@ def check(scenario: Scenario) -> None:
         raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {of}')
     if scenario.tune.torque_weight:
         raise wrong("tune.torque_weight", scenario.tune.torque_weight, f"absent {of} against the torque")
+    if scenario.tune.worst_case:
+        raise wrong("tune.worst_case", True, f"false {of}, whose points keep their limits in the trials drawn")
 
 
 def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:

@@ -239,6 +239,7 @@ def comparison_lines(summary: Summary) -> Iterator[str]:
 def front(summary: Summary) -> Table:
     """Points that no other one beats, and the paper's and the scenario's own gains."""
     from ptsmc_jax.metrics import CATALOGUES
+    from tuning.gains import base
 
     units = CATALOGUES[summary["plant"]]
     kept = [point for point in summary["points"] if not point["dominated"]]
@@ -249,7 +250,8 @@ def front(summary: Summary) -> Table:
         marks = [word for word in ("knee", "meets") if point[word]]
         if point["failures"]:
             marks.append(f"{point['failures']} failed or missed")
-        cells = (f"{point['gains'].get(gain, float('nan')):.4g}" for gain in names)
+        gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
+        cells = ("-" if value is None else f"{value:.4g}" for value in gains)
         within = "-" if low is None or high is None else f"{50 * (high - low) / point['rms']:.1f} %"
         numbers = (_digits(point["peak"], ".4g"), _digits(point["mean_peak"], ".4g"), _digits(point["rms"], ".3e"))
         rows.append((name, *numbers, within, *cells, ", ".join(marks)))
