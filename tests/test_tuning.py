@@ -11,7 +11,7 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, gains, objective, optimise, refine, report, results, starts, worst
+from tuning import bounds, gains, objective, optimise, polish, refine, report, results, starts, worst
 from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -181,9 +181,34 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
         return measure(some, at)[:2]
 
     (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jit(jax.jacfwd(f))(vector([3.0, 0.7]))
-    np.testing.assert_allclose(value, np.log(objective.FAILED))
+    np.testing.assert_allclose(value, (1 + 8) * np.log(objective.FAILED))
     assert np.all(np.asarray(over) == objective.FAILED - 1)
     assert np.all(np.isfinite(slope))
+
+
+@pytest.mark.parametrize("tail", [None, 3])
+def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
+    """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
+    turned = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(np.pi)))
+    eight = replace(problem(8, turned, peak_torque=0.7), tail=tail)
+    ((name, drawn),) = eight.coordinates.items()
+    lost = drawn.at[5, 2].set(1.0)  # by 180 degrees
+    left = np.delete(np.arange(8), 5)
+    others = replace(eight, trials=eight.trials[left], coordinates={name: lost[left]}, averaged=7, tail=tail)
+    z = np.array([[0.3, -0.4], [-0.8, 0.2]])
+    evaluate = Evaluator(bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    with_it, without = (evaluate.slopes(one, z) for one in (replace(eight, coordinates={name: lost}), others))
+    np.testing.assert_allclose(with_it.f, without.f + np.log(objective.FAILED), rtol=1e-14)
+    np.testing.assert_allclose(with_it.value, without.value, rtol=1e-13)
+    np.testing.assert_allclose(with_it.f_slope, without.f_slope, rtol=1e-10)
+    np.testing.assert_array_equal(with_it.beyond, without.beyond)
+    np.testing.assert_allclose(np.diff(starts.merit(with_it)), np.diff(starts.merit(without)), rtol=1e-12)
+    best, known = (polish.Best(z, 1, 0.0) for _ in range(2))
+    for kept, seen in ((best, with_it), (known, without)):
+        kept.offer(z, seen, np.full(2, True))
+    np.testing.assert_allclose(best.over, known.over + polish.BROKEN, rtol=1e-14)
+    np.testing.assert_array_equal(best.order(), known.order())
+    np.testing.assert_array_equal(best.worst, known.worst)
 
 
 def test_search_finds_the_constrained_optimum(monkeypatch):

@@ -9,7 +9,7 @@ import numpy as np
 from ptsmc_jax import montecarlo
 from tuning.bounds import Bounds
 from tuning.journal import Journal
-from tuning.objective import Problem, measure
+from tuning.objective import Problem, ended, measure
 
 FLOWN = 16  # points without slopes in one call of the compiled program
 
@@ -21,6 +21,11 @@ class Measured:
     f: np.ndarray  # (points,)
     c: np.ndarray  # (points, requirements, trials)
     value: np.ndarray  # (points,)
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """(points,) largest c over the trials that end; -1 without a requirement."""
+        return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
     def at(self, point: int) -> "Measured":
         """One of the points."""

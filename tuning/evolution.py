@@ -38,9 +38,8 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
 
     def merit(share: np.ndarray) -> np.ndarray:
         flown = evaluate.fly(problem, logit(share.T))
-        worst = flown.c.max(axis=(1, 2), initial=-1.0)
-        bad = FORBIDDEN + np.log1p(np.maximum(worst, 0.0))
-        return np.where(worst <= SLACK, flown.f, np.where(np.isfinite(worst), bad, 2.0 * FORBIDDEN))
+        bad = FORBIDDEN * np.where(np.isfinite(flown.f), 1.0, 2.0) + np.log1p(np.maximum(flown.beyond, 0.0))
+        return np.where((flown.beyond <= SLACK) & np.isfinite(flown.f), flown.f, bad)
 
     def tell(intermediate_result) -> None:
         nonlocal generation
@@ -67,7 +66,7 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
     polish(evaluate, replace(found.smooth, limits=problem.limits), best, 0)
     z = np.concatenate([logit(result.x[None]), best.z])
     seen, own = evaluate.fly(problem, z), evaluate.fly(problem, found.z[None])
-    first = int(np.lexsort((seen.f, seen.c.max(axis=(1, 2), initial=-1.0) > SLACK))[0])
+    first = int(np.lexsort((seen.f, seen.beyond > SLACK))[0])
     return Check(
         gains=dict(zip(problem.names, np.asarray(evaluate.bounds.gains(jnp.asarray(z[first]))).tolist(), strict=True)),
         value=float(np.exp(seen.value[first])),

@@ -1,5 +1,6 @@
 """What is minimised over the training trials, with requirements as constraints per trial."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -106,8 +107,9 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 
     The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
     worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
-    only some trials must keep a limit, c of the others is cut down to that of the last one that must. A trial that
-    fails, or has no value, counts as `judged` says.
+    only some trials must keep a limit, c of the others is cut down to that of the last one that must. Where a trial
+    fails, or has no value, c is `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to
+    F.
     """
     named = dict(zip(problem.names, gains, strict=True))
     parts = with_gains(problem.parts, named)
@@ -127,10 +129,13 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
         return square, torque, jnp.stack(over) if over else jnp.zeros(0)
 
     squares, torques, over = montecarlo.blocks(fly, (problem.trials, problem.coordinates))
-    value = jnp.log(named[T_F]) if problem.goal == T_F else _log_rms(squares[: problem.averaged], problem.tail)
-    weighted = value
+    value = weighted = (
+        jnp.log(named[T_F]) if problem.goal == T_F else _log_rms(squares[: problem.averaged], problem.tail)
+    )
+    if problem.goal != T_F:
+        weighted = value + jnp.sum(squares[: problem.averaged] >= FAILED**2) * math.log(FAILED)
     if problem.torque_weight:
-        weighted = value + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
+        weighted = weighted + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
     rows = [
         row if least is None else _cut(row, least, problem.averaged)
         for row, least in zip(over.T, problem.least or (None,) * len(problem.metrics), strict=True)
@@ -145,10 +150,24 @@ def judged(value: Array, status: Array) -> Array:
     return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
 
 
+def ended(c: np.ndarray) -> np.ndarray:
+    """Constraints, where a trial that fails or has no value is as if it kept its limit: no gain may change that."""
+    return np.where(c < FAILED - 1.0, c, -1.0)
+
+
+def failures(c: np.ndarray) -> np.ndarray:
+    """(points,) how many trials fail or have no value, of constraints c (points, requirements, trials)."""
+    return np.sum(np.any(c >= FAILED - 1.0, axis=1), axis=1)
+
+
 def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:
+    """Over those that end, or the `tail` worst of them: beside `FAILED`^2 no digit of theirs would be left."""
+    left = squares < FAILED**2
+    count = jnp.sum(left)
+    kept = jnp.where(left, squares, 0.0)
     if tail is not None:
-        squares = jax.lax.top_k(squares, tail)[0]
-    return 0.5 * jnp.log(jnp.mean(squares))
+        kept, count = jax.lax.top_k(kept, tail)[0], jnp.minimum(count, tail)
+    return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(kept) / jnp.maximum(count, 1), FAILED**2))
 
 
 def _cut(over: Float[Array, " trials"], least: int, averaged: int) -> Float[Array, " trials"]:

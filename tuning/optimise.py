@@ -17,7 +17,7 @@ from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
 from tuning.objective import Problem, coordinates_of, with_sign, with_trials
-from tuning.polish import Best, largest, polish
+from tuning.polish import BROKEN, Best, largest, polish
 from tuning.refine import NEARBY, WIDELY, refine
 from tuning.starts import Report, logit, promising, share_of, starting_points, toward_edges
 from tuning.worst import Hardest
@@ -55,7 +55,8 @@ class Search:
     gains: np.ndarray  # (gains,) the best admissible iterate
     z: np.ndarray  # its free reals
     value: float  # its goal over the training trials
-    worst: np.ndarray  # (requirements,) its largest metric / limit
+    worst: np.ndarray  # (requirements,) its largest metric / limit, infinite where a trial fails
+    ended: np.ndarray  # (requirements,) the same over the trials that end
     history: list[Step]
     problem: Problem  # that is judged, with the hardest trials: under the exact sign, if that was asked for
     smooth: Problem  # that the descent went by
@@ -294,7 +295,8 @@ class Run:
             gains=self.gains,
             z=self._best.z[best],
             value=float(self._best.value[best]),
-            worst=self._best.worst[best],
+            worst=np.where(self._best.over[best] >= BROKEN, np.inf, self._best.worst[best]),
+            ended=self._best.worst[best],
             history=self._history,
             problem=(judged := replace(self._problem, limits=self._problem.limits / (1.0 - self._margin))),
             smooth=with_sign(judged, *self._sign),

@@ -106,11 +106,11 @@ def trace(
     free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
     _unless_interrupted(free)
     problem = replace(free.smooth, limits=problem.limits)
-    highest = free.worst[at] * OFF
+    highest = free.ended[at] * OFF
     tight = HARDLY * highest
     least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
     _unless_interrupted(least)
-    lowest = least.worst[at] * tight
+    lowest = least.ended[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
@@ -177,8 +177,7 @@ def _climb(
 def _step(evaluate: Evaluator, problem: Problem, known: np.ndarray, exact: bool) -> Found | None:
     """F, goal and free reals of the best gains that keep these limits, from the most promising known ones."""
     flown = evaluate.fly(with_sign(problem, 0.0) if exact else problem, known)
-    over = flown.c.max(axis=(1, 2), initial=0.0)
-    chosen = np.lexsort((flown.f, np.maximum(over - 0.05, 0.0)))[:WARM]
+    chosen = np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]
     run = Run(evaluate, MARGIN, exact, lambda *told: None)
     run.step(problem, known[chosen], np.random.default_rng(0))
     value, over_limit = run.best_so_far

@@ -4,19 +4,23 @@ import numpy as np
 from scipy.optimize import minimize
 
 from tuning.evaluate import Evaluator, Measured, Sloped
-from tuning.objective import Problem
+from tuning.objective import Problem, ended, failures
 
 SLACK = 1e-4  # of it that an admissible iterate may use
 POLISH_STEPS = 40  # iterations of each, at most
+BROKEN = 1e3  # metric / limit by which a trial that fails is over, beside those that end
 
 
 def largest(c: np.ndarray, margin: float) -> np.ndarray:
-    """(points, requirements) largest metric / limit, from constraints against limits that are tighter by a margin."""
-    return (c.max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
+    """(points, requirements) largest metric / limit of the trials that end, from c with limits tighter by a margin."""
+    return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
 
 
 class Best:
-    """The best iterate so far of each start: admissible ones by their F, others by how far they are over."""
+    """The best iterate so far of each start: admissible ones by their F, others by how far they are over.
+
+    A trial that fails counts as `BROKEN` beyond its limit: more of them are worse, and what the others do still counts.
+    """
 
     def __init__(self, z: np.ndarray, requirements: int, margin: float):
         self.z, self.margin = z.copy(), margin
@@ -27,6 +31,7 @@ class Best:
         """Keep what is better; arrays over these starts. Admissible is what keeps the margin but for `SLACK`."""
         worst = largest(seen.c, self.margin)
         over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
+        over = over + BROKEN * failures(seen.c)
         better = allowed & ((over < self.over[starts]) | ((over == self.over[starts]) & (seen.f < self.f[starts])))
         kept = (self.z, self.f, self.value, self.over, self.worst)
         for old, new in zip(kept, (z, seen.f, np.exp(seen.value), over, worst), strict=True):
@@ -50,7 +55,7 @@ def polish(evaluate: Evaluator, problem: Problem, best: Best, start: int) -> Non
 
     limits = {
         "type": "ineq",
-        "fun": lambda z: -at(z).c.reshape(-1),
+        "fun": lambda z: -ended(at(z).c).reshape(-1),
         "jac": lambda z: -at(z).c_slope.reshape(-1, z.size),
     }
     minimize(

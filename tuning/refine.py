@@ -43,7 +43,7 @@ def refine(
         seen = evaluate.fly(problem, z)
         merits = np.nan_to_num(merit(seen, STEEP), nan=WORST, posinf=WORST)
         evolution.tell(list(zip(share, merits.tolist(), strict=True)))
-        over = np.maximum(seen.c.max(axis=(1, 2), initial=-1.0) - SLACK, 0.0)
+        over = np.maximum(seen.beyond - SLACK, 0.0)
         first = int(np.lexsort((seen.f, over))[0])
         best.offer(
             z[first : first + 1], seen.at(first), np.isfinite(seen.f[first : first + 1]), slice(start, start + 1)

@@ -52,8 +52,8 @@ def promising(evaluate: Evaluator, problem: Problem, z: np.ndarray, count: int, 
 
 
 def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
-    """(points,) F, with what they are beyond a limit charged, so many times as hard."""
-    return flown.f + CHARGE * np.log1p(times * flown.c.max(axis=(1, 2), initial=0.0))
+    """(points,) F, with what the trials that end are beyond a limit charged, so many times as hard."""
+    return flown.f + CHARGE * np.log1p(times * np.maximum(flown.beyond, 0.0))
 
 
 def toward_edges(uniform: np.ndarray) -> np.ndarray:

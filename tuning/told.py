@@ -134,8 +134,8 @@ def search(summary: Summary) -> Iterator[str]:
         yield f"starts dropped, since they met a number that is not finite: {found['dropped_starts']}"
     for metric, ratio in found.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
-            far = "has no value" if ratio is None else f"reaches {ratio:.3g} times its limit"
-            yield f"no gains found within the bounds keep every limit: with these {metric} {far} in training"
+            far = f"a trial has no {metric}" if ratio is None else f"{metric} reaches {ratio:.3g} times its limit"
+            yield f"no gains found within the bounds keep every limit: with these {far} in training"
     hardest = found.get("hardest")
     if hardest is not None and hardest["unbounded"]:
         moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"

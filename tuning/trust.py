@@ -61,7 +61,7 @@ def profiles(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> dict[str, 
         points[k, :, k] = np.sort(np.append(np.log(share / (1.0 - share)), z[k]))
     flown = evaluate.fly(problem, points.reshape(-1, z.size))
     gains = np.asarray(jax.vmap(evaluate.bounds.gains)(jnp.asarray(points.reshape(-1, z.size))))
-    over = flown.c.max(axis=(1, 2), initial=-1.0) + 1.0
+    over = flown.beyond + 1.0
     shape = (z.size, ACROSS + 1)
     gains, value, over, f = (v.reshape(*shape, -1) for v in (gains, np.exp(flown.value), over, flown.f))
     return {
