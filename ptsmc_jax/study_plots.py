@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib
 import matplotlib.colors
 import matplotlib.lines
+import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
@@ -45,6 +46,7 @@ def tuning_history(
             if np.nanmax(seen) > 10 * np.nanmin(seen):
                 axes[k + 1].set_yscale("log")
         axes[-1].set_xlabel("step")
+        axes[-1].xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
     return figure
 
 

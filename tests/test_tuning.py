@@ -11,7 +11,7 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, gains, objective, optimise, polish, refine, report, results, starts, worst
+from tuning import bounds, gains, objective, optimise, polish, refine, report, results, starts, told, worst
 from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -304,3 +304,18 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     np.testing.assert_allclose(found.gains[0], expected * (1 + optimise.SURE_MARGIN / 2), rtol=2e-4)
     np.testing.assert_allclose(found.value, found.gains[0], rtol=1e-9)
     assert found.worst[0] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1.234, "effort reaches 1.23 times its limit"),
+        (None, "a trial fails or has no effort"),
+        (np.inf, "a trial fails"),
+    ],
+)
+def test_what_breaks_a_limit_in_training_is_said(ratio, said):
+    """Infinite in a result, absent from the file it is read from."""
+    found = {"dropped_starts": [], "largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
+    (line,) = told.search({"search": found})
+    assert said in line

@@ -16,7 +16,7 @@ import optax
 from ptsmc_jax.requirements import Requirement
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
-from tuning.objective import Problem, coordinates_of, with_sign, with_trials
+from tuning.objective import FAILED, Problem, coordinates_of, failures, with_sign, with_trials
 from tuning.polish import BROKEN, Best, largest, polish
 from tuning.refine import NEARBY, WIDELY, refine
 from tuning.starts import Report, logit, promising, share_of, starting_points, toward_edges
@@ -45,7 +45,7 @@ class Step:
 
     gains: np.ndarray  # (starts, gains)
     value: np.ndarray  # (starts,) the goal over the training trials
-    worst: np.ndarray  # (starts, requirements) largest metric / limit
+    worst: np.ndarray  # (starts, requirements) largest metric / limit, `FAILED` where a trial fails
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,8 @@ class Run:
             best.offer(z, seen, alive)
             if not self._history or np.isfinite(best.f).any():
                 self._best, self._problem = best, tightened
-            self._history.append(Step(seen.gains, np.exp(seen.value), largest(seen.c, self._margin)))
+            worst = np.where(failures(seen.c)[:, None] > 0, FAILED, largest(seen.c, self._margin))
+            self._history.append(Step(seen.gains, np.exp(seen.value), worst))
             first = best.order()[0]
             self._report(what, step, steps, float(best.value[first]), float(best.over[first]))
             record.append((float(best.over[first]), float(best.f[first])))

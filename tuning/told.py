@@ -1,5 +1,6 @@
 """What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -134,7 +135,8 @@ def search(summary: Summary) -> Iterator[str]:
         yield f"starts dropped, since they met a number that is not finite: {found['dropped_starts']}"
     for metric, ratio in found.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
-            far = f"a trial has no {metric}" if ratio is None else f"{metric} reaches {ratio:.3g} times its limit"
+            lost = ratio is None or math.isinf(ratio)
+            far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
             yield f"no gains found within the bounds keep every limit: with these {far} in training"
     hardest = found.get("hardest")
     if hardest is not None and hardest["unbounded"]:
