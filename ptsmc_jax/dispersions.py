@@ -169,7 +169,7 @@ class RelativeInertia:
         left, closing = (jnp.sum(v) - 2.0 * v for v in (self.moments, -change))  # of each inequality; by all the way
         shortest = jnp.min(jnp.where(closing > 0.0, left / jnp.where(closing > 0.0, closing, 1.0), 1.0))
         way = jnp.minimum(shortest, FARTHEST / jnp.maximum(jnp.max(jnp.abs(share)), FARTHEST))
-        return self.moments + jnp.clip(way, 0.0, 1.0) * (1.0 - 1e-9) * change  # not beyond by rounding
+        return self.moments + jnp.maximum(way, 0.0) * (1.0 - 1e-9) * change  # not beyond by rounding
 
 
 @jax.tree_util.register_dataclass

@@ -150,7 +150,7 @@ def _default(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, f
     Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
     """
     (low, high), own = _usual(scenario, tune, name), _own(scenario, name)
-    if own:  # a gain that the law does not have is refused later
+    if own:
         least, most, closed = _range(scenario, tune, name)
         if min(own) < low and (least <= min(own) if closed else least < min(own)):
             low = (least + min(own)) / 2
@@ -178,7 +178,7 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
         lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
         return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
-        width = filter_bandwidth(scenario) if isinstance(scenario.filter, device_tables.SteadyStateFilter) else 1.0
+        width = filter_bandwidth(scenario)
         return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / _interval(scenario)))
     if name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME):  # a bound on the disturbance's rate
         own = _own(scenario, name)
