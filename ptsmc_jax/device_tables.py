@@ -88,7 +88,8 @@ class WheelLimits(Table, frozen=True):
     Attributes:
         torque_limit: of each wheel [N m]
         momentum_limit: of each wheel [N m s]
-        momentum: at t = 0, one number for each wheel; default: 0 each [N m s]
+        momentum: at t = 0, one number for each wheel, absolute: spin inertia times the sum of wheel speed and body rate
+            about its axis; default: 0 each [N m s]
     """
 
     torque_limit: Positive | None = None

@@ -1,6 +1,6 @@
 """What stands between the commanded torque and the body: delay, quantisation, limits, lag, reaction wheels.
 
-Each device is off where it is None. All are exact; quantisation has the derivative of the command it is given.
+Each device is off where it is None. Quantisation has the derivative of the command it is given.
 """
 
 from dataclasses import dataclass, field
@@ -26,7 +26,11 @@ def quantise(u: Array, step: Scalar) -> Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Wheels:
-    """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A."""
+    """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A.
+
+    h is absolute, spin inertia times (wheel speed + a . w); J is then the whole spacecraft's less the spin inertia of
+    each wheel about its axis, J_total - sum I a a' (Hughes, Spacecraft Attitude Dynamics, 1986).
+    """
 
     axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
     allocation: Leaf  # (n, 3) pseudo-inverse of A
@@ -66,7 +70,7 @@ class ActuatorState(NamedTuple):
     """What actuators carry from period to period."""
 
     queue: Array | None  # (delay, m) commands on their way, the oldest first [N m]
-    v: Array | None  # (channels,) torque at the end of the last period [N m]; None where it jumps to the command
+    v: Array | None  # (channels,) torque at the end of the last period [N m]; None where nothing depends on it
     h: Array | None  # (wheels,) stored momentum [N m s]
 
 
@@ -75,8 +79,29 @@ class Drive(NamedTuple):
 
     v: Array | None  # (channels,) [N m]; None: at c from the start
     c: Array
-    h: Array | None  # (wheels,) at the start of the period [N m s]
+    h: Any  # (wheels,) at the start of the period [N m s]; None without wheels
     limited: Array  # bool: a limit cuts the command
+
+
+class Push(NamedTuple):
+    """What acts on the body over a time dt inside a period: a torque linear in time, and the momentum of wheels."""
+
+    mean: Array  # (m,) torque on the body [N m]
+    slope: Array | None  # (m,) of the torque, about the middle [N m/s]; None where it is held
+    stored: Array | None  # (m,) momentum A h at the start [N m s]; None without wheels
+    dt: Array  # [s]
+
+    def at(self, s: Scalar, w: Vector) -> Vector:
+        """Torque on a body that turns at w [rad/s], s [s] from the start: u - w x A h [N m], with (A h)' = -u."""
+        u, gone = self.mean, self.mean * s
+        if self.slope is not None:
+            u, gone = u + self.slope * (s - self.dt / 2), gone + self.slope * (s * (s - self.dt) / 2)
+        return u if self.stored is None else u - jnp.cross(w, self.stored - gone)
+
+    @property
+    def middle(self) -> Array | None:
+        """Mean of the momentum A h at both ends [N m s]; None without wheels."""
+        return None if self.stored is None else self.stored - self.mean * self.dt / 2
 
 
 @jax.tree_util.register_dataclass
@@ -106,7 +131,7 @@ class Actuators:
         queue = jnp.zeros((self.delay, inputs)) if self.delay else None
         momentum = None if self.wheels is None else self.wheels.initial
         rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
-        return ActuatorState(queue, rest if self.moves else None, momentum)
+        return ActuatorState(queue, None if self.holds else rest, momentum)
 
     def command(self, state: ActuatorState, u: Vector, w: Vector, dt: Scalar, weight: Scalar) -> tuple[Drive, Any]:
         """The period's drive and the queue after it, for the law's command u [N m] at the rate seen w [rad/s].
@@ -136,7 +161,7 @@ class Actuators:
             assert state.v is not None
             reach = self.rate_limit * (dt if self.lag is None else dt + self.lag)
             limited = limited | jnp.any(jnp.abs(cut - state.v) > reach)
-        return Drive(state.v, cut, state.h, limited), queue
+        return Drive(state.v if self.moves else None, cut, state.h, limited), queue
 
     def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
         """Wheel torques that keep the momentum limit at the end of the period, and the torque limit in any case.
@@ -156,14 +181,15 @@ class Actuators:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
         return v
 
-    def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
-        """Torque of each channel s [s] into the period and its integral from the start [N m, N m s].
+    def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array, Array]:
+        """Torque of each channel s [s] into the period, its integral from the start and the integral of that.
 
-        v' = (c - v) / lag, |v'| at most the rate limit: a ramp until |c - v| is rate limit times lag, then the lag.
+        [N m, N m s, N m s^2]; v' = (c - v) / lag, |v'| at most the rate limit: a ramp until |c - v| is rate limit times
+        lag, then the lag.
         """
         v, c = drive.v, drive.c
         if v is None:
-            return c, c * s
+            return c, c * s, c * (s * s / 2)
         gap = c - v
         near = gap  # what the lag closes, after a ramp of this length and slope
         ramp, slope = jnp.zeros_like(gap), jnp.zeros_like(gap)
@@ -174,34 +200,46 @@ class Actuators:
             slope = self.rate_limit * jnp.sign(gap)
         ramping = s < ramp
         still = jnp.maximum(s - ramp, 0.0)
-        left, area = jnp.zeros_like(gap), jnp.zeros_like(gap)  # of the lag: what is not yet closed, and its integral
+        left, area, twice = (jnp.zeros_like(gap),) * 3  # of the lag: what is not yet closed, and its two integrals
         if self.lag is not None:
             left = near * jnp.exp(-still / self.lag)
             area = near * self.lag * -jnp.expm1(-still / self.lag)
+            twice = self.lag * (near * still - area)
+        ramped = jnp.where(ramping, s, ramp)  # time spent on the ramp
         torque = jnp.where(ramping, v + slope * s, c - left)
-        after = ramp * (v + slope * ramp / 2) + c * still - area
-        return torque, jnp.where(ramping, s * (v + slope * s / 2), after)
+        first = ramped * (v + slope * ramped / 2)
+        second = ramped * ramped * (v / 2 + slope * ramped / 6)
+        return torque, first + c * still - area, second + first * still + c * (still * still / 2) - twice
 
     def torque(self, drive: Drive, s: Scalar) -> Vector:
         """Torque on the body s [s] into the period [N m]."""
-        v, _ = self.channels(drive, s)
+        v, *_ = self.channels(drive, s)
         return v if self.wheels is None else self.wheels.axes @ v
 
-    def over(self, drive: Drive, start: Scalar, dt: Scalar) -> tuple[Vector, Array | None]:
-        """Mean torque on the body over dt [s] from `start` in the period [N m], and the momentum A h of the wheels.
+    def wheels_at(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
+        """Momentum [N m s] and torque [N m] of each wheel s [s] into the period, (wheels,) each."""
+        v, impulse, _ = self.channels(drive, s)
+        return drive.h - impulse, v
 
-        The momentum [N m s] is that of the middle, None without wheels. So the body's momentum comes out exact.
+    def over(self, drive: Drive, start: Scalar, dt: Scalar) -> Push:
+        """What acts over dt [s] from `start` in the period: the torque's impulse and first moment are exact.
+
+        So momentum is, and to leading order the attitude, whatever a lag or a rate limit does within a step.
         """
-        v, lasts = drive.c, dt > 0.0
-        before, after = (self.channels(drive, s)[1] for s in (start, start + dt))
+        v, slope, lasts = drive.c, None, dt > 0.0
         if drive.v is not None:
-            v = jnp.where(lasts, (after - before) / jnp.where(lasts, dt, 1.0), drive.v)
-        if self.wheels is None or drive.h is None:
-            return v, None
-        return self.wheels.axes @ v, self.wheels.axes @ (drive.h - (before + after) / 2)
+            (_, first, second), (_, first_next, second_next) = (self.channels(drive, s) for s in (start, start + dt))
+            long = jnp.where(lasts, dt, 1.0)
+            v = jnp.where(lasts, (first_next - first) / long, drive.v)
+            moment = (first + first_next) / 2 * dt - (second_next - second)  # of the torque about the middle
+            slope = jnp.where(lasts, 12.0 * moment / long**3, 0.0)
+        if self.wheels is None:
+            return Push(v, slope, None, dt)
+        axes = self.wheels.axes
+        return Push(axes @ v, None if slope is None else axes @ slope, axes @ self.wheels_at(drive, start)[0], dt)
 
-    def end(self, drive: Drive, queue: Any, dt: Scalar) -> ActuatorState:
+    def end(self, state: ActuatorState, drive: Drive, queue: Any, dt: Scalar) -> ActuatorState:
         """State after a period of dt [s]; one of length zero changes nothing."""
-        v, impulse = self.channels(drive, dt)
-        v = None if drive.v is None else jnp.where(dt > 0.0, v, drive.v)
+        v, impulse, _ = self.channels(drive, dt)
+        v = None if state.v is None else jnp.where(dt > 0.0, v, state.v)
         return ActuatorState(queue, v, None if drive.h is None else drive.h - impulse)

@@ -85,7 +85,7 @@ class Span(NamedTuple):
     delivered: tuple[Array, ...]
     weights: tuple[float, ...]  # sum to 1
     limited: Array  # bool: a limit of the actuators cuts the command
-    wheel_momentum: Array | None  # (wheels,) at the end [N m s]
+    wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
 
 
 class Judged(NamedTuple):
@@ -121,9 +121,10 @@ class Running(NamedTuple):
     peak_wheel_momentum: Array  # NaN without wheels
 
 
-def begin(first: Sight, judged: Judged, inputs: int) -> Running:
-    """Accumulators at t = 0 for a plant with this many inputs."""
+def begin(first: Sight, judged: Judged, inputs: int, wheel_momentum: Array | None = None) -> Running:
+    """Accumulators at t = 0 for a plant with this many inputs; wheel_momentum: (wheels,) [N m s]."""
     zero = jnp.zeros_like(judged.t_f)
+    stored = jnp.full_like(zero, jnp.nan) if wheel_momentum is None else jnp.max(jnp.abs(wheel_momentum))
     return Running(
         late=Late(jnp.zeros(inputs), zero, zero, zero, jnp.zeros(inputs)),
         peak_torque=zero,
@@ -133,7 +134,7 @@ def begin(first: Sight, judged: Judged, inputs: int) -> Running:
         settled_at=jnp.where(_unsettled(first, judged), jnp.inf, 0.0),
         peak_rate=first.rate,
         peak_momentum=first.momentum,
-        peak_wheel_momentum=jnp.full_like(zero, jnp.nan),
+        peak_wheel_momentum=stored,
     )
 
 
@@ -163,7 +164,7 @@ def update(running: Running, span: Span, judged: Judged) -> Running:
         peak_momentum=jnp.maximum(running.peak_momentum, span.end.momentum),
         peak_wheel_momentum=running.peak_wheel_momentum
         if span.wheel_momentum is None
-        else jnp.fmax(running.peak_wheel_momentum, jnp.max(jnp.abs(span.wheel_momentum))),
+        else jnp.maximum(running.peak_wheel_momentum, jnp.max(jnp.abs(span.wheel_momentum))),
     )
     late = jax.lax.cond(
         lasts & (span.t_next >= judged.t_f),

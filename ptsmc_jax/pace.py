@@ -29,7 +29,8 @@ from ptsmc_jax.rollout import Parts
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
-MOST_SUBSTEPS = 50
+MOST_SUBSTEPS = 200
+BASELINES = 50  # substeps at most, that a law to compare with asks for: a run that turns faster is marked
 MOVING = 4  # steps a period at least where the torque changes within it
 _SMOOTHED = ("disturbance.frequency", "plant.system")
 
@@ -61,7 +62,7 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
 
     Raises ScenarioError where too many steps would be needed, naming what asks for them.
     """
-    loop, frequencies, visited = scenario.loop, _frequencies(scenario, reach), None
+    loop, frequencies, visited = scenario.loop, _frequencies(scenario, parts, reach), None
     if isinstance(parts.plant, System):
         hurried = parts.with_t_f(build.vector(reach.smallest_t_f))
         visited = theory.visited(hurried)
@@ -79,7 +80,7 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
     return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
 
 
-def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
+def _frequencies(scenario: Scenario, parts: Parts, reach: Reach) -> dict[str, float]:
     """How fast things happen [rad/s], by the key that says so."""
     waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
     found = {"disturbance.frequency": float(max(waves))}
@@ -87,9 +88,42 @@ def _frequencies(scenario: Scenario, reach: Reach) -> dict[str, float]:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
         found |= _reference_frequencies(scenario.reference)
         key, rate = _slew(scenario.controller, reach.smallest_t_f)
-        if isinstance(scenario.controller, law_tables.Baseline):  # a bound only: a run that turns faster is marked
-            rate = min(rate, 0.5 * MOST_SUBSTEPS * 0.025 / scenario.loop.period)
+        if isinstance(scenario.controller, law_tables.Baseline):
+            rate = min(rate, 0.5 * BASELINES * 0.025 / scenario.loop.period)
         found[key] = rate
+        for key, rate in _nutation(scenario, parts).items():
+            found[key] = found.get(key, 0.0) + rate
+    return found
+
+
+def _nutation(scenario: Scenario, parts: Parts) -> dict[str, float]:
+    """How fast a body with wheels nutates at most [rad/s], by the key that says so: |H| over its two smallest moments.
+
+    J w' = -w x H + u, where H = J w + A h changes in inertial axes by disturbances only: wheels that give a body its
+    rate take as much.
+    """
+    if scenario.wheels is None or scenario.initial is None:
+        return {}
+    assert parts.actuators is not None
+    assert parts.actuators.wheels is not None
+    least, middle, largest = np.linalg.eigvalsh(np.asarray(parts.plant.inertia))
+    turning = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
+    stored = np.linalg.norm(np.asarray(parts.actuators.wheels.axes @ parts.actuators.wheels.initial))
+    shares = {
+        "wheels.momentum": stored,
+        "initial.rate": largest * turning,
+        "disturbance.amplitude": _impulse(scenario),
+    }
+    return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
+
+
+def _impulse(scenario: Scenario) -> float:
+    """What constant and sinusoidal disturbances add up to at most until t_end [N m s]."""
+    end, found = scenario.loop.t_end, 0.0
+    for term in checks.terms(scenario):
+        swing, frequency, bias = (np.abs(getattr(term, key, (0.0,))) for key in ("amplitude", "frequency", "bias"))
+        lasting = np.minimum(end, 2.0 / np.maximum(frequency, 1e-12))
+        found += float(np.linalg.norm(swing * lasting) + np.linalg.norm(bias) * end)
     return found
 
 

@@ -28,6 +28,8 @@ def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str,
         figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
+    if log.wheels is not None:
+        figures["wheels"] = wheels(parts, log)
     if isinstance(parts.plant, Spacecraft):
         return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
     return {"states": states(parts, log), **figures}
@@ -93,11 +95,23 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     marked = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
     axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=marked)
     if limit is not None:
-        for sign in (-1.0, 1.0):
-            axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
-        axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")
+        _limit(axes, limit, unit)
     _mark(axes, parts)
     axes.legend()
+    return figure
+
+
+def wheels(parts: Parts, log: Log) -> Figure:
+    """Momentum of the reaction wheels over time, and its limit."""
+    figure, axes = figure_of("Reaction wheels", "momentum [N m s]")
+    assert log.wheels is not None
+    assert parts.actuators is not None
+    _components(axes, log.t, log.wheels[0], "h")
+    device = parts.actuators.wheels
+    if device is not None and device.momentum_limit is not None:
+        _limit(axes, float(device.momentum_limit), " N m s")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
     return figure
 
 
@@ -205,6 +219,13 @@ def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwar
         width = {"lw": 0.8} if k >= len(STYLES) else {}
         label = f"${symbol}_{{{k + 1}}}$"
         axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **kwargs)
+
+
+def _limit(axes: Axes, limit: float, unit: str) -> None:
+    """Lines at plus and minus a limit."""
+    for sign in (-1.0, 1.0):
+        axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
+    axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")
 
 
 def _mark(axes: Axes, parts: Parts) -> None:

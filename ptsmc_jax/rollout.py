@@ -77,6 +77,7 @@ class Log(NamedTuple):
     disturbance: Array  # true disturbance [N m]
     reference: Any  # what the reference is then
     error: Array  # what the law drives to zero: the attitude error vector [-], for a chain x_1
+    wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
     lasts: Array  # bool: the row starts an interval of positive length, or is the last
 
 
@@ -160,14 +161,14 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         step = dt / parts.substeps
 
         def substep(k: Scalar, x: Any) -> Any:
-            u, stored = actuators.over(drive, k * step, step)
+            start, push = t + k * step, actuators.over(drive, k * step, step)
 
             def rate(time: Scalar, y: Any) -> Any:
                 d = parts.disturbance(time, y)
-                acting = _with_wheels(u, stored, parts.plant.velocity(y))
+                acting = push.at(time - start, parts.plant.velocity(y))
                 return parts.plant.rate(time, y, acting, d if pushed is None else d + pushed)
 
-            return numerics.rk4(rate, t + k * step, x, step)
+            return numerics.rk4(rate, start, x, step)
 
         if parts.substeps == 1:
             return parts.plant.normalise(substep(jnp.zeros_like(dt), x))
@@ -179,8 +180,11 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         dt, target = now.t_next - now.t, parts.reference(now.t)
         seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
         w = parts.plant.velocity(seen)
-        told = (state.u, None) if flight.applied is None else flight.applied
-        applied = _with_wheels(*told, (parts.plant.velocity(flight.seen) + w) / 2)
+        applied = state.u
+        if flight.applied is not None:
+            applied, stored = flight.applied
+            if stored is not None:
+                applied = applied - jnp.cross((parts.plant.velocity(flight.seen) + w) / 2, stored)
         impulse = model.unexplained_impulse(now.t, flight.seen, seen, applied, dt_before)
         memory = observer.update(jnp.where(partial, first_matrix, matrix), state.memory, impulse, now.t, dt_before)
         memory = jnp.where(dt_before > 0.0, memory, state.memory)
@@ -190,40 +194,41 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         pushed = flight.pushed
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
-        delivered = actuators.torque(drive, jnp.zeros_like(dt))
-        row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed) if record else None
+        zero, stored = jnp.zeros_like(dt), None
+        delivered = actuators.torque(drive, zero)
+        wheels = None if actuators.wheels is None else actuators.wheels_at(drive, zero)
+        row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels) if record else None
         x = fly(state.x, now.t, drive, pushed, dt)
+        acting = actuators.end(flight.acting, drive, queue, dt)
+        weights, torques = (1.0,), (delivered,)
         if actuators.moves:
             weights = (1 / 6, 4 / 6, 1 / 6)
             torques = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
-        else:
-            weights, torques = (1.0,), (delivered,)
-        acting = actuators.end(drive, queue, dt)
-        span = _Torques((u,) * len(torques), torques, weights, drive.limited, acting.h)
+        if wheels is not None:  # in the middle too: a lag may turn the torque around within the period
+            stored = jnp.stack([actuators.wheels_at(drive, s)[0] for s in (dt / 2, dt)])
+        span = _Torques((u,) * len(torques), torques, weights, drive.limited, stored)
         start = state.x
 
         def until(t: Scalar) -> Any:
             return fly(start, now.t, drive, pushed, t - now.t)
 
         state = _advance(parts, course, state, now, target, x, memory, span, until, dt / parts.substeps)
-        told = None if actuators.holds else actuators.over(drive, jnp.zeros_like(dt), dt)
+        told = None
+        if not actuators.holds:
+            push = actuators.over(drive, zero, dt)
+            told = push.mean, push.middle
         return (state, _Flight(sensing, seen, told, acting, pushed)), row
 
-    state, none = _begin(parts, course), jnp.zeros(parts.plant.inputs)
-    first = state.sight
     acting = actuators.begin(parts.plant.inputs)
+    state, none = _begin(parts, course, acting.h), jnp.zeros(parts.plant.inputs)
+    first = state.sight
     sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, ticks.sample[0])
     told = (none, None if actuators.wheels is None else none)
     flight = _Flight(
         sensing, course.x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none
     )
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
-    return _finish(parts, course, first, state, k2, rows, flight.pushed, held=True)
-
-
-def _with_wheels(u: Array, stored: Array | None, w: Array) -> Array:
-    """What acts on a body that turns at w and stores this momentum in wheels: u - w x A h."""
-    return u if stored is None else u - jnp.cross(w, stored)
+    return _finish(parts, course, first, state, k2, rows, flight, held=True)
 
 
 def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
@@ -263,7 +268,7 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
     return _finish(parts, course, first, state, k2, rows, None, held=False)
 
 
-def _begin(parts: Parts, course: _Course) -> _State:
+def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State:
     judged, x0 = course.judged, course.x0
     zero, none = jnp.zeros_like(judged.t_f), jnp.zeros(parts.plant.inputs)
     sight = _sight(parts, course.first, x0)
@@ -272,7 +277,7 @@ def _begin(parts: Parts, course: _Course) -> _State:
         memory=parts.observer.begin(),
         u=none,
         sight=sight,
-        running=metrics.begin(sight, judged, parts.plant.inputs),
+        running=metrics.begin(sight, judged, parts.plant.inputs, wheels),
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
@@ -317,7 +322,7 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torque
     return after._replace(status=status, bad_time=bad_time)
 
 
-def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, held: bool) -> Result:
+def _finish(parts: Parts, course, first, state: _State, k2, rows, flight: _Flight | None, *, held: bool) -> Result:
     judged = course.judged
     log, angle_at_t_f = None, state.running.late.angle_at_t_f
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
@@ -326,7 +331,11 @@ def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, hel
         d_hat = parts.observer.estimate(state.memory)
         u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
         u = state.u if held else u
-        last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed)
+        pushed, wheels = None, None
+        if flight is not None:
+            pushed, acting = flight.pushed, flight.acting
+            wheels = None if acting.h is None else (acting.h, acting.v)
+        last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
@@ -351,7 +360,7 @@ def _watch(
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)
 
 
-def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, lasts, pushed=None) -> Log:
+def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, lasts, pushed=None, wheels=None) -> Log:
     d = parts.disturbance(t, x)
     error, _ = parts.controller.errors(x, target)
-    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, lasts)
+    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, wheels, lasts)

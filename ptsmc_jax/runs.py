@@ -37,9 +37,11 @@ class Run:
         return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable."""
+        """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable, wheels."""
         log = self.log
         blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
+        if log.wheels is not None:
+            blocks["h"], blocks["v"] = log.wheels
         found = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
             found |= numbered(name, block)

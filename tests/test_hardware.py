@@ -1,6 +1,7 @@
 """Delay, limits, lag, quantisation and wheels, each against an independent model of a few lines."""
 
 import dataclasses
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,9 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import hardware, lanes, rollout, sensors, signals
+from ptsmc_jax import hardware, lanes, rollout, runs, scenario, sensors, signals
 from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FULL_INERTIA, parts, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -30,7 +32,7 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
     )
     for start, target in ((0.2, -0.3), (-0.1, 0.4), (0.1, 0.1)):
         for s in (0.0, 0.01, 0.2, 1.5):
-            found, impulse = device.channels(drive_of(device, [start], [target]), vector(s))
+            found, impulse, second = device.channels(drive_of(device, [start], [target]), vector(s))
             if lag is None:
                 gap = target - start
                 step = gap if rate_limit is None else np.clip(gap, -rate_limit * s, rate_limit * s)
@@ -46,6 +48,8 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
             drive = drive_of(device, [start], [target])
             area, _ = quad(lambda at, drive=drive: float(device.channels(drive, vector(at))[0][0]), 0.0, s, limit=200)
             np.testing.assert_allclose(impulse[0], area, rtol=0, atol=1e-6)
+            area, _ = quad(lambda at, drive=drive: float(device.channels(drive, vector(at))[1][0]), 0.0, s, limit=200)
+            np.testing.assert_allclose(second[0], area, rtol=0, atol=1e-6)
 
 
 def test_quantisation_rounds_and_lets_the_slope_through():
@@ -106,34 +110,120 @@ def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
         y = solve_ivp(
             rate, (log.t[k], log.t[k + 1]), y, args=(log.commanded[k],), rtol=1e-10, atol=1e-12, max_step=0.01
         ).y[:, -1]
-    # momentum is exact; within a step of 0.025 s the mean torque stands for its course, h^2 / 12 of 0.03 rad/s^2 a jump
-    np.testing.assert_allclose(np.concatenate([log.x.q[60], log.x.w[60]]), y[:7], atol=1e-5)
-    np.testing.assert_allclose(log.u[60], y[7:], atol=1e-6)
+    # impulse and first moment of the torque are exact in a step: what is left is its bend, turned by w dt
+    np.testing.assert_allclose(np.concatenate([log.x.q[60], log.x.w[60]]), y[:7], atol=1e-9)
+    np.testing.assert_allclose(log.u[60], y[7:], atol=1e-9)
 
 
-def test_wheels_exchange_momentum_with_the_body():
-    """Without a disturbance the total angular momentum stays where it is in the inertial frame."""
-    device = hardware.Actuators(wheels=hardware.wheels(PYRAMID, [0.5, -0.2, 0.1, 0.3]), lag=vector(0.2))
-    quiet = signals.Constant(vector([0.0] * 3))
-    run = with_device(device, disturbance=quiet, inertia=FULL_INERTIA, rate=(0.02, -0.01, 0.03))
-    run = dataclasses.replace(run, sensors=None, substeps=4)
-    result = fly(run, np.uint32(1), np.uint32(2), record=True)
-    log = jax.tree.map(np.asarray, result.log)
-    assert int(result.status) == rollout.OK
-    # the wheels' momentum: minus the integral of their torques, which the lag gives in closed form
-    h, v, axes = np.array([0.5, -0.2, 0.1, 0.3]), np.zeros(4), PYRAMID.T
-    totals, largest = [], np.abs(h).max()
-    for k in range(len(log.t) - 1):
-        total = Rotation.from_quat(log.x.q[k]).apply(np.asarray(FULL_INERTIA) @ log.x.w[k] + axes @ h)
-        totals.append(total)
-        c = np.linalg.pinv(axes) @ (log.commanded[k] + np.cross(log.x.w[k], axes @ h))
-        dt = log.t[k + 1] - log.t[k]
-        left = np.exp(-dt / 0.2)
-        h = h - (c * dt - (c - v) * 0.2 * (1 - left))
-        v = c - (c - v) * left
-        largest = max(largest, np.abs(h).max())
-    np.testing.assert_allclose(totals, np.tile(totals[0], (len(totals), 1)), atol=2e-6)  # h at mid-step
-    np.testing.assert_allclose(result.metrics.peak_wheel_momentum, largest, rtol=1e-4)
+def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
+    """Body and wheels, J w' = A v - w x (J w + A h) and h' = -v, from the first row on: attitude and momenta."""
+    n, inverse = axes.shape[1], np.linalg.inv(inertia)
+    y = np.concatenate([log.x.q[0], log.x.w[0], log.wheels[1][0], log.wheels[0][0]])
+
+    def rate(t, y, c):
+        q, w, v, h = y[:4], y[4:7], y[7 : 7 + n], y[7 + n :]
+        v_dot = np.zeros(n) if lag is None else np.clip((c - v) / lag, -limit, limit)
+        w_dot = inverse @ (axes @ v - np.cross(w, inertia @ w + axes @ h))
+        return np.concatenate([0.5 * (q[3] * w + np.cross(q[:3], w)), [-0.5 * q[:3] @ w], w_dot, v_dot, -v])
+
+    for k in range(intervals):
+        c = np.linalg.pinv(axes) @ (log.commanded[k] + np.cross(log.x.w[k], axes @ log.wheels[0][k]))
+        gap = c - log.wheels[1][k]
+        ramps = [] if lag is None else np.abs(gap - np.clip(gap, -limit * lag, limit * lag)) / limit
+        y[7 : 7 + n] = c if lag is None else y[7 : 7 + n]
+        ends = [log.t[k], *np.sort([log.t[k] + r for r in ramps if 0 < r < log.t[k + 1] - log.t[k]]), log.t[k + 1]]
+        for start, end in pairwise(ends):  # no interval has a bend inside
+            y = solve_ivp(rate, (start, end), y, args=(c,), method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    return y[:4], y[7 + n :]
+
+
+@pytest.mark.parametrize("momentum", [[0.5, -0.2, 0.1, 0.3], [40.0, 0.0, 0.0, 0.0]])
+@pytest.mark.parametrize(("lag", "limit"), [(None, np.inf), (0.2, np.inf), (0.05, np.inf), (0.1, 0.5)])
+def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
+    """Total angular momentum stays where it is in the inertial frame; attitude as by an independent integration."""
+    hardware_table = {"torque_lag": lag, "torque_rate_limit": limit if np.isfinite(limit) else None}
+    flown = runs.fly(
+        scenario.study(
+            scenario.from_tables(
+                {
+                    "spacecraft": {"inertia": FULL_INERTIA},
+                    "initial": {"rotvec_deg": [60.0, -40.0, 70.0], "rate": [0.02, -0.01, 0.03]},
+                    "disturbance": {"kind": "none"},
+                    "controller": {"t_f": 15.0, "delta": 1.0},
+                    "loop": {"mode": "sampled", "period": 0.1, "clock": "flight", "t_end": 16.0},
+                    "hardware": {key: value for key, value in hardware_table.items() if value is not None},
+                    "wheels": {"momentum": momentum},
+                }
+            )
+        )
+    )
+    log, axes, inertia = flown.log, PYRAMID.T, np.asarray(FULL_INERTIA)
+    assert log.wheels is not None
+    total = [
+        Rotation.from_quat(q).apply(inertia @ w + axes @ h)
+        for q, w, h in zip(log.x.q, log.x.w, log.wheels[0], strict=True)
+    ]
+    # RK4's own: (0.025 rad)^5 / 120 a step at most, of the part of the momentum that turns
+    np.testing.assert_allclose(total, np.tile(total[0], (len(total), 1)), atol=1e-10 * np.linalg.norm(total[0]))
+    q, h = wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals := 80)
+    off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
+    assert off.magnitude() < 1e-9
+    np.testing.assert_allclose(log.wheels[0][intervals], h, rtol=0, atol=1e-12 * max(np.abs(momentum)) + 1e-13)
+    assert list(flown.columns())[-8:] == ["h1", "h2", "h3", "h4", "v1", "v2", "v3", "v4"]  # of trajectory.csv
+    largest = flown.metrics["peak_wheel_momentum"]
+    assert largest >= np.abs(log.wheels[0]).max()  # t = 0 counts too
+    np.testing.assert_allclose(largest, np.abs(log.wheels[0]).max(), rtol=2e-3)
+
+
+CUBESAT = {
+    "spacecraft": {"inertia": [0.05, 0.08, 0.11]},
+    "initial": {"rotvec_deg": [60.0, -40.0, 70.0]},
+    "disturbance": {"kind": "none"},
+    "controller": {"t_f": 20.0, "delta": 2.0},
+    "loop": {"mode": "sampled", "period": 0.2, "clock": "flight", "t_end": 22.0},
+}
+
+
+def test_steps_follow_the_nutation():
+    """0.4 N m s on a CubeSat turn it 1.6 rad a period: steps follow |H|/J, and more of them change nothing."""
+    ready = scenario.study(scenario.from_tables({**CUBESAT, "wheels": {"momentum": [0.4, 0.0, 0.0, 0.0]}}))
+    finer = dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, substeps=3 * ready.parts.substeps))
+    ours, theirs = (runs.fly(one) for one in (ready, finer))
+    # RK4 at 0.025 rad a step, |H| / sqrt(J_1 J_2) of them: some 1e-9 rad (theory: the same bound as for the body rate)
+    np.testing.assert_allclose(ours.metrics["window_error"], theirs.metrics["window_error"], rtol=1e-6)
+    off = Rotation.from_quat(ours.log.x.q[-1]).inv() * Rotation.from_quat(theirs.log.x.q[-1])
+    assert off.magnitude() < 1e-9
+    assert ready.parts.substeps >= 0.4 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
+
+
+def test_steps_follow_what_disturbances_leave_in_the_wheels():
+    """What is constant adds up until t_end; a wheel takes it."""
+    drifting = {"disturbance": {"kind": "constant", "amplitude": [0.005, 0.0, 0.0]}, "wheels": {}}
+    ready = scenario.study(scenario.from_tables({**CUBESAT, **drifting}))
+    assert ready.parts.substeps >= 0.005 * 22.0 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"wheels": {"momentum": [4.0, 0.0, 0.0, 0.0]}}, r"^wheels\.momentum is \[4\.0.*must be lower: loop\.period"),
+        ({"wheels": {}, "disturbance": {"kind": "constant", "amplitude": [0.5] * 3}}, r"^disturbance\.amplitude is"),
+    ],
+)
+def test_too_much_momentum_for_the_period_is_refused(changes, said):
+    with pytest.raises(ScenarioError, match=said):
+        scenario.study(scenario.from_tables({**CUBESAT, **changes}))
+
+
+def test_peak_wheel_momentum_counts_from_the_start():
+    """A wheel that first speeds the body up, and not quite takes that back: its largest momentum is that at t = 0."""
+    spinning = hardware.wheels(np.eye(3), [5.0, 0.0, 0.0])
+    turned = {"q": Rotation.from_rotvec([-1.0, 0.0, 0.0]).as_quat(), "rate": (-0.1, 0.0, 0.0)}
+    run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, t_end=23.0, **turned)
+    run = dataclasses.replace(run, actuators=hardware.Actuators(wheels=spinning))
+    log = jax.tree.map(np.asarray, fly(run, record=True).log)
+    assert np.all(np.abs(log.wheels[0][1:]) < 5.0)
+    assert float(fly(run, record=True).metrics.peak_wheel_momentum) == 5.0
 
 
 def test_wheels_keep_their_limits():
@@ -272,7 +362,7 @@ def test_gradients_are_finite_at_the_corners():
     def outcome(u, v, h, dt):
         state = hardware.ActuatorState(u[None], v, h)
         drive, queue = device.command(state, u, vector([0.0] * 3), dt, vector(1.0))
-        end = device.end(drive, queue, dt)
+        end = device.end(state, drive, queue, dt)
         return device.torque(drive, dt), device.over(drive, 0.0 * dt, dt), end.v, end.h
 
     zero, full = vector([0.0] * 4), vector([0.5] * 4)
