@@ -93,7 +93,7 @@ class Tune(Table, frozen=True):
         level: the CVaR is the RMS of the worst 1 - level of the trials; with "cvar" only, default: 0.9
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
-        trials: trials to tune on
+        trials: trials to tune on; more where a quantile with a confidence takes more to be shown at all
         starts: points to descend from
         steps: of the descent
     """

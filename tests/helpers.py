@@ -170,11 +170,12 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning import optimise, refine, report, starts, worst
+    from tuning import confirm, optimise, refine, starts, worst
 
     for module, name, value in (
         (worst, "SCREENED", 64),
-        (report, "FRESH", fresh),
+        (confirm, "FRESH", fresh),
+        (confirm, "FEWEST", 64),
         (starts, "CANDIDATES", 8),
         (optimise, "SPREAD", 16),
         (refine, "GENERATIONS", 3),

@@ -354,9 +354,9 @@ def test_a_killed_search_goes_on(tmp_path):
     """kill -9 while it searches, in a process of its own; then the same command to the end."""
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
-        "import sys; from tuning import cli, optimise, refine, report, starts, worst; "
+        "import sys; from tuning import cli, confirm, optimise, refine, starts, worst; "
         "starts.CANDIDATES = 8; optimise.SPREAD = 16; refine.GENERATIONS = 3; "
-        "worst.SCREENED = 64; report.FRESH = 40; cli.main()"
+        "worst.SCREENED = 64; confirm.FRESH = 40; cli.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
     journal = tmp_path / "t" / "journal.bin"

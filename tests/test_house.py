@@ -56,8 +56,8 @@ FLOORS = {
         bounds design journal
         objective
         evaluate
-        worst trust polish starts
-        refine
+        worst trust polish starts confirm
+        refine work
         optimise
         evolution
         report single reproduction mapping

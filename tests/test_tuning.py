@@ -11,7 +11,7 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, gains, objective, optimise, polish, refine, report, results, starts, told, worst
+from tuning import bounds, confirm, gains, objective, optimise, polish, refine, report, results, starts, told, worst
 from tuning.evaluate import Evaluator
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -121,9 +121,9 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
 
 @pytest.mark.parametrize("least", [1, 5, 8])
 def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
-    """The largest c is that order statistic of the averaged trials; harder trials that were added do not count."""
-    some = problem(peak_torque=0.7, effort=5.0)
-    some = replace(objective.with_trials(some, np.arange(8, 11)), least=(least, None))
+    """The largest c is that order statistic of the averaged trials; of added trials those count that are said to."""
+    some = replace(problem(peak_torque=0.7, effort=5.0), least=(least, None))
+    some = objective.with_trials(some, np.arange(8, 11))  # they must keep what every trial must keep
     _, c, _ = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
     expected = np.sort(flown.metrics.peak_torque[:8])[least - 1] / 0.7 - 1
@@ -163,8 +163,9 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
     assert [report._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
-    assert report._fresh_trials([share]) == report.FRESH
-    assert report._fresh_trials([share, sure]) == 2 * 852
+    assert confirm.fresh_trials([share]) == confirm.FRESH
+    assert confirm.fresh_trials([share, sure]) == 2 * 852
+    assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 852]
     tables = {"rms": None, "worst": 1, "cvar": 6}
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"objective": kind}}).tune

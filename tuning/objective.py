@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import montecarlo, rollout
 from ptsmc_jax.dispersions import Coordinates, Dispersion
@@ -31,6 +31,7 @@ class Problem:
     trials: Leaf  # (trials,) uint32, that name the noise
     coordinates: Coordinates  # of what is drawn, arrays over the trials first
     limits: Leaf  # (requirements,) in the metrics' units
+    counted: Leaf  # (requirements, trials) bool: whether a trial beyond the averaged ones must keep a limit
     # the smooth sign is at least so many times K2 wide, the observer's bound: narrower ones chatter, without slopes
     widened: Leaf
     averaged: int = field(metadata={"static": True})
@@ -60,6 +61,7 @@ def problem(
         trials=jnp.zeros(0, dtype=jnp.uint32),
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=jnp.asarray([r.limit for r in requirements], dtype=float),
+        counted=jnp.zeros((len(requirements), 0), dtype=bool),
         widened=jnp.zeros(()),
         averaged=len(trials),
         names=names,
@@ -79,15 +81,27 @@ def _coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> 
     return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
-def with_trials(problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None) -> Problem:
-    """The problem with these trials added, which count in the constraints; coordinates: if not their own."""
+def with_trials(
+    problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None, counted: np.ndarray | None = None
+) -> Problem:
+    """The problem with these trials added, which count in the constraints; coordinates: if not their own.
+
+    counted: (requirements,) bool, which limits they must keep; by default those that every trial must keep.
+    """
     if coordinates is None:
         coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
+    rows = np.asarray(whole_rows(problem) if counted is None else counted, dtype=bool)
     return replace(
         problem,
         trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
+        counted=jnp.concatenate([problem.counted, jnp.tile(rows[:, None], (1, len(trials)))], axis=1),
         coordinates={name: jnp.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
     )
+
+
+def whole_rows(problem: Problem) -> np.ndarray:
+    """(requirements,) bool: limits that every trial must keep."""
+    return np.asarray([least is None for least in problem.least or (None,) * len(problem.metrics)], dtype=bool)
 
 
 def with_sign(problem: Problem, width: float, widened: float = 0.0) -> Problem:
@@ -137,8 +151,10 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     if problem.torque_weight:
         weighted = weighted + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
     rows = [
-        row if least is None else _cut(row, least, problem.averaged)
-        for row, least in zip(over.T, problem.least or (None,) * len(problem.metrics), strict=True)
+        _asked(row, least, problem.averaged, counted[problem.averaged :])
+        for row, least, counted in zip(
+            over.T, problem.least or (None,) * len(problem.metrics), problem.counted, strict=True
+        )
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
     return weighted, constraints, value
@@ -170,8 +186,11 @@ def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array,
     return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(kept) / jnp.maximum(count, 1), FAILED**2))
 
 
-def _cut(over: Float[Array, " trials"], least: int, averaged: int) -> Float[Array, " trials"]:
-    """Cut off above the `least`-th smallest of the averaged trials; the trials added to them say nothing of a share."""
+def _asked(
+    over: Float[Array, " trials"], least: int | None, averaged: int, counted: Bool[Array, " added"]
+) -> Float[Array, " trials"]:
+    """What is asked of c: of the averaged trials all but the worst beyond `least`, of the others those counted."""
     first = over[:averaged]
-    allowed = -jax.lax.top_k(-first, least)[0][-1]
-    return jnp.concatenate([jnp.minimum(first, allowed), jnp.full(over.shape[0] - averaged, -1.0)])
+    if least is not None:
+        first = jnp.minimum(first, -jax.lax.top_k(-first, least)[0][-1])
+    return jnp.concatenate([first, jnp.where(counted, over[averaged:], -1.0)])

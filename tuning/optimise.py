@@ -14,12 +14,23 @@ import numpy as np
 import optax
 
 from ptsmc_jax.requirements import Requirement
+from tuning import confirm
 from tuning import worst as worst_case
 from tuning.evaluate import Evaluator
-from tuning.objective import FAILED, Problem, coordinates_of, failures, with_sign, with_trials
-from tuning.polish import BROKEN, Best, largest, polish
-from tuning.refine import NEARBY, WIDELY, refine
-from tuning.starts import Report, logit, promising, share_of, starting_points, toward_edges
+from tuning.objective import FAILED, Problem, coordinates_of, failures, whole_rows, with_sign, with_trials
+from tuning.polish import BROKEN, POLISH_STEPS, Best, largest, polish
+from tuning.refine import GENERATIONS, NEARBY, WIDELY, refine
+from tuning.starts import (
+    CANDIDATES,
+    CHOOSING,
+    Report,
+    logit,
+    promising,
+    share_of,
+    starting_points,
+    toward_edges,
+)
+from tuning.work import ROUND, SLOPED, Work
 from tuning.worst import Hardest
 
 PENALTY = 20.0
@@ -36,6 +47,7 @@ HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
 ROUNDS = 6  # searches again with hardest trials added, at most
 
+SEARCHING, POLISHING = "searching", "polishing"
 SPREADING, REFINING = "looking for a better valley", "refining"
 
 
@@ -64,7 +76,18 @@ class Search:
     rounds: int = 0  # searches again with harder trials
     margin: float = MARGIN  # that was kept from the limits
     hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
+    counts: list[confirm.Count] = field(default_factory=list)  # of requirements on a share, on other trials
+    seconds: dict[str, float] = field(default_factory=dict)  # that each step of the search took
     interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class Joining:
+    """Trials that join the constraints."""
+
+    trials: np.ndarray  # that name the noise
+    counted: np.ndarray  # (requirements,) bool: the limits that they must keep
+    coordinates: dict[str, list[float]] | None = None  # of a single one, where they are not its own
 
 
 def search(
@@ -85,44 +108,63 @@ def search(
 
     A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
     screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
-    not those drawn, but the worst case inside the dispersions' support. own: (gains,) the scenario's gains, the first
-    start. exact: what is found goes on under the exact sign, see `Run.settle`. judged: say how hard the worst case is.
-    report is called after every step. Interrupted, it returns the best so far once there is one.
+    not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
+    on others after each search: where too many of them break it, those next to the limit join, and must keep it. own:
+    (gains,) the scenario's gains, the first start. exact: what is found goes on under the exact sign, see `Run.settle`.
+    judged: say how hard the worst case is. report is called after every step. Interrupted, it returns the best so far
+    once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
+    shares = [r for r in requirements if r.quantile is not None] if problem.trials.size > 1 else []
     margin = SURE_MARGIN if (robust and sure) or problem.trials.size == 1 else MARGIN
+    again = max(20, steps // 3)
+    report = Work(report, evaluate, *_planned(problem, starts, steps, again, exact=exact))
     run = Run(evaluate, margin, exact, report)
-    interrupted, hardest = False, None
+    interrupted, hardest, counts = False, None, list[confirm.Count]()
 
     def flown(problem: Problem) -> Problem:
         return with_sign(problem, 0.0) if exact else problem
 
+    def counted(requirement: Requirement) -> np.ndarray:
+        return np.asarray([metric == requirement.metric for metric in problem.metrics])
+
     try:
         if sure:  # screened as flown
             middle = np.asarray(evaluate.bounds.gains(jnp.zeros(len(problem.names))))
-            problem = _with_room(with_trials(problem, _hardest(problem, *worst_case.screen(problem, sure, middle))))
+            harder = _hardest(problem, *worst_case.screen(problem, sure, middle))
+            problem = _with_room(with_trials(problem, harder))
+        elif shares:
+            problem = _with_room(problem)
         z = starting_points(evaluate, problem, own, starts, seed, report)
-        run.descend(problem, z, steps, "searching")
+        run.descend(problem, z, steps, SEARCHING)
         run.settle(problem, np.random.default_rng(seed))
         rounds = joined = 0
-        while sure:
-            found = run.gains
-            if robust:
+        while sure or shares:
+            found, joining = run.gains, list[Joining]()
+            if shares:  # each time on other trials, which those screened are not among
+                report("confirming on other trials", 0, 0, *run.best_so_far)
+                counts = confirm.count(flown(problem), shares, found, problem.averaged + worst_case.SCREENED, rounds)
+                joining += [
+                    Joining(one.harder[:HARDEST], counted(requirement))
+                    for requirement, one in zip(shares, counts, strict=True)
+                    if not one.held
+                ]
+            if sure and robust:
                 report("looking for the worst case", 0, 0, *run.best_so_far)
                 hardest = worst_case.hardest(flown(problem), sure, found)
-                if hardest.unbounded or not hardest.beyond or rounds == ROUNDS:
-                    break
-                problem = _add(problem, joined, np.asarray([hardest.trial]), hardest.coordinates)
-                joined, hardest = joined + 1, None  # it was the worst case of gains that are searched on from
-            else:
+                if hardest.beyond and not hardest.unbounded:
+                    joining.append(Joining(np.asarray([hardest.trial]), whole_rows(problem), hardest.coordinates))
+            elif sure:
                 trials, ratio = worst_case.screen(flown(problem), sure, found)
-                if np.all(ratio <= 1.0) or rounds == ROUNDS:
-                    break
-                more = _hardest(problem, trials, ratio)
-                problem, joined = _add(problem, joined, more), joined + more.size
+                if np.any(ratio > 1.0):
+                    joining.append(Joining(_hardest(problem, trials, ratio), whole_rows(problem)))
+            if not joining or rounds == ROUNDS:
+                break
+            for more in joining:
+                problem, joined = _add(problem, joined, more), joined + more.trials.size
+            hardest = None  # it was the worst case of gains that are searched on from
             rounds += 1
-            again = max(20, steps // 3)
-            run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"harder trials, round {rounds}")
+            run.descend(problem, evaluate.bounds.free(found, edge=1e-6)[None], again, f"{ROUND}, round {rounds}")
             run.settle(problem, np.random.default_rng(seed))
             run.rounds = rounds
         if sure and judged and hardest is None:
@@ -132,28 +174,43 @@ def search(
         if not run.started:
             raise
         interrupted = True
-    return replace(run.outcome(), hardest=hardest, interrupted=interrupted)
+    report("done", 0, 0, *run.best_so_far)
+    counts = [] if interrupted else counts
+    return replace(run.outcome(), hardest=hardest, counts=counts, seconds=report.seconds, interrupted=interrupted)
+
+
+def _planned(problem: Problem, starts: int, steps: int, again: int, *, exact: bool) -> tuple[dict, dict]:
+    """What each step of a search flies at most, in rollouts, and each of a further round; see `Work`."""
+    trials, sloped = problem.trials.size, SLOPED * problem.trials.size
+    settling = {SPREADING: SPREAD * trials} if exact else {}
+    settling[REFINING] = GENERATIONS * WIDELY[0] * trials
+    first = {CHOOSING: starts * CANDIDATES * trials, SEARCHING: starts * (steps + 1) * sloped}
+    return (
+        {**first, POLISHING: starts * POLISH_STEPS * sloped, **settling},
+        {ROUND: (again + 1) * sloped, POLISHING: POLISH_STEPS * sloped, **settling},
+    )
 
 
 def _with_room(problem: Problem) -> Problem:
-    """With `SPARE` places more, that hold the first trial again: it counts in the constraints, which it meets twice."""
+    """With `SPARE` places more, that hold the first trial again: it must keep what every trial must keep, twice."""
     return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], SPARE))
 
 
-def _add(problem: Problem, joined: int, trials: np.ndarray, coordinates: dict | None = None) -> Problem:
-    """The problem with these trials in the places left for them, and then in those of the ones that joined first.
+def _add(problem: Problem, joined: int, more: Joining) -> Problem:
+    """The problem with more trials in the places left for them, and then in those of the ones that joined first.
 
     joined: how many have been added to `_with_room`'s.
     """
     places = problem.trials.size - problem.averaged
-    at = problem.averaged + (places - SPARE + joined + np.arange(len(trials))) % places
-    if coordinates is None:
-        own = coordinates_of(problem.dispersion, int(problem.seed), trials)
+    at = problem.averaged + (places - SPARE + joined + np.arange(more.trials.size)) % places
+    if more.coordinates is None:
+        own = coordinates_of(problem.dispersion, int(problem.seed), more.trials)
     else:
-        own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
+        own = {name: jnp.asarray(v)[None] for name, v in more.coordinates.items()}
     return replace(
         problem,
-        trials=problem.trials.at[at].set(jnp.asarray(trials, dtype=jnp.uint32)),
+        trials=problem.trials.at[at].set(jnp.asarray(more.trials, dtype=jnp.uint32)),
+        counted=problem.counted.at[:, at].set(jnp.asarray(more.counted)[:, None]),
         coordinates={name: v.at[at].set(own[name]) for name, v in problem.coordinates.items()},
     )
 
@@ -282,7 +339,7 @@ class Run:
     def _polish(self, tightened: Problem, best: "Best", starts: list[int]) -> None:
         done: list[np.ndarray] = []  # shares of the bounds at which a polish ended
         for k, start in enumerate(starts):
-            self._report("polishing", k, len(starts), *self.best_so_far)
+            self._report(POLISHING, k, len(starts), *self.best_so_far)
             if all(np.abs(share_of(best.z[start]) - other).max() >= SAME for other in done):
                 polish(self._evaluate, tightened, best, start)
                 done.append(share_of(best.z[start]))

@@ -11,13 +11,13 @@ from ptsmc_jax import draws, montecarlo, tables, theory
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
-from ptsmc_jax.requirements import Requirement, Verdict, fewest_trials, least_within
+from ptsmc_jax.requirements import Requirement, Verdict, least_within
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
-from tuning import evolution, gains, objective, trust
+from tuning import confirm, evolution, gains, objective, trust
 from tuning.design import ShortestTime, shortest_time
 from tuning.evaluate import Evaluator
 from tuning.evolution import Check
@@ -28,7 +28,6 @@ from tuning.starts import Report
 from tuning.trust import Profile
 
 SMOOTH = 1e-3  # width of the sign that is descended by where the scenario flies the exact one
-FRESH = 1000  # trials on which gains are judged
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
@@ -180,7 +179,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     assert table is not None
     bounds = gain_bounds.of_scenario(scenario)
     ready = study(scenario, reach=_reach(scenario, table))
-    trained = trials_of(ready, table.trials)
+    trained = trials_of(ready, confirm.training_trials(ready.requirements, table.trials))
     problem = objective.problem(
         ready.parts,
         ready.dispersion,
@@ -231,7 +230,7 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
 def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
     """A scenario's gains on fresh trials, as flown; as many as every quantile that is asked for takes."""
     flown = study(as_flown(scenario))
-    trials = np.arange(trials_of(flown, _fresh_trials(requirements)))
+    trials = np.arange(trials_of(flown, confirm.fresh_trials(requirements)))
     return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
 
 
@@ -291,7 +290,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
 
 
 def _least(requirement: Requirement, trials: int) -> int | None:
-    """How many training trials must keep a limit: too few to show a quantile, all of them."""
+    """How many training trials must keep a limit."""
     if requirement.quantile is None:
         return None
     return least_within(trials, requirement.quantile, requirement.confidence) or trials
@@ -303,12 +302,6 @@ def _tail(table: tables.Tune, trials: int) -> int | None:
         return None
     assert table.level is not None or table.objective == "worst"
     return 1 if table.level is None else max(1, round((1.0 - table.level) * trials))
-
-
-def _fresh_trials(requirements: Sequence[Requirement]) -> int:
-    """Fresh trials: enough to show every quantile that is asked for, with some beyond the limit."""
-    needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([FRESH, *(2 * count for count in needed)])
 
 
 def rounded(value: float) -> float:

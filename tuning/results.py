@@ -72,6 +72,9 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rounds_with_harder_trials": found.rounds,
             "dropped_starts": found.dropped,
             "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
+            "confirmed": [
+                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
+            ],
             "worst_case": tuning.tuned.tune.worst_case,
             "hardest": None
             if found.hardest is None
@@ -80,6 +83,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
+            "seconds_by_step": found.seconds,
             "goal_under_the_smooth_sign": tuning.smooth_value,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),

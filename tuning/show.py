@@ -31,7 +31,7 @@ class Progress:
             console=Console(stderr=True),
             disable=quiet,
         )
-        self._what, self._task = "", self._bar.add_task("compiling", total=None)
+        self._total, self._task = 0, self._bar.add_task("compiling", total=None)
 
     def __enter__(self) -> "Progress":
         self._bar.start()
@@ -42,8 +42,8 @@ class Progress:
 
     def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
         """What is being done, steps done and in all; the best goal so far, how far it is beyond a limit."""
-        if what != self._what:
-            self._what = what
+        if total != self._total:
+            self._total = total
             self._bar.reset(self._task, total=total or None)
         limits = "limits met" if over == 0.0 else f"{100 * over:.3g} % beyond a limit"
         best = f": {self._goal} {value:.4g}, {limits}" if value == value else ""

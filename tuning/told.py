@@ -138,6 +138,13 @@ def search(summary: Summary) -> Iterator[str]:
             lost = ratio is None or math.isinf(ratio)
             far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
             yield f"no gains found within the bounds keep every limit: with these {far} in training"
+    for one in found.get("confirmed", []):
+        most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
+        yield (
+            f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
+            f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
+            f"probability of {100 * one['probability']:.3g} %"
+        )
     hardest = found.get("hardest")
     if hardest is not None and hardest["unbounded"]:
         moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
@@ -154,6 +161,9 @@ def search(summary: Summary) -> Iterator[str]:
         yield (
             f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
             f"{found['seconds']:.0f} s"
+            + "".join(
+                f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
+            )
         )
     smooth = found.get("goal_under_the_smooth_sign")
     if smooth is not None:
