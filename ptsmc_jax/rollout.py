@@ -22,7 +22,7 @@ from ptsmc_jax.sensors import Sensor
 
 Scalar = Float[Array, ""]
 
-OK, DIVERGED, TOO_FAST, SINGULAR, MISSED = range(5)
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED = range(6)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
@@ -30,6 +30,7 @@ STATUS = {
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
+    UNBOUNDED: ("diverged", "a metric is not finite"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
 SINGULAR_CLEARANCE = 1e-3
@@ -328,10 +329,12 @@ def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, hel
         u = state.u if held else u
         last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
+    found, none = metrics.finish(state.running, judged), metrics.begin(first, judged, parts.plant.inputs)
+    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.finish(none, judged))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
-    status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
-    bad_time = jnp.where(missed, judged.t_f, state.bad_time)
-    return Result(metrics.finish(state.running, judged), status, bad_time, log)
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
+    bad_time = jnp.where(unbounded, judged.t_end, jnp.where(missed, judged.t_f, state.bad_time))
+    return Result(found, status, bad_time, log)
 
 
 def _sight(parts: Parts, target: Any, x: Any) -> metrics.Sight:
