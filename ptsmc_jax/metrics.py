@@ -214,14 +214,14 @@ def finish(running: Running, judged: Judged) -> Metrics:
     )
 
 
-def unbounded(found: Metrics, at_start: Metrics) -> Array:
+def unbounded(found: Metrics, first: Running) -> Array:
     """Whether a metric ends infinite or NaN: the square of what it is made of is beyond the largest number, say.
 
-    at_start: `finish` of what a run begins with, where a metric that the plant lacks is NaN already. A settling time
-    need not be there.
+    first: accumulators at t = 0, where a metric that the plant lacks is NaN already. A settling time need not be there.
     """
-    pairs = zip(found._replace(settling_time=jnp.zeros_like(found.effort)), at_start, strict=True)
-    return jnp.any(jnp.stack([~jnp.isfinite(v) & ~(jnp.isnan(v) & jnp.isnan(v0)) for v, v0 in pairs]))
+    every = found._replace(settling_time=jnp.zeros_like(found.effort))._asdict()
+    lacking = {name: jnp.isnan(getattr(first, name, 0.0)) for name in every}
+    return jnp.any(jnp.stack([jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name]) for name, v in every.items()]))
 
 
 def _unsettled(sight: Sight, judged: Judged) -> Array:

@@ -329,8 +329,8 @@ def _finish(parts: Parts, course, first, state: _State, k2, rows, pushed, *, hel
         u = state.u if held else u
         last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
-    found, none = metrics.finish(state.running, judged), metrics.begin(first, judged, parts.plant.inputs)
-    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.finish(none, judged))
+    found = metrics.finish(state.running, judged)
+    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(first, judged, parts.plant.inputs))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
     bad_time = jnp.where(unbounded, judged.t_end, jnp.where(missed, judged.t_f, state.bad_time))
