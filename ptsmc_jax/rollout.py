@@ -213,7 +213,8 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     state, none = _begin(parts, course), jnp.zeros(parts.plant.inputs)
     first = state.sight
     acting = actuators.begin(parts.plant.inputs)
-    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, ticks.sample[0])
+    started = jax.tree.map(lambda v: v[jnp.argmax(lengths > 0.0)], ticks)
+    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, started)
     told = (none, None if actuators.wheels is None else none)
     flight = _Flight(
         sensing, course.x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none
