@@ -215,6 +215,16 @@ def finish(running: Running, judged: Judged) -> Metrics:
     )
 
 
+def unbounded(found: Metrics, first: Running) -> Array:
+    """Whether a metric ends infinite or NaN: the square of what it is made of is beyond the largest number, say.
+
+    first: accumulators at t = 0, where a metric that the plant lacks is NaN already. A settling time need not be there.
+    """
+    every = found._replace(settling_time=jnp.zeros_like(found.effort))._asdict()
+    lacking = {name: jnp.isnan(getattr(first, name, 0.0)) for name in every}
+    return jnp.any(jnp.stack([jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name]) for name, v in every.items()]))
+
+
 def _unsettled(sight: Sight, judged: Judged) -> Array:
     return ~(sight.angle < judged.settling_angle)  # an angle that is no number is not settled
 

@@ -22,7 +22,7 @@ from ptsmc_jax.sensors import Sensor
 
 Scalar = Float[Array, ""]
 
-OK, DIVERGED, TOO_FAST, SINGULAR, MISSED = range(5)
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED = range(6)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
@@ -30,6 +30,7 @@ STATUS = {
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
+    UNBOUNDED: ("diverged", "a metric is not finite"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
 SINGULAR_CLEARANCE = 1e-3
@@ -222,7 +223,8 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     acting = actuators.begin(parts.plant.inputs)
     state, none = _begin(parts, course, acting.h), jnp.zeros(parts.plant.inputs)
     first = state.sight
-    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, ticks.sample[0])
+    started = jax.tree.map(lambda v: v[jnp.argmax(lengths > 0.0)], ticks)
+    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, started)
     told = (none, None if actuators.wheels is None else none)
     flight = _Flight(
         sensing, course.x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none
@@ -325,22 +327,24 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torque
 def _finish(parts: Parts, course, first, state: _State, k2, rows, flight: _Flight | None, *, held: bool) -> Result:
     judged = course.judged
     log, angle_at_t_f = None, state.running.late.angle_at_t_f
+    acting = None if flight is None else flight.acting
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
         d_hat = parts.observer.estimate(state.memory)
         u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
         u = state.u if held else u
-        pushed, wheels = None, None
-        if flight is not None:
-            pushed, acting = flight.pushed, flight.acting
-            wheels = None if acting.h is None else (acting.h, acting.v)
+        pushed = None if flight is None else flight.pushed
+        wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
         last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
+    found = metrics.finish(state.running, judged)
+    begun = metrics.begin(first, judged, parts.plant.inputs, None if acting is None else acting.h)
+    unbounded = (state.status == OK) & metrics.unbounded(found, begun)
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
-    status = jnp.where(missed, MISSED, state.status).astype(jnp.int32)
-    bad_time = jnp.where(missed, judged.t_f, state.bad_time)
-    return Result(metrics.finish(state.running, judged), status, bad_time, log)
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
+    bad_time = jnp.where(unbounded, judged.t_end, jnp.where(missed, judged.t_f, state.bad_time))
+    return Result(found, status, bad_time, log)
 
 
 def _sight(parts: Parts, target: Any, x: Any) -> metrics.Sight:

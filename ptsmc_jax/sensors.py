@@ -37,8 +37,8 @@ def per_sample(density: float, period: float) -> float:
 class Sensor(Protocol):
     """What the rollout asks of a sensor."""
 
-    def begin(self, seed: Whole, trial: Whole, x0: Any, sample: Array) -> Any:
-        """Memory before the first sample."""
+    def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> Any:
+        """Memory before the first sample of positive length, which is now."""
         ...
 
     def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
@@ -64,13 +64,22 @@ class AttitudeFilter:
 
     attitude_gain: Leaf  # share of a star tracker residual that corrects the attitude [-]
     bias_gain: Leaf  # of it, per second, that corrects the bias [1/s]
-    attitude_error: Leaf  # 1 sigma per axis of the estimate at t = 0 [rad]
-    bias_error: Leaf  # [rad/s]
+    # (every, 2, 2) Cholesky factors of the covariance per axis of its errors [rad, rad/s] in the steady state, just
+    # before the sample after the star tracker's, the one after that, and so on to the next one of the star tracker
+    spread: Leaf
 
-    def begin(self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"]) -> Estimate:
-        """An estimate [-, rad/s] whose errors are those of the steady state: the filter has run before the slew."""
-        turned = attitude.multiply(q, attitude.from_rotation_vector(self.attitude_error * normals[:3]))
-        return Estimate(turned, bias + self.bias_error * normals[3:])
+    def begin(
+        self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"], sample: Array, share: Scalar
+    ) -> Estimate:
+        """An estimate [-, rad/s] whose errors are those of the steady state: the filter has run before the slew.
+
+        sample: number of the first sample, before which this is; where its share is below 1, it is partly before the
+        next one.
+        """
+        every = self.spread.shape[0]
+        root = numerics.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
+        turn, drift = root @ normals.reshape(2, 3)
+        return Estimate(attitude.multiply(q, attitude.from_rotation_vector(turn)), bias + drift)
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
@@ -114,20 +123,41 @@ def attitude_filter(
     attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk [rad/s/sqrt(s)];
     every: control periods between star tracker samples.
     """
-    interval = period * every
-    k1, k2 = filter_gains(bandwidth, interval)
-    # errors (attitude, bias) from one correction to the next: e+ = K F e + K g + (k1, -k2) noise
-    zero, one = jnp.zeros_like(k1), jnp.ones_like(k1)
-    step = jnp.array([[one, -interval * one], [zero, one]])
-    keep = jnp.array([[1.0 - k1, zero], [k2, one]])
-    walk = interval * bias_walk**2
-    gyro = jnp.array([[rate_noise**2 * period * interval + walk * interval**2 / 3, -walk * interval / 2],
-                      [-walk * interval / 2, walk * one]])  # fmt: skip
-    star = jnp.outer(jnp.stack([k1, -k2]), jnp.stack([k1, -k2])) * attitude_noise**2
-    move, drive = keep @ step, keep @ gyro @ keep.T + star
-    spread = numerics.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4))
-    sizes = numerics.sqrt(jnp.maximum(spread[::3], 0.0))  # the diagonal
-    return AttitudeFilter(k1, k2, sizes[0], sizes[1])
+    k1, k2 = filter_gains(bandwidth, period * every)
+    # e: errors of attitude, less what the gyro's noise at the sample adds to it, and of bias, just before a sample.
+    # One period later it is step e, after a star tracker sample step keep e, and noises times the vectors named so
+    zero, one, half = jnp.zeros_like(k1), jnp.ones_like(k1), period / 2
+
+    def after(t: Any) -> Array:
+        return jnp.array([[one, -t * one], [zero, one]])
+
+    def square(vector: Array, sigma: Any) -> Array:
+        return jnp.outer(vector, vector) * sigma**2
+
+    gyro, walk = jnp.stack([half * one, zero]), jnp.sqrt(period) * jnp.stack([half * one, -one])
+    corrected = after(period) @ jnp.array([[1.0 - k1, zero], [k2, one]])
+    star = after(period) @ jnp.stack([k1, -k2])
+    drive = square(2.0 * gyro, rate_noise) + square(walk, bias_walk)
+    steps = jax.vmap(after)(period * jnp.arange(every))
+    each = jax.vmap(lambda step: step @ drive @ step.T)(steps)
+    added = jnp.cumsum(each, axis=0) - each
+    move = corrected @ steps[-1]
+    drive = corrected @ added[-1] @ corrected.T + square(star, attitude_noise)
+    drive = drive + square(corrected @ gyro + gyro, rate_noise) + square(walk, bias_walk)
+    first = numerics.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4)).reshape(2, 2)
+
+    def spread(step: Array, since: Array) -> Array:
+        return _cholesky(step @ first @ step.T + since + square(gyro, rate_noise))
+
+    return AttitudeFilter(k1, k2, jax.vmap(spread)(steps, added))
+
+
+def _cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """Lower factor of a covariance; without derivatives that are not finite where there is no noise."""
+    (a, b), (_, d) = covariance
+    first = numerics.sqrt(jnp.maximum(a, 0.0))
+    along = jnp.where(first > 0.0, b / jnp.where(first > 0.0, first, 1.0), 0.0)
+    return jnp.array([[first, 0.0], [along, numerics.sqrt(jnp.maximum(d - along * along, 0.0))]])
 
 
 class Memory(NamedTuple):
@@ -187,15 +217,16 @@ class Sensors:
             return jnp.zeros(3)
         return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
 
-    def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, sample: Int[Array, ""]) -> Memory:
-        """Memory before the first sample."""
+    def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, now: Ticks) -> Memory:
+        """Memory before the first sample of positive length, which is now."""
         keys, bias, estimate = self.keys(seed, trial), None, None
         if self.rate_bias is not None or self.bias_rate is not None:
             bias = self.first_bias(seed, trial)
         if self.filter is not None:
             normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
-            estimate = self.filter.begin(x0.q, jnp.zeros(3) if bias is None else bias, normals)
-        return Memory(keys, self.noise(keys, sample), bias, estimate, None if estimate is None else x0.w)
+            none = jnp.zeros(3) if bias is None else bias
+            estimate = self.filter.begin(x0.q, none, normals, now.sample, now.noise_weight)
+        return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
     def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
         """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
@@ -231,10 +262,10 @@ class StateSensor:
         """Noise of one sample, (n,)."""
         return self.sigma * draws.normals(key, self.sigma.shape[-1], sample)
 
-    def begin(self, seed: Whole, trial: Whole, x0: Float[Array, " n"], sample: Int[Array, ""]) -> tuple:
-        """Memory before the first sample."""
+    def begin(self, seed: Whole, trial: Whole, x0: Float[Array, " n"], now: Ticks) -> tuple:
+        """Memory before the first sample of positive length, which is now."""
         key = self.key(seed, trial)
-        return key, self.noise(key, sample)
+        return key, self.noise(key, now.sample)
 
     def measure(self, memory: tuple, x: Float[Array, " n"], now: Ticks, dt: Scalar) -> tuple[Float[Array, " n"], tuple]:
         """The states as measured, and the memory."""

@@ -1,3 +1,4 @@
+import itertools
 import math
 from dataclasses import replace
 
@@ -182,8 +183,11 @@ def test_initial_rates_are_drawn_about_the_nominal_one():
 def bodies(moments, std, turn=0.0, axes=None):
     axes = np.eye(3) if axes is None else axes
     kind = dispersions.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
-    plant = many_drawn(dispersions.Dispersion(inertia=kind)).plant
+    plant = plants_of(dispersions.Dispersion(inertia=kind), jnp.arange(TRIALS, dtype=jnp.uint32))
     return np.asarray(plant.inertia), np.asarray(plant.inertia_inverse)
+
+
+plants_of = jax.jit(jax.vmap(lambda whole, k: whole.apply(PARTS, 4, k).plant, (None, 0)))
 
 
 def test_principal_moments_are_truncated_normal():
@@ -213,14 +217,69 @@ def test_every_drawn_body_is_physical(moments):
     assert on_the_edge < 1e-3  # the nominal body once in 2^16 draws; clipping would put half of them here
 
 
-@pytest.mark.parametrize(("moments", "std"), [([10.0, 10.0, 0.1], 0.05), ([20.0, 20.0, 1.0], 0.2)])
-def test_slender_bodies_are_dispersed_too(moments, std):
-    """One draw in nine is a body: where none of sixteen is, the first one goes as far as a body can."""
+@pytest.mark.parametrize("std", [0.05, 0.2])
+@pytest.mark.parametrize("moments", [[20.0, 0.02, 20.0], [10.0, 10.0, 0.1], [1e-4, 100.0, 100.0]])
+def test_slender_bodies_keep_the_stated_law(moments, std):
+    """Two large moments may differ by the small one, c, at most: hardly any of all draws is such a body.
+
+    Beside the spread of the large ones that is nothing, so that, of their differences, all are as likely: (a - b) / c
+    is uniform, c has its normal density times c itself, and the mean of a and b is normal. That leaves out the square
+    of c over the spread of a - b, 0.3 % at most here, where the test sees 2 %.
+    """
     inertia, _ = bodies(moments, std)
-    found = np.diagonal(inertia, axis1=1, axis2=2)
-    assert not np.any(np.all(found == moments, axis=1))
+    found = np.diagonal(inertia, axis1=1, axis2=2)[:, np.argsort(moments)]
     assert np.all(2.0 * found.max(axis=1) <= found.sum(axis=1))
-    assert np.all(np.abs(found / moments - 1.0) <= dispersions.FARTHEST * std * (1 + 1e-12))
+    c, a, b = ((found / np.sort(moments) - 1.0) / std).T
+    assert np.abs([a, b, c]).max() <= dispersions.FARTHEST * (1 + 1e-9)
+
+    def cdf(s):
+        def whole(s):  # integral of (1 + std s) times the normal density
+            return stats.norm.cdf(s) - std * stats.norm.pdf(s)
+
+        return (whole(s) - whole(-3.0)) / (whole(3.0) - whole(-3.0))
+
+    difference = (found[:, 1] - found[:, 2]) / found[:, 0]
+    assert stats.kstest(c, cdf).pvalue > ALARM
+    assert stats.kstest(difference, "uniform", (-1.0, 2.0)).pvalue > ALARM
+    assert stats.kstest((a + b) / math.sqrt(2.0), "norm").pvalue > ALARM
+    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
+    assert np.abs(np.corrcoef([c, a + b, difference]) - np.eye(3)).max() < limit
+
+
+drawn_bodies = jax.jit(jax.vmap(lambda kind, c: kind.at(c)[0], (None, 0)))
+
+
+@pytest.mark.parametrize("std", [0.05, 0.3])
+@pytest.mark.parametrize("moments", [[10.0, 10.0, 20.0], [20.0, 19.5, 1.0], [2.0, 20.0, 20.0], [10.0, 12.0, 14.0]])
+def test_what_is_drawn_where_no_candidate_is_a_body_has_their_law(moments, std):
+    """All sixteen beyond three sigma: what is drawn instead has the law of candidates that are drawn until one is."""
+    rng = np.random.default_rng(1)
+    kind = dispersions.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
+    c = rng.standard_normal((1 << 15, kind.count))
+    c[:, : 3 * dispersions.CANDIDATES] = 9.0
+    found = np.diagonal(np.asarray(drawn_bodies(kind, vector(c))), axis1=1, axis2=2)
+    shares = rng.standard_normal((1 << 19, 3))
+    wanted = np.array(moments) * (1.0 + std * shares)
+    is_one = (2.0 * wanted.max(axis=1) <= wanted.sum(axis=1)) & (wanted.min(axis=1) > 0.0)
+    wanted = wanted[is_one & (np.abs(shares).max(axis=1) <= dispersions.FARTHEST)]
+    assert len(wanted) > 1 << 15
+    for weights in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -1, 0], [0, 1, -1], [1, 1, -1], [1, 1, 1]):
+        one, other = found @ np.array(weights), wanted @ np.array(weights)
+        assert np.asarray(stats.ks_2samp(one, other))[1] > ALARM, weights
+    assert not np.any(np.all(found == moments, axis=1))
+
+
+body_slopes = jax.jit(jax.jacfwd(lambda kind, c: kind.at(c), (0, 1)))
+
+
+@pytest.mark.parametrize("moments", [[20.0, 20.0, 0.02], [10.0, 12.0, 14.0], [1.0, 1.0, 2.0]])
+def test_drawn_bodies_have_slopes_in_every_number(moments):
+    """At no spread at all too, and for coordinates at the far end of what is drawn."""
+    for std, first in itertools.product((0.0, 0.05), (0.5, 9.0)):
+        for size in (0.3, 6.7):
+            kind = dispersions.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.1))
+            c = jnp.full(kind.count, size).at[: 3 * dispersions.CANDIDATES].set(first)
+            assert all(np.all(np.isfinite(slope)) for slope in jax.tree.leaves(body_slopes(kind, c)))
 
 
 def test_principal_axes_are_turned_by_a_normal_rotation_vector():

@@ -89,13 +89,16 @@ def test_names_and_bounds_axis_by_axis():
 def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
     def sizes(bandwidth):
         found = sensors.attitude_filter(bandwidth, 2e-5, 1e-6, 1e-8, 0.1, 2)
-        return jnp.log(jnp.stack([found.attitude_gain, found.bias_gain, found.attitude_error, found.bias_error]))
+        spread = found.spread.reshape(-1, 4)[:, jnp.array([0, 2, 3])]  # the factors' lower left half
+        return jnp.log(jnp.abs(jnp.append(spread, jnp.stack([found.attitude_gain, found.bias_gain]))))
 
     at = vector(0.4)
     exact, step = jax.jacfwd(sizes)(at), 1e-4
     numeric = (sizes(at + step) - sizes(at - step)) / (2 * step)
     np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # step^2 times a third derivative of some 10
-    assert np.all(np.isfinite(jax.jacfwd(lambda b: sensors.attitude_filter(b, 2e-5, 0.0, 0.0, 0.1, 2).bias_error)(at)))
+    for star, gyro in ((2e-5, 0.0), (0.0, 1e-6), (0.0, 0.0)):
+        spread = jax.jacfwd(lambda b, star=star, gyro=gyro: sensors.attitude_filter(b, star, gyro, 0.0, 0.1, 2).spread)
+        assert np.all(np.isfinite(spread(at)))
 
 
 @pytest.mark.parametrize("kind", ["nonlinear", "finite_time", "prescribed_time"])

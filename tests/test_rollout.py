@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, plants, rollout, signals, theory
+from ptsmc_jax import clock, plants, rollout, runs, scenario, signals, theory
 from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -216,6 +216,38 @@ def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
     lost = fly(parts(q=np.array([np.nan, 0.0, 0.0, 1.0])))
     assert int(lost.status) == rollout.DIVERGED
     assert all(np.isnan(float(getattr(lost.metrics, name))) for name in ("window_error", "hold_error", "settling_time"))
+
+
+def flown(plant, mode, **tables):
+    return runs.fly(scenario.study(scenario.from_tables({"plant": plant, "loop": {"mode": mode}, **tables})))
+
+
+MASS = plants.system(1, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(1))
+
+
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
+@pytest.mark.parametrize("plant", [{"kind": "chain"}, {"kind": "system", "system": MASS}], ids=["chain", "system"])
+def test_a_run_with_a_metric_that_is_not_finite_is_not_ok(plant, mode):
+    """The state stays finite, but its square is beyond 1.8e308: the RMS over the window has no value."""
+    needs = {"requirements": {"peak_torque": 1e300, "window_error": 1e300}}
+    large, lost = (flown({**plant, "x0": [x, 0.0]}, mode, **needs) for x in (1e140, 1e160))
+    assert (large.status, large.met) == ("ok", True)
+    assert all(np.isfinite(value) for name, value in large.metrics.items() if name != "settling_time")
+    assert np.isnan(large.metrics["settling_time"])  # it never settles, which alone is no failure
+    assert np.isfinite(lost.log.x).all()
+    assert not np.isfinite(lost.metrics["window_error"])
+    assert (lost.status, lost.reason) == ("diverged", "a metric is not finite")
+    assert lost.bad_time == float(lost.parts.t_end)
+    assert not any(v.met for v in lost.verdicts)
+    assert not lost.met
+
+
+def test_a_spacecraft_whose_momentum_has_no_2_norm_is_not_ok():
+    for inertia, code in ((1e140, rollout.OK), (1e170, rollout.UNBOUNDED)):
+        result = fly(parts(inertia=(inertia,) * 3, gain=inertia, rate=(0.02, -0.03, 0.01)))
+        assert int(result.status) == code
+        assert np.isfinite(float(result.metrics.peak_momentum)) == (code == rollout.OK)
+        assert np.isfinite(float(result.metrics.window_error))
 
 
 def test_either_sign_of_the_quaternion_is_the_same_run():

@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import itertools
 import math
 
@@ -28,7 +29,7 @@ def tick(sample, weight=1.0):
 
 
 def seen_by(sensor, x, seed, trial, sample):
-    return sensor.measure(sensor.begin(seed, trial, x, sample), x, tick(sample), vector(0.05))[0]
+    return sensor.measure(sensor.begin(seed, trial, x, tick(sample)), x, tick(sample), vector(0.05))[0]
 
 
 measure = jax.jit(jax.vmap(lambda sensor, seed, trial, k: seen_by(sensor, STATE, seed, trial, k), (None, None, 0, 0)))
@@ -79,7 +80,7 @@ def test_no_noise_measures_exactly():
 
 def test_the_attitude_is_turned_about_body_axes():
     turn, push = np.array([0.3, -0.1, 0.2]), np.array([1.0, 2.0, 3.0])
-    memory = SENSORS.begin(0, 0, STATE, jnp.asarray(0))._replace(noise=(vector(turn), vector(push)))
+    memory = SENSORS.begin(0, 0, STATE, tick(0))._replace(noise=(vector(turn), vector(push)))
     got, _ = SENSORS.measure(memory, STATE, tick(0), vector(0.05))
     exact = ATTITUDE * Rotation.from_rotvec(turn)
     np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact.as_matrix(), atol=20 * EPS)
@@ -130,35 +131,104 @@ def test_filter_propagates_a_turning_body():
     assert errors[-1] < 1e-3
 
 
-def test_filter_in_its_steady_state_keeps_the_errors_it_starts_with():
-    """A body at rest: the errors of 4 000 trials after 200 s have the size that Lyapunov's equation says."""
-    every, period, noise, gyro, walk = 4, 0.25, 2e-5, 2e-6, 1e-7
-    found = sensors.attitude_filter(0.15, noise, gyro, walk, period, every)
+# control period, periods between star tracker samples, their noise, the gyro's, walk of its bias, bandwidth
+TRACKED = {"period": 0.25, "every": 4, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_walk": 1e-7, "bandwidth": 0.15}
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    """A function (first sample, share of the steady state's error at the start, samples) -> (sample, error, 12 000).
+
+    Errors of attitude [rad] and bias [rad/s] per axis of 4 000 trials just after each sample of a body at rest.
+    """
+    period, every, noise, gyro, walk = (TRACKED[name] for name in list(TRACKED)[:5])
+    found = sensors.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)
     sensor = sensors.Sensors(vector(noise), vector(gyro), vector(1e-4), vector(walk / np.sqrt(period)), found, every)
     rest = plants.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0] * 3))
 
-    def errors(trial):
+    @functools.partial(jax.jit, static_argnames="count")
+    @functools.partial(jax.vmap, in_axes=(None, None, 0, None))
+    def errors(first, size, trial, count):
         def one(memory, k):
-            seen, memory = sensor.measure(memory, rest, tick(k), vector(period))
-            return memory, (2 * seen.q[:3], memory.estimate.bias - memory.bias)
+            dt = jnp.where(k > first, period, 0.0)
+            seen, memory = sensor.measure(memory, rest, tick(k), dt)
+            return memory, jnp.stack([2 * seen.q[:3], memory.estimate.bias - memory.bias])
 
-        memory = sensor.begin(7, trial, rest, jnp.asarray(0))
-        start = (2 * memory.estimate.q[:3], memory.estimate.bias - memory.bias)
-        _, (turn, bias) = jax.lax.scan(one, memory, jnp.arange(801))
-        return start, (turn[-1], bias[-1])
+        scaled = dataclasses.replace(sensor, filter=dataclasses.replace(found, spread=size * found.spread))
+        return jax.lax.scan(one, scaled.begin(7, trial, rest, tick(first)), first + jnp.arange(count))[1]
 
-    start, end = jax.jit(jax.vmap(errors))(jnp.arange(4000, dtype=jnp.uint32))
-    for name, first, last, size in zip(("attitude", "bias"), start, end, (found.attitude_error, found.bias_error),
-                                       strict=True):  # fmt: skip
-        for values in (first, last):
-            np.testing.assert_allclose(np.std(values), size, rtol=5 / np.sqrt(2 * 12000), err_msg=name)
-    assert float(found.attitude_error) < 0.6 * noise  # what the filter is for
+    def many(first, size, count):
+        got = errors(jnp.asarray(first), vector(size), jnp.arange(4000, dtype=jnp.uint32), count)
+        return np.asarray(got).transpose(1, 2, 0, 3).reshape(count, 2, -1)
+
+    return many
+
+
+def steady():
+    """Covariance of a filter's errors just before each sample after the star tracker's, by iteration.
+
+    Of attitude, bias and the gyro's noise at the sample, half of which the trapezium rule takes into each period.
+    """
+    h, every, noise, gyro, walk, bandwidth = TRACKED.values()
+    k1, k2 = (float(v) for v in sensors.filter_gains(vector(bandwidth), h * every))
+    step = np.array([[1.0, -h, h / 2], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    keep = np.array([[1.0 - k1, 0.0, 0.0], [k2, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    fresh, drift = np.array([h / 2, 0.0, 1.0]), np.array([h / 2, -1.0, 0.0])
+    drive = gyro**2 * np.outer(fresh, fresh) + walk**2 * h * np.outer(drift, drift)
+    star = noise**2 * np.outer([k1, -k2, 0.0], [k1, -k2, 0.0])
+    found, after = [np.zeros((3, 3))] * every, np.zeros((3, 3))
+    for k in range(1000 * every):  # e^-0.3 a star tracker sample: nothing is left of zero
+        after = keep @ found[-1] @ keep.T + star if k % every == 0 else found[k % every - 1]
+        found[k % every] = step @ after @ step.T + drive
+    return np.array(found)[:, :2, :2], keep[:2, :2], star[:2, :2]
+
+
+def test_spread_of_the_filter_solves_lyapunovs_equation():
+    found = np.asarray(sensors.attitude_filter(**{k: TRACKED[k] for k in sorted(TRACKED)}).spread)
+    covariance, keep, star = steady()
+    np.testing.assert_allclose(found @ found.swapaxes(1, 2), covariance, rtol=1e-12)
+    after = keep @ covariance[-1] @ keep.T + star
+    assert -0.79 < after[0, 1] / np.sqrt(after[0, 0] * after[1, 1]) < -0.65  # they are far from independent
+
+
+@pytest.mark.parametrize("first", [0, -4, 2, -1])
+def test_errors_of_the_filter_are_the_same_from_the_first_sample_on(first, filtered):
+    """Whether or not that is one of the star tracker; drawn independently, they would fall to 0.8 of their size."""
+    covariance, keep, star = steady()
+    sampling, smallest = SIGMAS / np.sqrt(12_000), np.inf  # of a correlation; of a size 1 / sqrt 2 of it
+    for k, errors in enumerate(filtered(first, 1.0, 40), first):
+        before = covariance[(k - 1) % 4]
+        wanted = keep @ before @ keep.T + star if k % 4 == 0 else before
+        size = np.sqrt(np.diag(wanted))
+        smallest = min(smallest, size[0])
+        np.testing.assert_allclose(errors.std(axis=1) / size, 1.0, rtol=0, atol=sampling / np.sqrt(2.0), err_msg=str(k))
+        found = np.corrcoef(errors)[0, 1]
+        assert abs(found - wanted[0, 1] / size.prod()) < sampling
+    assert smallest < 0.6 * TRACKED["attitude_noise"]  # what the filter is for
+
+
+def test_filter_comes_to_its_steady_state_from_any_start(filtered):
+    covariance, keep, star = steady()
+    wanted = keep @ covariance[-1] @ keep.T + star
+    for start in (0.0, 30.0):
+        errors = filtered(0, start, 401)[-1]  # after 100 s of a bandwidth of 0.15 rad/s: 30 (1 + 15) e^-15 is left
+        np.testing.assert_allclose(errors.std(axis=1), np.sqrt(np.diag(wanted)), rtol=SIGMAS / np.sqrt(24_000))
+        correlation = wanted[0, 1] / np.sqrt(wanted[0, 0] * wanted[1, 1])
+        assert abs(np.corrcoef(errors)[0, 1] - correlation) < SIGMAS / np.sqrt(12_000)
+
+
+def test_start_of_the_filter_does_not_jump_where_the_partial_first_period_vanishes():
+    found = sensors.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
+    q, none, normals = STATE.q, vector([0.0] * 3), vector([1.0, -0.3, 0.2, 0.5, 0.1, -1.0])
+    for k in range(-4, 1):
+        vanishing, whole = (found.begin(q, none, normals, jnp.asarray(n), vector(s)) for n, s in ((k, 0), (k + 1, 1)))
+        jax.tree.map(np.testing.assert_array_equal, vanishing, whole)
 
 
 def test_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
     found = sensors.attitude_filter(0.5, 1e-5, 1e-6, 0.0, 0.1, 3)
     sensor = sensors.Sensors(vector(0.0), vector(0.0), None, None, found, 3)
-    begun = sensor.begin(0, 0, STATE, jnp.asarray(0))
+    begun = sensor.begin(0, 0, STATE, tick(0))
     off = attitude.multiply(STATE.q, attitude.from_rotation_vector(vector([1e-3, 0.0, 0.0])))
     begun = begun._replace(estimate=sensors.Estimate(off, vector([0.0] * 3)))
 
