@@ -46,6 +46,20 @@ class Sensor(Protocol):
         ...
 
 
+class Reading(NamedTuple):
+    """What a sensor says of a state near the true one, to first order, for `floor`.
+
+    Of (x, own): the plant's local coordinates (n,), see `Plant.moved`, then states of the sensor's own, a gyro's bias.
+    """
+
+    rows: np.ndarray  # (m, n + own) what is read of them
+    noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
+    every: np.ndarray  # (m,) control periods from one reading to the next
+    own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
+    own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
+    start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
+
+
 class Estimate(NamedTuple):
     """State of the attitude filter."""
 
@@ -114,8 +128,20 @@ def attitude_filter(
     attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk [rad/s/sqrt(s)];
     every: control periods between star tracker samples.
     """
+    k1, k2 = filter_gains(bandwidth, period * every)
+    spread = filter_covariance(k1, k2, attitude_noise, rate_noise, bias_walk, period, every)
+    sizes = [numerics.sqrt(jnp.maximum(spread[k, k], 0.0)) for k in (0, 1)]
+    return AttitudeFilter(k1, k2, *sizes)
+
+
+def filter_covariance(
+    k1: Any, k2: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, every: int
+) -> Float[Array, "2 2"]:
+    """Covariance of the errors (attitude [rad], bias [rad/s]) of an axis after a correction, in the steady state.
+
+    Of a filter with these gains, see `filter_gains`; the noises are those of `attitude_filter`.
+    """
     interval = period * every
-    k1, k2 = filter_gains(bandwidth, interval)
     # errors (attitude, bias) from one correction to the next: e+ = K F e + K g + (k1, -k2) noise
     zero, one = jnp.zeros_like(k1), jnp.ones_like(k1)
     step = jnp.array([[one, -interval * one], [zero, one]])
@@ -125,9 +151,7 @@ def attitude_filter(
                       [-walk * interval / 2, walk * one]])  # fmt: skip
     star = jnp.outer(jnp.stack([k1, -k2]), jnp.stack([k1, -k2])) * attitude_noise**2
     move, drive = keep @ step, keep @ gyro @ keep.T + star
-    spread = numerics.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4))
-    sizes = numerics.sqrt(jnp.maximum(spread[::3], 0.0))  # the diagonal
-    return AttitudeFilter(k1, k2, sizes[0], sizes[1])
+    return numerics.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4)).reshape(2, 2)
 
 
 class Memory(NamedTuple):
@@ -215,6 +239,20 @@ class Sensors:
         seen = AttitudeState(estimate.q, w - estimate.bias)
         return seen, Memory(memory.keys, noise_next, bias, estimate, w)
 
+    def reading(self, period: float) -> Reading:
+        """Rotation [rad], every so many periods behind a filter, and rate with its bias [rad/s], every period [s]."""
+        one, none = np.eye(3), np.zeros((3, 3))
+        star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
+        bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
+        start, every = None, 1
+        if self.filter is not None:
+            k1, k2, every = self.filter.attitude_gain, self.filter.bias_gain, self.every
+            spread = np.asarray(filter_covariance(k1, k2, star, gyro, drift * np.sqrt(period), period, every))
+            start = np.block([[one, none, none], [none, none, one]]), np.kron(spread, one)
+        rows = np.block([[one, none, none], [none, one, one]])
+        kept = np.repeat([every, 1], 3)
+        return Reading(rows, np.repeat([star, gyro], 3), kept, np.full(3, bias), np.full(3, drift), start)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -241,3 +279,8 @@ class StateSensor:
         key, noise = memory
         noise_next = self.noise(key, now.sample + 1)
         return x + numerics.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
+
+    def reading(self, period: float) -> Reading:
+        """Every state, every period [s]."""
+        sigma = np.asarray(self.sigma)
+        return Reading(np.eye(sigma.size), sigma, np.ones(sigma.size, int), np.zeros(0), np.zeros(0))
