@@ -14,7 +14,7 @@ from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.rollout import Log, Parts
 from ptsmc_jax.scenario import Study
 
-FLOORS = 8  # trials whose floors are pooled: they differ by a few per cent
+FLOORS = 4  # trials whose floors are pooled: they differ by a few per cent
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 from ptsmc_jax import clock, estimation, hardware, rollout, sensors, signals
 from ptsmc_jax.estimation import Model
 from tests.helpers import chain_parts, parts, vector
+from tuning import told
 
 PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
 
@@ -233,3 +234,20 @@ def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
     assert len(after_star) > 50
     # the error is half an angle
     np.testing.assert_allclose(after_star[-1], math.sqrt(own[0, 0]) / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize("least", [None, 0.0])
+def test_where_there_is_no_floor_nothing_is_said(least):
+    """Without noise, where no run flies, and in results of earlier versions, which have no such key."""
+    point = {"gains": {"eta": 3.0}, "rms": 1e-5, "interval": None, "peak": 0.2, "mean_peak": 0.1, "failures": 0,
+             "knee": False, "meets": True, "dominated": False}  # fmt: skip
+    front = {"plant": "spacecraft", "points": [point], "requirements": [], "paper_refused": None}
+    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
+    flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
+    for known in ({}, {"floor": least}):
+        assert told.run_lines({**run, **known}) == ["status: ok"]
+        assert list(told.campaign_error({**flown, **known})) == []
+        assert list(told.front_lines({**front, **known})) == []
+        assert "times the floor" not in told.front({**front, **known}).head
+    assert told.front({**front, "floor": 5e-6}).head[5] == "times the floor"
+    assert told.front({**front, "floor": 5e-6}).rows[0][5] == "2"
