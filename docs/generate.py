@@ -28,11 +28,12 @@ filled in, as `scenario.toml` beside their results. What follows from several ke
 least one control period, is said when a scenario is refused."""
 METRICS = """\
 What a run is judged by: in `summary.json`, in the rows of a campaign and in `[requirements]`. Over trials
-`window_error` pools as RMS; of the others mean, largest and quantiles are told. A run that never settles has no
-`settling_time` (null). A trial that diverged or met a singularity has a status, a reason and its first bad time, and
-breaks every requirement; so does one that never settles a limit on `settling_time`. A run that ends with another
-metric infinite or without a value (an error whose square no number holds) counts as diverged at t_end. One that is
-`missed`, far from the reference at t_f, counts with its metrics."""
+`window_error` pools as RMS and stands beside its `floor`, what no controller can beat ([the
+method](method.md#the-floor) says what that takes as known); of the others mean, largest and quantiles are told. A run
+that never settles has no `settling_time` (null). A trial that diverged or met a singularity has a status, a reason and
+its first bad time, and breaks every requirement; so does one that never settles a limit on `settling_time`. A run that
+ends with another metric infinite or without a value (an error whose square no number holds) counts as diverged at
+t_end. One that is `missed`, far from the reference at t_f, counts with its metrics."""
 ERRORS = """\
 The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
 part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and

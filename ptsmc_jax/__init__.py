@@ -31,6 +31,7 @@ _EXPORTS = {
     "Result": "rollout",
     "STATUS": "rollout",
     "simulate": "explore",
+    "floor": "explore",
     "trials": "explore",
     "verdicts": "explore",
     "read": "scenario",
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.controllers import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
     from ptsmc_jax.controllers import PrescribedTimeSystem as PrescribedTimeSystem
     from ptsmc_jax.dispersions import Dispersion as Dispersion
+    from ptsmc_jax.explore import floor as floor
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts

@@ -10,9 +10,11 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import animation, campaign, metrics, plotting, runs, scenario
+from ptsmc_jax.estimation import Floor
 from ptsmc_jax.montecarlo import OwnMetrics
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.runs import Run
+from ptsmc_jax.scenario import Study
 from ptsmc_jax.tables import Scenario
 
 
@@ -61,9 +63,14 @@ class Flight:
         """One for each requirement of the scenario."""
         return self.run.verdicts
 
+    @property
+    def floor(self) -> Floor | None:
+        """What no controller can beat along this run, and its course over time; None: not flown to the end."""
+        return self.run.floor
+
     def plot(self, *names: str) -> "Figures":
         """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
-        made = plotting.run_figures(self.run.parts, self.run.log, self.run.torque_limit)
+        made = plotting.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
         unknown = [name for name in names if name not in made]
         if unknown:
             raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(made)}")
@@ -127,6 +134,17 @@ def trials(
     _whole("count", count, 1)
     known = what if isinstance(what, Scenario) else scenario.read(what)
     return campaign.Campaign(scenario.study(known), seed, own).fly(range(count))
+
+
+def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
+    """RMS window error that no controller can beat in a scenario, in the unit of the metric; 0: nothing is unknown.
+
+    Pooled over a few trials, see `runs.floor`; what is taken as known: `estimation`. None: none of them flies.
+    """
+    _whole("seed", seed)
+    if not isinstance(what, Study):
+        what = scenario.study(what if isinstance(what, Scenario) else scenario.read(what))
+    return runs.floor(what, seed)
 
 
 def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:

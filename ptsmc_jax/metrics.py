@@ -239,9 +239,15 @@ def _square_error(span: Span, start: tuple, end: tuple, judged: Judged) -> Scala
     (error, rate), (error_next, rate_next) = start, end
     middle = (error + error_next) / 2 + dt / 8 * (rate - rate_next)
     g0, g1, g2 = (jnp.sum(e * e) for e in (error, middle, error_next))
+    return in_window(span.t, span.t_next, (g0, g1, g2), judged)
 
-    def fraction(t: Array) -> Array:
-        return jnp.clip((t - span.t) / dt, 0.0, 1.0)
+
+def in_window(t: Array, t_next: Array, squares: tuple[Array, Array, Array], judged: Judged) -> Array:
+    """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s]."""
+    dt, (g0, g1, g2) = t_next - t, squares
+
+    def fraction(time: Array) -> Array:
+        return jnp.clip((time - t) / dt, 0.0, 1.0)
 
     def primitive(x: Array) -> Array:
         return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))

@@ -69,6 +69,14 @@ class Plant(ABC):
         """The state with its constraints met again, which integration meets but for its error."""
         return x
 
+    def moved(self, x: Any, by: Float[Array, " n"]) -> Any:
+        """A state near another one: local coordinates (n,), as many as it has degrees of freedom."""
+        return x + by
+
+    def apart(self, x: Any, other: Any) -> Float[Array, " n"]:
+        """Local coordinates (n,) of a state near x, to first order."""
+        return other - x
+
     @abstractmethod
     def speed(self, x: Any) -> Scalar:
         """What the metric peak_rate is the largest of."""
@@ -127,6 +135,14 @@ class Spacecraft(Plant):
     def normalise(self, x: AttitudeState) -> AttitudeState:
         """The state with |q| = 1 again."""
         return AttitudeState(attitude.normalise(x.q), x.w)
+
+    def moved(self, x: AttitudeState, by: Float[Array, "6"]) -> AttitudeState:
+        """The state turned by a small rotation in body axes [rad], its rate changed [rad/s]."""
+        return AttitudeState(attitude.multiply(x.q, attitude.from_rotation_vector(by[:3])), x.w + by[3:])
+
+    def apart(self, x: AttitudeState, other: AttitudeState) -> Float[Array, "6"]:
+        """Small rotation in body axes [rad] and change of the rate [rad/s]."""
+        return jnp.concatenate([2.0 * attitude.multiply(attitude.conjugate(x.q), other.q)[:3], other.w - x.w])
 
     def speed(self, x: AttitudeState) -> Scalar:
         """|w| [rad/s]."""
@@ -206,7 +222,6 @@ def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> C
     """Integrator chain; f, g: see `Chain`, plain functions are wrapped. Raises ValueError where order is below 2."""
     if order < 2:
         raise ValueError(f"order is {order}, but must be at least 2")
-
     return Chain(order, _called(f), _called(g))
 
 
@@ -336,11 +351,9 @@ def system(
         except Exception as error:
             said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
             raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {said}") from error
-        if getattr(returned, "shape", None) != shape:
-            raise ValueError(
-                f"{name}(t, x_1, x_2) returns {getattr(returned, 'shape', type(returned).__name__)}, but for n = {n} "
-                f"must return an array of shape {shape}"
-            )
+        got = getattr(returned, "shape", type(returned).__name__)
+        if got != shape:
+            raise ValueError(f"{name}(t, x_1, x_2) returns {got}, but for n = {n} must return an array {shape}")
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
     definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
     if not definite:
@@ -367,8 +380,7 @@ def check_inertia(inertia: object) -> np.ndarray:
         tensor = tensor.astype(float)
     except (ValueError, TypeError):  # rows of different lengths, or no numbers
         tensor = np.zeros(0)
-    if tensor.shape == (3,):
-        tensor = np.diag(tensor)
+    tensor = np.diag(tensor) if tensor.shape == (3,) else tensor
     if tensor.shape != (3, 3):
         raise ValueError("allowed are three principal moments or a symmetric 3x3 tensor [kg m^2]")
     if not np.all(np.isfinite(tensor)):

@@ -15,15 +15,16 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import theory
 from ptsmc_jax.controllers import PrescribedTime
 from ptsmc_jax.drawing import RC, STYLES, TIME, figure_of
+from ptsmc_jax.estimation import Floor
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.remark_2 import Measured
 from ptsmc_jax.rollout import Log, Parts
 
 
-def run_figures(parts: Parts, log: Log, limit: float | None = None) -> dict[str, Figure]:
+def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
-    figures = {"error": error(parts, log), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
+    figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
     if isinstance(parts.controller, Prescribed):
         figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
@@ -55,8 +56,8 @@ def states(parts: Parts, log: Log, title: str = "States") -> Figure:
     return figure
 
 
-def error(parts: Parts, log: Log) -> Figure:
-    """2-norm of the error on a log scale with its bound, and the window in which it is judged."""
+def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
+    """2-norm of the error on a log scale with its bound and floor, and the window in which it is judged."""
     symbol, _, _ = _names(parts)
     figure, axes = figure_of("Error", symbol)
     size = np.linalg.norm(log.error, axis=1)
@@ -64,6 +65,9 @@ def error(parts: Parts, log: Log) -> Figure:
     if isinstance(parts.controller, Prescribed):
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, theory.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
+    if floor is not None and floor.window_error > 0.0:
+        known = (floor.error > 0.0) & (floor.error < size.max())  # before the first samples nothing is
+        axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="floor: no controller beats it")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _mark(axes, parts)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax import draws, metrics, numerics
 from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.hardware import Actuators
+from ptsmc_jax.hardware import Actuators, Drive
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
 from ptsmc_jax.plants import Plant
@@ -159,22 +159,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     walk = draws.stream(seed, trial, DISTURBANCE_WALK)
 
     def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
-        step = dt / parts.substeps
-
-        def substep(k: Scalar, x: Any) -> Any:
-            start, push = t + k * step, actuators.over(drive, k * step, step)
-
-            def rate(time: Scalar, y: Any) -> Any:
-                d = parts.disturbance(time, y)
-                acting = push.at(time - start, parts.plant.velocity(y))
-                return parts.plant.rate(time, y, acting, d if pushed is None else d + pushed)
-
-            return numerics.rk4(rate, start, x, step)
-
-        if parts.substeps == 1:
-            return parts.plant.normalise(substep(jnp.zeros_like(dt), x))
-        starts = jnp.arange(parts.substeps, dtype=dt.dtype)
-        return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
+        return over_period(parts, t, x, drive, pushed, dt)
 
     def period(carry: tuple[_State, _Flight], tick: tuple) -> tuple[tuple[_State, _Flight], Any]:
         (now, dt_before, partial), (state, flight) = tick, carry
@@ -231,6 +216,30 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     )
     (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
     return _finish(parts, course, first, state, k2, rows, flight, held=True)
+
+
+def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | None, dt: Scalar) -> Any:
+    """The true plant's state dt [s] into a control period from t [s], under the period's drive and a torque besides.
+
+    pushed: that torque, constant over the period, (m,) [N m]; None: no random walk.
+    """
+    actuators = Actuators() if parts.actuators is None else parts.actuators
+    step = dt / parts.substeps
+
+    def substep(k: Scalar, x: Any) -> Any:
+        start, push = t + k * step, actuators.over(drive, k * step, step)
+
+        def rate(time: Scalar, y: Any) -> Any:
+            d = parts.disturbance(time, y)
+            acting = push.at(time - start, parts.plant.velocity(y))
+            return parts.plant.rate(time, y, acting, d if pushed is None else d + pushed)
+
+        return numerics.rk4(rate, start, x, step)
+
+    if parts.substeps == 1:
+        return parts.plant.normalise(substep(jnp.zeros_like(dt), x))
+    starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+    return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
 
 
 def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:

@@ -1,16 +1,20 @@
 """One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import rollout
+from ptsmc_jax import estimation, rollout
+from ptsmc_jax.estimation import Floor
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.rollout import Log, Parts
 from ptsmc_jax.scenario import Study
+
+FLOORS = 4  # trials whose floors are pooled: they differ by a few per cent
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,12 @@ class Run:
     def torque_limit(self) -> float | None:
         """What the scenario allows of the torque; None: it does not say."""
         return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
+
+    @cached_property
+    def floor(self) -> Floor | None:
+        """What no controller can beat along this run, see `estimation`; None: it was not flown to the end."""
+        finished = self.status in [rollout.STATUS[code][0] for code in rollout.FINISHED]
+        return estimation.along(self.parts, self.log) if finished else None
 
     def columns(self) -> dict[str, np.ndarray]:
         """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable, wheels."""
@@ -66,3 +76,14 @@ def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
     finished = np.asarray(int(result.status) in rollout.FINISHED)
     verdicts = [r.verdict(np.asarray(metrics[r.metric]), finished) for r in ready.requirements]
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
+
+
+def floor(ready: Study, seed: int = 0) -> float | None:
+    """RMS window error that no controller can beat, in the unit of the metric, see `estimation`; 0: nothing is unknown.
+
+    Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials. None: none of these is
+    flown to the end.
+    """
+    trials = range(FLOORS) if ready.dispersion.varies else (None,)
+    runs = (fly(ready, seed, trial) for trial in trials)
+    return estimation.pooled(run.floor for run in runs if run.floor is not None)

@@ -46,6 +46,20 @@ class Sensor(Protocol):
         ...
 
 
+class Reading(NamedTuple):
+    """What a sensor says of a state near the true one, to first order, for `floor`.
+
+    Of (x, own): the plant's local coordinates (n,), see `Plant.moved`, then states of the sensor's own, a gyro's bias.
+    """
+
+    rows: np.ndarray  # (m, n + own) what is read of them
+    noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
+    every: np.ndarray  # (m,) control periods from one reading to the next
+    own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
+    own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
+    start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
+
+
 class Estimate(NamedTuple):
     """State of the attitude filter."""
 
@@ -246,6 +260,19 @@ class Sensors:
         seen = AttitudeState(estimate.q, w - estimate.bias)
         return seen, Memory(memory.keys, noise_next, bias, estimate, w)
 
+    def reading(self, period: float) -> Reading:
+        """Rotation [rad], every so many periods behind a filter, and rate with its bias [rad/s], every period [s]."""
+        one, none = np.eye(3), np.zeros((3, 3))
+        star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
+        bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
+        start, every = None, 1
+        if self.filter is not None:
+            root, every = np.asarray(self.filter.spread[-1]), self.every
+            start = np.block([[one, none, none], [none, none, one]]), np.kron(root @ root.T, one)
+        rows = np.block([[one, none, none], [none, one, one]])
+        kept = np.repeat([every, 1], 3)
+        return Reading(rows, np.repeat([star, gyro], 3), kept, np.full(3, bias), np.full(3, drift), start)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -272,3 +299,8 @@ class StateSensor:
         key, noise = memory
         noise_next = self.noise(key, now.sample + 1)
         return x + numerics.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
+
+    def reading(self, period: float) -> Reading:
+        """Every state, every period [s]."""
+        sigma = np.asarray(self.sigma)
+        return Reading(np.eye(sigma.size), sigma, np.ones(sigma.size, int), np.zeros(0), np.zeros(0))

@@ -130,12 +130,17 @@ def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: fl
 
 
 def front(
-    points: Sequence[Any], others: Mapping[str, Any], limit: float | None, units: tuple[str, ...], name: str = "front"
+    points: Sequence[Any],
+    others: Mapping[str, Any],
+    limit: float | None,
+    units: tuple[str, ...],
+    name: str = "front",
+    floor: float | None = None,
 ) -> Figure:
     """Window error against peak torque of the points of a front, with their intervals.
 
     Points have rms, interval, peak, dominated and knee; others, by label: such points that are no part of it; units: of
-    error and torque.
+    error and torque; floor: the error that no controller can beat.
     """
     figure, axes = figure_of(f"Accuracy against torque: the {name}, fresh trials", f"RMS window error [{units[0]}]")
     kept = [point for point in points if not point.dominated]
@@ -154,6 +159,8 @@ def front(
             axes.loglog(p.peak, p.rms, marker, ms=8, color=style[0], label=f"{label}: {p.rms:.2e}")
     if limit is not None:
         axes.axvline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {units[1]}")
+    if floor:
+        axes.axhline(floor, color="0.3", lw=1.0, ls=":", label=f"floor {floor:.2g}")
     axes.set_xlabel(f"largest peak torque [{units[1]}]")
     plain_ticks(axes.xaxis)
     axes.legend(fontsize=9)

@@ -50,7 +50,7 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     assert "250 trials of seed 3: 250 ok" in said
     assert "peak_torque at most 30 N m: worst" in said
     assert "within it 100 % (95 %: 98.5353 to 100 %)" in said  # 0.025^(1/250)
-    names = {"scenario.toml", "versions.json", "summary.json", "trials", "figures"}
+    names = {"scenario.toml", "versions.json", "floor.json", "summary.json", "trials", "figures"}
     assert {path.name for path in folder.iterdir()} == names
     assert [path.name[:21] for path in sorted((folder / "trials").iterdir())] == [
         "0000000000-0000000099", "0000000100-0000000199", "0000000200-0000000249"
@@ -64,6 +64,10 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     assert (found["status"], found["flown"], found["counts"]["ok"]) == ("met", 250, 250)
     errors = rows["window_error"].to_numpy()
     told = found["quantiles"]["window_error"]
+    least = found["floor"]
+    assert 0.0 < least < told["rms"]
+    for place in (said, read.text):
+        assert f"RMS window error {told['rms']:.3e}, {told['rms'] / least:.3g} times the floor {least:.2e}" in place
     np.testing.assert_allclose([told["mean"], told["rms"], told["max"]],
                                [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
     assert told["0.9"]["value"] == np.sort(errors)[224]

@@ -36,6 +36,7 @@ def test_simulate_leaves_what_the_contract_says(command, tmp_path):
     assert summary["status"] == "ok"
     assert set(metrics.CATALOGUE) - {"peak_wheel_momentum"} <= set(summary)
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
+    assert f"{summary['window_error'] / summary['floor']:.3g} times the floor {summary['floor']:.2e}" in out
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
     made = json.loads((folder / "versions.json").read_text())
     assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)
@@ -102,6 +103,8 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert {"gains", "training", "fresh", "paper", "verdicts"} <= set(summary)
     assert summary["fresh"]["trials"] == 40
     assert summary["fresh"]["seed"] != summary["training"]["seed"]
+    for group in ("fresh", "paper"):
+        assert 0.0 < summary[group]["floor"] < summary[group]["window_error"]["rms"]
     files = {"tuned.toml", "history.csv", "summary.json", "scenario.toml", "versions.json"}
     drawn = {f"figures/{name}.png" for name in ("history", "tradeoff", "sensitivities", "profiles")}
     assert set(tree(tmp_path / "t")) == files | drawn
@@ -121,6 +124,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
 
     read = checked(tmp_path / "t")
     assert set(read.charts) == {"search"}
+    assert f"{summary['fresh']['window_error']['rms'] / summary['fresh']['floor']:.3g} times the floor" in read.text
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict

@@ -29,7 +29,7 @@ FLOORS = {
         components
         lanes
         kernel
-        theory linear
+        theory linear estimation
         requirements
         dispersions
         values systems

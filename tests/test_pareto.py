@@ -123,6 +123,10 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     assert f"{len(kept)} points, each judged on 60 fresh trials" in told
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}
+    assert all(float(row["rms_window_error"]) > summary["floor"] > 0.0 for row in rows)
+    assert f"floor {summary['floor']:.2e}: no controller" in told
+    drawn = read.charts["front"]["layout"]["shapes"][-1]
+    assert drawn["y0"] == drawn["y1"] == summary["floor"]
     assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
     assert command("pareto", "s.toml", "--points", 6, "--out", "p")[1].startswith("front already done")
     assert command("pareto", "s.toml", "--points", 7, "--out", "p")[0] == 2

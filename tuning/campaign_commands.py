@@ -112,6 +112,8 @@ def montecarlo(
                 folder = campaign_folder.settle(folder, stopped)
             else:
                 campaign_folder.fly(folder, share, told, elsewhere)
+            if not dry_run:
+                campaign_folder.find_floor(folder)
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from ptsmc_jax import campaign as flying
-from ptsmc_jax import rows, scenario, schema, store, systems
+from ptsmc_jax import rows, runs, scenario, schema, store, systems
 from ptsmc_jax.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.rows import Part, Rows
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.store import RefusedError
 from ptsmc_jax.tables import Scenario
 
+FLOOR = "floor.json"  # what no controller can beat: found when flying, so that a summary needs no plant
 OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
 
@@ -92,6 +93,7 @@ def begin(wanted: Folder, force: bool) -> None:
         for kept in (wanted.rows, wanted.plan):
             for file in kept.folder.glob("*.parquet"):
                 file.unlink()
+        (path / FLOOR).unlink(missing_ok=True)
     else:
         store.check(path, force=True)
         there = path.is_dir() and any(path.iterdir())
@@ -165,6 +167,20 @@ def fly(
     flying.follow(made, flying.tally(parts, trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
+
+
+def find_floor(folder: Folder) -> None:
+    """Write the RMS window error that no controller can beat into the folder, where it is not there yet."""
+    if not (folder.path / FLOOR).exists():
+        store.write_json(folder.path / FLOOR, {"window_error": runs.floor(folder.campaign.ready, folder.seed)})
+
+
+def floor_of(folder: Folder) -> float | None:
+    """What `find_floor` wrote; None: nothing, as in campaigns of earlier versions."""
+    try:
+        return json.loads((folder.path / FLOOR).read_text(encoding="utf-8"))["window_error"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:

@@ -15,7 +15,7 @@ from ptsmc_jax import drawing, metrics, rows, runs, schema, statistics, store
 from ptsmc_jax.requirements import Requirement, Verdict
 from ptsmc_jax.rollout import STATUS
 from ptsmc_jax.store import RefusedError
-from tuning.campaign_folder import Folder
+from tuning.campaign_folder import Folder, floor_of
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
@@ -97,6 +97,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "counts": counts,
         "reasons": reasons,
         "interval_confidence": CONFIDENCE,
+        "floor": floor_of(folder),
         "verdicts": told,
         "quantiles": found,
         "drivers": drivers,

@@ -289,7 +289,8 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
         *_limits(summary["verdicts"]),
         Section("Metrics", [_table(told.campaign(summary), note), _text(told.campaign_drivers(summary))]),
     ]
-    return _verdict(summary, told.campaign_counts(summary), bool(summary["verdicts"])), sections
+    lines = [*told.campaign_counts(summary), *told.campaign_error(summary)]
+    return _verdict(summary, lines, bool(summary["verdicts"])), sections
 
 
 def _map(result: Result) -> tuple[Heading, list[Section]]:

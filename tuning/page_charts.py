@@ -139,7 +139,13 @@ def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None
     shapes = [] if limit is None else [
         {"type": "line", "x0": limit, "x1": limit, "yref": "paper", "y0": 0, "y1": 1, "line": {"dash": "dash"}}
     ]  # fmt: skip
-    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes)}
+    said = []
+    if summary.get("floor"):
+        level = {"y0": summary["floor"], "y1": summary["floor"], "xref": "paper", "x0": 0, "x1": 1}
+        shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
+        said.append({"text": "floor", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(summary["floor"]),
+                     "yanchor": "bottom", "showarrow": False})  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=said)}
 
 
 def _bars(points: Sequence[dict[str, Any]]) -> Chart:

@@ -65,6 +65,7 @@ class Front:
     paper_refused: str | None  # why the paper's gains are not among them
     fresh_seed: int
     trials: int
+    floor: float | None  # RMS window error that no controller can beat
     rollouts: int
     gradients: int
 
@@ -123,7 +124,8 @@ def trace(
         trials, values = report.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
         fixed[name] = _point(np.nan, values, np.nan, trials, ready.requirements)
     count = next(iter(judged.values()))[1].status.size if judged else 0
-    return Front(_marked(judged), fixed, refused, fresh_seed, count, evaluate.rollouts, evaluate.gradients)
+    floor = report.floor_of(scenario, fresh_seed)
+    return Front(_marked(judged), fixed, refused, fresh_seed, count, floor, evaluate.rollouts, evaluate.gradients)
 
 
 def check(scenario: Scenario) -> None:
@@ -269,6 +271,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "trials": front.trials,
         "seed": front.fresh_seed,
         "interval_confidence": trust.CONFIDENCE,
+        "floor": front.floor,
         "rollouts": front.rollouts,
         "gradients": front.gradients,
         "points": [said(point) for point in front.points],
@@ -295,4 +298,5 @@ def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_b
         known = scenario.requirements.get(TORQUE)
         limit = None if known is None else _limited(scenario)[1]
         units = tuple(metrics.CATALOGUES[scenario.plant.kind][name][0] for name in ("window_error", TORQUE))
-        drawing.save({"front": study_plots.front(front.points, front.others, limit, units)}, folder / "figures")
+        drawn = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
+        drawing.save({"front": drawn}, folder / "figures")

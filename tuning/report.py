@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import draws, montecarlo, tables, theory
+from ptsmc_jax import draws, montecarlo, runs, tables, theory
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
@@ -56,6 +56,7 @@ class Tuning:
     seed: int
     fresh_seed: int
     judged_gains: dict[str, dict[str, float]]  # the gains of each of them
+    floors: dict[str, float | None]  # RMS window error that no controller can beat, for each of them
     verdicts: list[Verdict]  # of the tuned gains on the fresh trials
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
@@ -118,10 +119,11 @@ def tune(
     trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
     fresh_seed = seed_of_judge(seed)
-    fresh, judged_gains = {}, {}
+    fresh, judged_gains, floors = {}, {}, {}
     for name, candidate in {"tuned": tuned, **others}.items():
         fresh[name] = judge(candidate, fresh_seed, ready.requirements)
         judged_gains[name] = gains.gains_of(study(as_flown(candidate)).parts)
+        floors[name] = floor_of(candidate, fresh_seed)
     verdicts = verdicts_of(ready.requirements, fresh["tuned"])
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
@@ -151,6 +153,7 @@ def tune(
         seed=seed,
         fresh_seed=fresh_seed,
         judged_gains=judged_gains,
+        floors=floors,
         verdicts=verdicts,
         shortest=shortest,
         trust=believed,
@@ -232,6 +235,11 @@ def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requiremen
     flown = study(as_flown(scenario))
     trials = np.arange(trials_of(flown, confirm.fresh_trials(requirements)))
     return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
+
+
+def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
+    """RMS window error that no controller can beat where a scenario is judged, see `runs.floor`."""
+    return runs.floor(study(as_flown(scenario)), fresh_seed)
 
 
 def verdicts_of(requirements: Sequence[Requirement], trials: Trials) -> list[Verdict]:

@@ -47,7 +47,8 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     kind, found = tuning.tuned.plant.kind, tuning.search
     assert tuning.tuned.tune is not None
     groups = {
-        name: {"gains": tuning.judged_gains[name], **statistics(trials, kind)} for name, trials in tuning.fresh.items()
+        name: {"gains": tuning.judged_gains[name], "floor": tuning.floors[name], **statistics(trials, kind)}
+        for name, trials in tuning.fresh.items()
     }
     checked = None if tuning.check is None else asdict(tuning.check)
     return {

@@ -50,7 +50,12 @@ def campaign(found: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
     show.say(*told.campaign_counts(found))
     show.table(told.campaign(found))
-    show.say(*map(told.verdict, found["verdicts"]), *told.campaign_drivers(found), f"results in {folder}")
+    show.say(
+        *told.campaign_error(found),
+        *map(told.verdict, found["verdicts"]),
+        *told.campaign_drivers(found),
+        f"results in {folder}",
+    )
 
 
 def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:

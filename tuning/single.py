@@ -14,7 +14,8 @@ def summary(run: Run) -> dict[str, Any]:
     """What `summary.json` says."""
     verdicts = {v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met} for v in run.verdicts}
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
-    return {**heading, **run.metrics, "verdicts": verdicts}
+    floor = None if run.floor is None else run.floor.window_error
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts}
 
 
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
@@ -27,4 +28,4 @@ def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | No
     if figures:
         from ptsmc_jax import drawing, plotting  # takes 0.3 s, which a run without figures need not wait for
 
-        drawing.save(plotting.run_figures(run.parts, run.log, run.torque_limit), folder / "figures")
+        drawing.save(plotting.run_figures(run.parts, run.log, run.torque_limit, run.floor), folder / "figures")

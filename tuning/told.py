@@ -51,11 +51,13 @@ def run(summary: Summary, kind: str) -> Table:
 
 
 def run_lines(summary: Summary) -> list[str]:
-    """Status of one run."""
+    """Status of one run, and its error beside the floor."""
     bad_time = summary["bad_time"]
     when = "" if bad_time is None or bad_time != bad_time else f", at {bad_time:.4g} s"
     what = f", {summary['reason']}{when}" if summary["reason"] else ""
-    return [f"status: {summary['status']}{what}"]
+    beside = floor(summary.get("window_error"), summary.get("floor"))
+    error = [f"window error {summary['window_error']:.3e}{beside}"] if beside else []
+    return [f"status: {summary['status']}{what}", *error]
 
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
@@ -92,6 +94,8 @@ def tuning(summary: Summary) -> Table:
     ):
         found = (group[metric][statistic] if group[metric] else None for group in groups.values())
         rows.append((label, *("-" if v is None else f"{v:.4g}" for v in found), CATALOGUES[kind][metric][0]))
+        if label == "RMS window error" and summary["fresh"].get("floor"):
+            rows.append(("times the floor", *(_times(group) for group in groups.values()), ""))
     rows.append(("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), ""))
     return Table(("", *groups, "unit"), rows)
 
@@ -115,7 +119,17 @@ def accuracy(summary: Summary) -> Iterator[str]:
     if trained and fresh:
         both = [f"{where} {one['rms']:.3e}" + _between(one.get("rms_interval"), ".3e")
                 for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
-        yield f"RMS window error: {', '.join(both)}"
+        yield f"RMS window error: {', '.join(both)}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
+
+
+def floor(error: float | None, least: float | None) -> str:
+    """How many times the error is what no controller can beat; nothing where there is no such floor."""
+    return f", {error / least:.3g} times the floor {least:.2e}" if error and least else ""
+
+
+def _times(group: Summary) -> str:
+    known = group["window_error"] and group.get("floor")
+    return f"{group['window_error']['rms'] / group['floor']:.3g}" if known else "-"
 
 
 def paper_refused(summary: Summary) -> Iterator[str]:
@@ -263,17 +277,22 @@ def front(summary: Summary) -> Table:
         if point["failures"]:
             marks.append(f"{point['failures']} failed or missed")
         gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
-        cells = ("-" if value is None else f"{value:.4g}" for value in gains)
+        cells = ["-" if value is None else f"{value:.4g}" for value in gains]
+        if summary.get("floor"):
+            cells.insert(0, "-" if point["rms"] is None else f"{point['rms'] / summary['floor']:.3g}")
         within = "-" if low is None or high is None else f"{50 * (high - low) / point['rms']:.1f} %"
         numbers = (_digits(point["peak"], ".4g"), _digits(point["mean_peak"], ".4g"), _digits(point["rms"], ".3e"))
         rows.append((name, *numbers, within, *cells, ", ".join(marks)))
     torque, error = units["peak_torque"][0], units["window_error"][0]
-    return Table(("", f"peak {torque}", "mean", f"error {error}", "+-", *names, ""), rows)
+    beside = ("times the floor",) if summary.get("floor") else ()
+    return Table(("", f"peak {torque}", "mean", f"error {error}", "+-", *beside, *names, ""), rows)
 
 
 def front_lines(summary: Summary) -> Iterator[str]:
     """What is left out of a front, and whether anything on it will do."""
     yield from paper_refused(summary)
+    if summary.get("floor"):
+        yield f"floor {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
     kept = [point for point in summary["points"] if not point["dominated"]]
     lost = len(summary["points"]) - len(kept)
     if lost:
@@ -319,6 +338,14 @@ def campaign_counts(summary: Summary) -> Iterator[str]:
     for reason in summary["reasons"]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
+
+
+def campaign_error(summary: Summary) -> Iterator[str]:
+    """The RMS of the window errors, beside what no controller can beat."""
+    error = summary["quantiles"]["window_error"].get("rms")
+    beside = floor(error, summary.get("floor"))
+    if beside:
+        yield f"RMS window error {error:.3e}{beside}"
 
 
 def campaign_drivers(summary: Summary) -> Iterator[str]:

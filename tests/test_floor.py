@@ -1,0 +1,252 @@
+"""The floor: closed forms, a brute-force estimator, the filter that attains it, and who says it."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ptsmc_jax import clock, estimation, hardware, rollout, sensors, signals
+from ptsmc_jax.estimation import Model
+from tests.helpers import chain_parts, parts, vector
+from tuning import told
+
+PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
+
+
+def still(made):
+    """A history in which nothing moves, as long as the run of these parts; only what `estimation` reads."""
+    periods = int(np.ceil(float(made.t_end) / PERIOD))
+
+    def kept(v):
+        return np.tile(np.asarray(v), (periods + 1, *[1] * np.ndim(v)))
+
+    x = made.initial
+    held = jax.tree.map(kept, x)
+    none, t = np.zeros((periods + 1, made.plant.inputs)), np.arange(periods + 1) * PERIOD
+    log: Any = rollout.Log
+    return log(t, held, none, none, none, none, none, None, none, None, np.ones(periods + 1, bool))
+
+
+def flown_at(made, **changes):
+    """The parts on the flight clock, with other devices."""
+    return dataclasses.replace(made, clock=clock.flight(PERIOD, float(made.t_end)), **changes)
+
+
+def delayed(periods):
+    return hardware.Actuators(delay=periods)
+
+
+def by_least_squares(move, push, rows, noise, prior, output, delay):
+    """Variances (periods, outputs) by conditioning on all samples at once.
+
+    z_{k+1} = move z_k + push v_k, v_k standard normal; samples rows z_k with noise (periods, m), infinite where there
+    is none; prior: information (n, n) on z_0; output: rows of (z_k, v_k) that are asked for, (outputs, n + v).
+    """
+    periods, n, v = len(noise), len(move), push.shape[1]
+    total = n + v * periods  # (z_0, v_0, v_1, ..)
+    state = [np.eye(n, total)]
+    for k in range(periods - 1):
+        drawn = np.eye(v, total, n + v * k)
+        state.append(move @ state[k] + push @ drawn)
+    scale = np.concatenate([np.min(noise[np.isfinite(noise)]) * np.ones(n), np.ones(v * periods)])  # well conditioned
+    start = np.zeros((total, total))
+    start[:n, :n] = prior
+    start[n:, n:] = np.eye(v * periods)
+    found = np.full((periods, len(output)), np.nan)
+    for k in range(delay, periods):
+        information = start.copy()
+        for j in range(k - delay + 1):
+            there = np.isfinite(noise[j])
+            read = (rows @ state[j])[there] / noise[j][there, None]
+            information += read.T @ read
+        asked = output @ np.vstack([state[k], np.eye(v, total, n + v * k)])
+        covariance = np.linalg.inv(information * np.outer(scale, scale))
+        found[k] = np.einsum("ij,jk,ik->i", asked * scale, covariance, asked * scale)
+    return found
+
+
+def pooled_in_window(made, squares):
+    """RMS over the window of squares at the start, the middle and the end of each period (periods, 3), by Simpson."""
+    t_f, window = float(made.controller.t_f), float(made.window)
+    inside = slice(round(t_f / PERIOD), round((t_f + window) / PERIOD))
+    return np.sqrt(np.sum(squares[inside] @ np.array([1, 4, 1]) / 6) * PERIOD / window)
+
+
+def test_farrenkopfs_steady_state():
+    """His two states, attitude and the gyro's bias, by the closed form of theory (Markley and Reynolds, 2000)."""
+    interval, star, gyro, walk = 0.25, 2e-5, 1e-5, 3e-6
+    s_v, s_u = gyro * math.sqrt(interval) / star, walk * interval**1.5 / star
+    g = math.sqrt(1 + s_v**2 / 4 + s_u**2 / 48)
+    z = g + s_u / 4 + 0.5 * math.sqrt(2 * g * s_u + s_v**2 + s_u**2 / 3)
+    before, after = star * math.sqrt(z**2 - 1), star * math.sqrt(1 - z**-2)
+    move = np.array([[1.0, -interval], [0.0, 1.0]])
+    grown = walk**2 * interval
+    noise = np.array([[gyro**2 * interval + grown * interval**2 / 3, -grown * interval / 2],
+                      [-grown * interval / 2, grown]])  # fmt: skip
+    periods = 2000  # the slower of both errors falls by e each 40
+    moves, kicks = (
+        np.tile(move, (periods, 1, 1)),
+        np.tile(np.linalg.solve(move, np.linalg.cholesky(noise)), (periods, 1, 1)),
+    )
+    moves[-1], kicks[-1] = np.eye(2), 0.0
+    first, last = np.array([[1.0, 0.0]]), move[:1]
+    output = np.stack([np.vstack([first, last])] * periods)
+    model = Model(np.diag([1.0, 1e-3]), first, np.full((periods, 1), star), kicks, moves, output)
+    found = estimation.deviations(model)
+    np.testing.assert_allclose(found[-2, 1], before, rtol=1e-9)
+    np.testing.assert_allclose(found[-1, 0], after, rtol=1e-9)  # nothing moves in this last period
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_chain_as_by_a_brute_force_estimator(order, delay):
+    """Its motion under a held input is a polynomial, which RK4 and the metric's cubic follow exactly up to order 3."""
+    made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
+    density = 3e-3
+    made = flown_at(made, walk_rate=vector([density]), actuators=delayed(delay))
+    found = estimation.along(made, still(made))
+    periods, n = len(found.t), order
+
+    def motion(t):
+        """Transition by t of (x, walk)."""
+        a = np.diag(np.ones(n), 1)
+        return expm(a * t)
+
+    move = motion(PERIOD)
+    push = move[:, -1:] * density * PERIOD  # the step of the walk acts from the start of the period
+    output = np.stack([motion(t)[0] for t in (0.0, PERIOD / 2, PERIOD)])
+    output = np.hstack([output, output[:, -1:] * density * PERIOD])
+    noise = np.tile(np.asarray(made.sensors.sigma), (periods, 1))
+    prior = np.diag([0.0] * n + [1e30])  # the walk starts at zero
+    squares = by_least_squares(move, push, np.eye(n, n + 1), noise, prior, output, delay)
+    # 1e-9: the start is "unknown" by 1e5 sigma, which is 1e-10 of the variance after one sample
+    np.testing.assert_allclose(found.error[delay:], np.sqrt(squares[delay:, 2]), rtol=1e-9)
+    np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
+
+
+AT_REST = {"q": [0.0, 0.0, 0.0, 1.0], "t_f": 3.0, "t_end": 5.0, "period": PERIOD}
+
+
+@pytest.mark.parametrize("kind", ["raw", "bias", "filter"])
+def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
+    """Each axis on its own: angle, rate, the gyro's bias and its walk, the torque's walk."""
+    star, gyro, bias, drift, every = 2e-5, 1e-6, 3e-6, 4e-7, 4
+    walk = np.array([1e-5, 2e-5, 0.0])
+    held: Any = sensors.attitude_filter(0.2, star, gyro, drift * math.sqrt(PERIOD), PERIOD, every)
+    own: tuple[Any, Any] = vector(bias), vector(drift)
+    if kind != "filter":
+        every, held = 1, None
+    if kind == "raw":
+        bias, drift, own = 0.0, 0.0, (None, None)
+    sensor = sensors.Sensors(vector(star), vector(gyro), *own, held, every)
+    made = flown_at(parts(**AT_REST), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1))
+    found = estimation.along(made, still(made))
+    periods = len(found.t)
+    squares = np.zeros((periods, 3))
+    noise = np.array([[star if k % every == 0 else np.inf, gyro] for k in range(periods)])
+    rows = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0]])
+    for axis, inertia in enumerate(np.diag(np.asarray(made.plant.inertia))):
+        # angle, rate, bias, torque
+        a = np.zeros((4, 4))
+        a[0, 1], a[1, 3] = 1.0, 1.0 / inertia
+        move = expm(a * PERIOD)
+        steps = np.zeros((4, 2))
+        steps[2, 0], steps[3, 1] = drift * PERIOD, walk[axis] * PERIOD
+        prior = np.diag([0.0, 0.0, 1.0 / max(bias, 1e-20) ** 2, 1e40])
+        if kind == "filter":
+            root = np.asarray(held.spread[-1])
+            prior[np.ix_([0, 2], [0, 2])] += np.linalg.inv(root @ root.T)
+        output = np.stack([expm(a * t)[0] / 2 for t in (0.0, PERIOD / 2, PERIOD)])
+        squares += by_least_squares(move, move @ steps, rows, noise, prior, np.hstack([output, output @ steps]), 1)
+    np.testing.assert_allclose(found.error[1:], np.sqrt(squares[1:, 2]), rtol=1e-8)  # of numbers 1e10 apart
+    np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-8)
+
+
+def test_a_state_that_is_measured_without_noise_is_known():
+    """With the rate known the position does not move: it is known as the mean of all samples."""
+    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
+    found = estimation.along(made, still(made))
+    np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
+
+
+def test_without_noise_only_what_pushes_is_unknown():
+    """Every state is seen exactly: what a step of the walk does within a period is all that is left."""
+    density = 0.2
+    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
+    found = estimation.along(made, still(made))
+    np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
+
+
+def test_without_noise_there_is_no_floor():
+    continuous = parts(t_f=3.0)
+    assert estimation.along(continuous, still(continuous)).window_error == 0.0
+    for noise in (None, [0.0, 0.0]):
+        made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
+        found = estimation.along(made, still(made))
+        assert found.window_error == 0.0
+        np.testing.assert_array_equal(found.error, 0.0)
+
+
+def test_momentum_stored_in_wheels_couples_the_axes():
+    """At rest with momentum h in the wheels the rate moves by J dw' = h x dw."""
+    momentum = np.array([3.0, -2.0, 1.0])
+    device = hardware.wheels(np.eye(3), momentum)
+    calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=signals.Constant(jnp.zeros(3)))
+    made = flown_at(calm, actuators=hardware.Actuators(wheels=device))
+    ticks, log = estimation._lasting(made, still(made))
+    linear = estimation._linear(made, log, ticks)
+    coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
+    # RK4: 0.3 rad/s over a period, 0.04^5 / 120
+    np.testing.assert_allclose(linear.move[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
+
+
+def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
+    """A body pushed about so much that its motion tells nothing: what is left is the gyro, Farrenkopf's case.
+
+    The floor is 0.9 % below: his model has the gyro's mean over an interval, the floor each of its samples.
+    """
+    star, gyro, drift, every = 2e-5, 4e-5, 2e-6, 4
+    interval, walk = PERIOD * every, drift * math.sqrt(PERIOD)
+    # gains of Farrenkopf's steady state, by his recursion
+    move, read = np.array([[1.0, -interval], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    grown = walk**2 * interval
+    spread = np.array([[gyro**2 * PERIOD * interval + grown * interval**2 / 3, -grown * interval / 2],
+                       [-grown * interval / 2, grown]])  # fmt: skip
+    p, gain = np.diag([1e-8, 1e-8]), np.zeros((2, 1))
+    for _ in range(2000):
+        gain = p @ read.T / (read @ p @ read.T + star**2)
+        p = move @ (p - gain @ read @ p) @ move.T + spread
+    k1, k2 = float(gain[0, 0]), -float(gain[1, 0])
+    own = p - gain @ read @ p
+    held = sensors.AttitudeFilter(vector(k1), vector(k2), vector(np.tile(np.linalg.cholesky(p), (every, 1, 1))))
+    sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
+    made = parts(**{**AT_REST, "t_end": 40.0})
+    made = flown_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
+    ticks, log = estimation._lasting(made, still(made))
+    at_start = estimation.deviations(estimation._model(made, log, ticks))[:, :3]
+    after_star = at_start[::every]
+    assert len(after_star) > 50
+    # the error is half an angle
+    np.testing.assert_allclose(after_star[-1], math.sqrt(own[0, 0]) / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize("least", [None, 0.0])
+def test_where_there_is_no_floor_nothing_is_said(least):
+    """Without noise, where no run flies, and in results of earlier versions, which have no such key."""
+    point = {"gains": {"eta": 3.0}, "rms": 1e-5, "interval": None, "peak": 0.2, "mean_peak": 0.1, "failures": 0,
+             "knee": False, "meets": True, "dominated": False}  # fmt: skip
+    front = {"plant": "spacecraft", "points": [point], "requirements": [], "paper_refused": None}
+    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
+    flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
+    for known in ({}, {"floor": least}):
+        assert told.run_lines({**run, **known}) == ["status: ok"]
+        assert list(told.campaign_error({**flown, **known})) == []
+        assert list(told.front_lines({**front, **known})) == []
+        assert "times the floor" not in told.front({**front, **known}).head
+    assert told.front({**front, "floor": 5e-6}).head[5] == "times the floor"
+    assert told.front({**front, "floor": 5e-6}).rows[0][5] == "2"
