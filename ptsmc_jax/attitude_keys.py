@@ -32,21 +32,30 @@ def quaternion(table: signal_tables.Attitude, name: str) -> np.ndarray:
     key, value = attitude_key(table)
     full = f"{name}.{key}"
     if table.sequence is not None and key != "euler_deg":
-        raise ScenarioError(f"{name}.sequence is {schema.show(table.sequence)}, but goes with euler_deg only")
+        raise ScenarioError(f"{name}.sequence is {schema.brief(table.sequence)}, but goes with euler_deg only")
     if key in ("quat_xyzw", "quat_wxyz"):
         given = unit(full, value)
         return given if key == "quat_xyzw" else np.roll(given, -1)
-    array = np.array(value, dtype=float)
+    with np.errstate(all="ignore"):  # of numbers too large to be turned by, which are refused
+        found = _turned(table, name, full, np.array(value, dtype=float))
+    if not abs(np.linalg.norm(found) - 1.0) < 1e-6:
+        raise wrong(full, value, "an attitude in numbers whose squares are finite")
+    return found
+
+
+def _turned(table: signal_tables.Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
+    """The attitude of a key that holds no quaternion, as one."""
     from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
 
+    key = full.removeprefix(f"{name}.")
     if key == "rotvec_deg":
         return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
     if key == "mrp":
         return Rotation.from_mrp(array).as_quat(canonical=True)
     if key == "dcm_body_to_inertial":
         off = np.abs(array @ array.T - np.eye(3)).max()
-        if off > 1e-6 or np.linalg.det(array) < 0:
-            raise wrong(full, value, "a rotation matrix (orthonormal within 1e-6, determinant +1)")
+        if not off <= 1e-6 or np.linalg.det(array) < 0:
+            raise wrong(full, array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
         return Rotation.from_matrix(array).as_quat(canonical=True)
     if table.sequence is None:
         raise ScenarioError(f'{full} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"')

@@ -1,5 +1,6 @@
 """What single keys of a scenario cannot tell: defaults that depend on other keys, keys against each other."""
 
+import math
 from typing import Any
 
 import msgspec
@@ -24,6 +25,8 @@ from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.free_gains import FINITE_TIME, MOST_STEPS
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
+
+SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -98,12 +101,12 @@ def _check_plant(scenario: Scenario) -> None:
         try:
             plants.check_inertia(scenario.spacecraft.inertia)
         except ValueError as error:
-            raise ScenarioError(f"spacecraft.inertia is {schema.show(scenario.spacecraft.inertia)}: {error}") from None
+            raise ScenarioError(f"spacecraft.inertia is {schema.brief(scenario.spacecraft.inertia)}: {error}") from None
         if scenario.spacecraft.true_inertia is not None:
             try:
                 plants.check_inertia(scenario.spacecraft.true_inertia)
             except ValueError as error:
-                value = schema.show(scenario.spacecraft.true_inertia)
+                value = schema.brief(scenario.spacecraft.true_inertia)
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
         attitude_keys.quaternion(scenario.initial, "initial")
         attitude_keys.quaternion(scenario.reference, "reference")
@@ -133,26 +136,32 @@ def _check_each(name: str, table: str, found: Any, m: int) -> None:
 
 
 def _check_system(plant: plant_tables.SystemPlant) -> None:
+    """What can be said of it without running the file that it names: whoever reads a scenario may not want that."""
     if plant.system is None:
         raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
     if len(plant.x0) % 2:
         raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
+    if not isinstance(plant.system, str):
+        system(plant)
+        return
     try:
-        found = system(plant)
+        systems.named(plant.system, systems.ALLOWED)
     except ValueError as error:
-        raise ScenarioError(f"plant.system is {schema.show(plant.system)}: {error}") from None
-    if found.inputs * 2 != len(plant.x0):
-        n = found.inputs
-        raise wrong("plant.x0", plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
+        raise ScenarioError(f"plant.system is {schema.brief(plant.system)}: {error}") from None
 
 
 def system(plant: plant_tables.SystemPlant) -> plants.System:
-    """The system that a scenario names, or holds; raises ValueError where there is none."""
-    if isinstance(plant.system, plants.System):
-        return plant.system
-    if not isinstance(plant.system, str):
-        raise ValueError(f"allowed is {systems.ALLOWED}")
-    return systems.load(plant.system)
+    """The system that a scenario holds, or names: that file is run. Raises ScenarioError where there is none."""
+    try:
+        if not isinstance(plant.system, plants.System | str):
+            raise ValueError(f"allowed is {systems.ALLOWED}")
+        found = systems.load(plant.system) if isinstance(plant.system, str) else plant.system
+    except ValueError as error:
+        raise ScenarioError(f"plant.system is {schema.brief(plant.system)}: {error}") from None
+    if found.inputs * 2 != len(plant.x0):
+        n = found.inputs
+        raise wrong("plant.x0", plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
+    return found
 
 
 def _check_chain(plant: plant_tables.ChainPlant, controller: Any) -> None:
@@ -211,7 +220,7 @@ def _check_devices(scenario: Scenario) -> None:
             if attitude_keys.has_attitude(term):
                 attitude_keys.quaternion(term, name)
             elif term.sequence is not None:
-                raise ScenarioError(f"{name}.sequence is {schema.show(term.sequence)}, but goes with euler_deg only")
+                raise ScenarioError(f"{name}.sequence is {schema.brief(term.sequence)}, but goes with euler_deg only")
     if table is not None:
         if table.rate_noise is not None and table.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", table.rate_noise_density, "absent where rate_noise is given")
@@ -235,7 +244,7 @@ def _check_devices(scenario: Scenario) -> None:
             if flat:
                 enough = "far enough from 0 and 90 degrees for the wheels to span all directions"
                 raise wrong("wheels.cant_deg", device.cant_deg, enough) from None
-            raise ScenarioError(f"wheels.axes is {schema.show(axes.tolist())}: {error}") from None
+            raise ScenarioError(f"wheels.axes is {schema.brief(axes.tolist())}: {error}") from None
         if device.momentum is not None and len(device.momentum) != len(axes):
             raise wrong("wheels.momentum", device.momentum, f"a list of {len(axes)} numbers, one for each wheel")
         limit = device.momentum_limit
@@ -264,6 +273,12 @@ def _check_loop(scenario: Scenario) -> None:
         raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
     if sampled and loop.t_end / loop.period > MOST_STEPS:
         raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {loop.t_end / MOST_STEPS}")
+    if sampled:
+        _check_periods(scenario)
+    elif loop.window < SHORTEST_WINDOW * t_f:
+        raise wrong(
+            "loop.window", loop.window, f"at least {SHORTEST_WINDOW * t_f:.6g}, controller.t_f times {SHORTEST_WINDOW}"
+        )
     if not sampled:
         for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
             if getattr(scenario.hardware, key) is not None:
@@ -276,6 +291,19 @@ def _check_loop(scenario: Scenario) -> None:
             raise ScenarioError(
                 f'disturbance.kind = "random_walk" needs the sampled loop, but loop.mode is "{loop.mode}"'
             )
+
+
+def _check_periods(scenario: Scenario) -> None:
+    """What is counted in periods, or holds some, against the period and the run."""
+    loop = scenario.loop
+    assert loop.t_end is not None
+    if loop.window < loop.period * (1 - 1e-9):
+        raise wrong("loop.window", loop.window, f"at least one control period, loop.period = {loop.period}")
+    samples = math.ceil(loop.t_end / loop.period * (1 - 1e-9))
+    for key in ("delay", "star_tracker_every"):
+        periods = getattr(scenario.hardware, key, None) or 0
+        if periods > samples:
+            raise wrong(f"hardware.{key}", periods, f"at most the {samples} control periods until loop.t_end")
 
 
 def _check_dispersion(scenario: Scenario) -> None:

@@ -149,7 +149,7 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 
 def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
     """One for each requirement of the scenario over these rows; a failed trial breaks every one."""
-    return campaign.verdicts(scenario.study(what).requirements, rows)
+    return campaign.verdicts(scenario.requirements(what), rows)
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

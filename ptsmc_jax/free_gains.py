@@ -73,7 +73,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     assert free is not None  # `resolve` filled it in
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    said = f"tune.free is {schema.show(free)}, but"
+    said = f"tune.free is {schema.brief(free)}, but"
     for name in free:
         if name not in ("observer_gain", "filter_bandwidth") and not hasattr(scenario.controller, name):
             known = [key for key in tables.FREE if hasattr(scenario.controller, key)]
@@ -92,7 +92,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     if "t_f" in free and isinstance(scenario.observer, law_tables.Prescribed) and scenario.observer.t_o is None:
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
-        raise ScenarioError(f"tune.per_axis is true, but tune.free is {schema.show(free)}, without observer_gain")
+        raise ScenarioError(f"tune.per_axis is true, but tune.free is {schema.brief(free)}, without observer_gain")
     if tune.level is not None and tune.objective != "cvar":
         raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
     if tune.objective == "t_f":
@@ -111,7 +111,7 @@ def _check_bounds(scenario: Scenario, tune: tables.Tune, name: str, bounds: tupl
     if name not in tables.FREE:
         raise ScenarioError(f"{key} is not a known gain; {schema.nearest(name, tables.FREE)}")
     if name not in free:
-        raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.show(free)}")
+        raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {schema.brief(free)}")
     least, most, closed = _range(scenario, tune, name)
     if not (least <= lower if closed else least < lower) or not upper < most:
         allowed = f"two numbers {'from' if closed else 'above'} {least}"

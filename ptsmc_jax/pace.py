@@ -73,11 +73,32 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
         return _grid(scenario, reach, parts, saves, frequencies, visited), 1
     assert loop.t_end is not None
     substeps = _substeps(scenario, frequencies)
+    last = loop.t_end + reach.t_f - scenario.controller.t_f
+    _check_steps(scenario, last, substeps)
     if loop.clock == "flight":
-        last = loop.t_end + reach.t_f - scenario.controller.t_f
         return dataclasses.replace(clock.flight(loop.period, last), t_end=build.vector(loop.t_end)), substeps
     late = loop.t_end - scenario.controller.t_f + reach.delta
     return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
+
+
+def steps(parts: Parts) -> int:
+    """Integration steps of a run."""
+    ticks = parts.clock
+    count = ticks.count if isinstance(ticks, clock.Flight) else ticks.before + ticks.after
+    return count * parts.substeps
+
+
+def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
+    """Refuse a sampled loop of more integration steps until `last` [s] than a sensible number."""
+    period, needed = scenario.loop.period, last / scenario.loop.period * substeps
+    if needed > MOST_STEPS:
+        asks = (
+            f"the sampled loop would take {needed:.6g} steps, {substeps} a period, and at most {MOST_STEPS} are allowed"
+        )
+        if last > (scenario.loop.t_end or 0.0):
+            raise ScenarioError(f"tune.bounds.t_f asks for runs of {last:.6g} s, but must be lower: {asks}")
+        longer = f", or loop.period longer than {period}" if substeps <= MOVING else ""
+        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier{longer}: {asks}")
 
 
 def _frequencies(scenario: Scenario, parts: Parts, reach: Reach) -> dict[str, float]:

@@ -27,7 +27,10 @@ class ChainPlant(Table, frozen=True):
 
 
 class SystemPlant(Table, frozen=True):
-    """A second-order system of one's own, x_1' = F, x_2' = H + G u + D d, equation (25).
+    """A second-order system of one's own, x_1' = F, x_2' = H + G u + D d, equation (25), in a Python file.
+
+    A scenario that names one is a program: flying it runs that file, which can do what you can. Read it before you fly
+    somebody else's; results that name one are flown with --trust only.
 
     Attributes:
         system: where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed

@@ -53,12 +53,28 @@ class Study:
     @property
     def catalogue(self) -> dict[str, tuple[str, str]]:
         """The metrics that this plant has: name -> (unit, what it is)."""
-        names = metrics.CATALOGUES[self.scenario.plant.kind]
-        return names if self.scenario.wheels is not None else {k: v for k, v in names.items() if "wheel" not in k}
+        return catalogue(self.scenario)
+
+
+def catalogue(scenario: Scenario) -> dict[str, tuple[str, str]]:
+    """The metrics that a scenario's plant has: name -> (unit, what it is)."""
+    names = metrics.CATALOGUES[scenario.plant.kind]
+    return names if scenario.wheels is not None else {k: v for k, v in names.items() if "wheel" not in k}
+
+
+def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
+    """What a scenario asks of its runs."""
+    units = metrics.CATALOGUES[scenario.plant.kind]
+    return tuple(
+        Requirement(name, value.limit, units[name][0], value.quantile, value.confidence)
+        if isinstance(value, t.Limit)
+        else Requirement(name, float(value), units[name][0])
+        for name, value in scenario.requirements.items()
+    )
 
 
 def read(path: str | Path) -> Scenario:
-    """The scenario of a TOML file, checked; raises ScenarioError with one sentence."""
+    """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
     return from_tables(schema.load(path))
 
 
@@ -110,7 +126,8 @@ def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = Non
     """The parts of a checked scenario; `saves`: times [s] at which a continuous run must have nodes.
 
     drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
-    Raises ScenarioError where the law meets its singularity on the way from the initial state to the reference.
+    Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
+    where the law meets its singularity on the way from the initial state to the reference.
     """
     parts = _parts(scenario, saves, reach)
     dispersion = build.dispersion(scenario)
@@ -121,14 +138,7 @@ def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = Non
     # a drawn trial that meets the singularity is marked and counted
     if scenario.initial is not None and (not drawn or (dispersion.attitude is None and dispersion.reference is None)):
         _check_start(scenario, parts)
-    units = metrics.CATALOGUES[scenario.plant.kind]
-    requirements = tuple(
-        Requirement(name, value.limit, units[name][0], value.quantile, value.confidence)
-        if isinstance(value, t.Limit)
-        else Requirement(name, float(value), units[name][0])
-        for name, value in scenario.requirements.items()
-    )
-    return Study(scenario, parts, dispersion, requirements)
+    return Study(scenario, parts, dispersion, requirements(scenario))
 
 
 def _check_system(scenario: Scenario, system: System, parts: Parts) -> None:
@@ -172,7 +182,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
     additive, law = isinstance(parts.controller, controllers.PrescribedTime), parts.controller
     singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
-    said = f"initial.{key} is {schema.show(value)}"
+    said = f"initial.{key} is {schema.brief(value)}"
     if isinstance(law, Prescribed):
         times, _, square = (np.asarray(v) for v in _path(parts))
     else:  # of the others only the start is known
@@ -183,7 +193,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
     if square.min() < SINGULAR_CLEARANCE**2:
         when = float(times[int(np.argmin(square))])
         raise ScenarioError(
-            f"{said} with initial.rate = {schema.show(scenario.initial.rate)}, but from there the path to the "
+            f"{said} with initial.rate = {schema.brief(scenario.initial.rate)}, but from there the path to the "
             f"reference meets {singular}, at t = {when:.4g} s; allowed is a start whose path keeps {name} above "
             f"{SINGULAR_CLEARANCE}"
         )

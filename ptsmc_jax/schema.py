@@ -6,6 +6,8 @@ Only single tables and keys are looked at here; `checks.py` looks at keys agains
 import difflib
 import json
 import math
+import os
+import re
 import tomllib
 import typing
 from collections.abc import Collection, Iterable, Mapping
@@ -20,6 +22,11 @@ from ptsmc_jax.signal_tables import ATTITUDE_KEYS
 from ptsmc_jax.tables import Limit, Scenario
 from ptsmc_jax.values import Positive, Table, Truth
 
+DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
+LONGEST_KEY = 100  # characters
+LONGEST_VALUE = 160  # characters of a value in an error
+MOST_BITS = 1023  # of a whole number, beyond which it is no finite float
+
 
 class ScenarioError(ValueError):
     """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed."""
@@ -31,7 +38,13 @@ class ScenarioError(ValueError):
 
 def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
     """The error for a key whose value is not allowed."""
-    return ScenarioError(f"{key} is {show(value)}, but must be {allowed}")
+    return ScenarioError(f"{key} is {brief(value)}, but must be {allowed}")
+
+
+def brief(value: Any) -> str:
+    """A value as an error says it: as `show` does, a long one cut."""
+    shown = show(value)
+    return shown if len(shown) <= LONGEST_VALUE else f"{shown[:LONGEST_VALUE]} ... ({len(shown)} characters)"
 
 
 def show(value: Any) -> str:
@@ -46,17 +59,35 @@ def show(value: Any) -> str:
         return "[" + ", ".join(map(show, value)) + "]"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{k} = {show(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to write very long ones out
+        return f"a whole number of {value.bit_length()} bits"
     return str(value)
+
+
+_TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
+# a dotted key without end, for which the parser would take memory by the square of its length
+_DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
+
+
+def toml(text: str, name: str) -> dict[str, Any]:
+    """The raw tables of a TOML file, which errors call by this name; raises ScenarioError where it is none."""
+    try:
+        if _DOTTED.search(text):
+            raise RecursionError
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
+        raise ScenarioError(f"{name} is no valid TOML: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{name} has tables or arrays in each other, {_TOO_DEEP}") from None
 
 
 def load(path: str | Path) -> dict[str, Any]:
     """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML.
 
-    A Python file that it names (plant.system) is looked for beside it.
+    A Python file that it names (plant.system) is looked for beside it, and not run.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
-        raw = tomllib.loads(text)
     except FileNotFoundError:
         raise ScenarioError(f"the scenario file {path} is not there") from None
     except IsADirectoryError:
@@ -65,13 +96,12 @@ def load(path: str | Path) -> dict[str, Any]:
         raise ScenarioError(f"the scenario file {path} is no text in UTF-8, but must be a TOML file") from None
     except OSError as error:
         raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
-    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
-        raise ScenarioError(f"the scenario file {path} is no valid TOML: {error}") from None
+    raw = toml(text, f"the scenario file {path}")
     plant = raw.get("plant")
     where = plant.get("system") if isinstance(plant, dict) else None
     file, _, name = where.rpartition(":") if isinstance(where, str) else ("", "", "")
-    if isinstance(plant, dict) and file.endswith(".py"):
-        plant["system"] = f"{(Path(path).parent / file).resolve()}:{name}"
+    if isinstance(plant, dict) and file.endswith(".py") and not os.path.isabs(file) and "\0" not in file:
+        plant["system"] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
     return raw
 
 
@@ -80,6 +110,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
 
     metrics: names of the metrics by the kind of the plant.
     """
+    _check_shape(raw)
     for name, table in raw.items():
         if name in Scenario.__struct_fields__ and not isinstance(table, Mapping):
             raise wrong(name, table, "a table")
@@ -93,7 +124,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
             raise ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
         if not isinstance(raw[name], Mapping):
             place = _place(name, layout)
-            raise ScenarioError(f"{name} = {show(raw[name])} stands outside a table; {place}")
+            raise ScenarioError(f"{name} = {brief(raw[name])} stands outside a table; {place}")
         known = (*layout, "requirements")
         raise ScenarioError(f"[{name}] is not a known table; {nearest(name, known, '[{}]')}")
 
@@ -123,6 +154,25 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
     }
     return Scenario(**found)
+
+
+def _check_shape(raw: Mapping[str, Any]) -> None:
+    """Refuse what is nested without end and keys that no sentence can name, before anything walks through them."""
+    level: list[tuple[str, Any]] = [("", raw)]
+    for _ in range(DEEPEST):
+        inside: list[tuple[str, Any]] = []
+        for top, value in level:
+            if isinstance(value, Mapping):
+                for key, within in value.items():
+                    if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
+                        said = brief(key) if isinstance(key, str) else repr(key)
+                        raise ScenarioError(f"{top or 'the scenario'} has the key {said}, which is not a known one")
+                    inside.append((top or key, within))
+            elif isinstance(value, list | tuple):
+                inside += [(top, within) for within in value]
+        level = [(top, value) for top, value in inside if isinstance(value, Mapping | list | tuple)]
+    if level:
+        raise ScenarioError(f"{level[0][0]} has tables or arrays in each other, {_TOO_DEEP}")
 
 
 def _plant_kind(plant: Mapping[str, Any]) -> str:
@@ -251,7 +301,7 @@ def _value(key: str, value: Any, kind: Any) -> Any:
     value = _plain(value)
     bad = _not_finite(value)
     if bad is not None:
-        raise wrong(key, value, f"{keys.allowed(kind)}, and {bad!r} is no finite number")
+        raise wrong(key, value, f"{keys.allowed(kind)}, and {show(bad)} is no finite number")
     if _holds_truth(value) and kind is not Truth:  # numpy, which reads the inertia, takes true for 1
         raise wrong(key, value, keys.allowed(kind))
     try:
@@ -271,8 +321,10 @@ def _holds_truth(value: Any) -> bool:
     return isinstance(value, bool) or (isinstance(value, tuple) and any(map(_holds_truth, value)))
 
 
-def _not_finite(value: Any) -> float | None:
+def _not_finite(value: Any) -> float | int | None:
     if isinstance(value, float) and not math.isfinite(value):
+        return value
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
         return value
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
     return next((bad for bad in map(_not_finite, inside) if bad is not None), None)

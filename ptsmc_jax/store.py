@@ -9,12 +9,13 @@ import platform
 import re
 import shutil
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tomli_w
+
+from ptsmc_jax import schema
 
 JOURNAL = "journal.bin"  # of a run that is not finished
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
@@ -42,11 +43,20 @@ def packages() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
+def made(folder: Path) -> dict[str, Any]:
+    """What `versions` said when the results in a folder were made; empty where it cannot be read."""
+    try:
+        told = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
 def previous(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:
     """The summary of the same scenario with the same command, seed and what else `versions` was told; None: none."""
     try:
         return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, told) else None
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
@@ -81,15 +91,17 @@ def _same(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) ->
 
 def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> str | None:
     """What tells the run in the folder from this one, in words; None: nothing does."""
+    there = made(folder)
     try:
-        made = json.loads((folder / "versions.json").read_text())
-        known = tomllib.loads((folder / "scenario.toml").read_text())
+        known = schema.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
+        return "something else"
+    if not there or not all(isinstance(table, dict) for table in known.values()):
         return "something else"
     wanted = json.loads(json.dumps(_named(scenario)))
     for name, value in told.items():
-        if made.get(name) != value:
-            return f"a run with {name} {made.get(name)}, not {value}"
+        if there.get(name) != value:
+            return f"a run with {name} {there.get(name)}, not {value}"
     for table in dict.fromkeys((*known, *wanted)):
         for key in dict.fromkeys((*known.get(table, {}), *wanted.get(table, {}))):
             old, new = (tables.get(table, {}).get(key, "absent") for tables in (known, wanted))

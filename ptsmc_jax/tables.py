@@ -37,7 +37,7 @@ from ptsmc_jax.signal_tables import (
     SpinReference,
     SumDisturbance,
 )
-from ptsmc_jax.values import Count, Interval, NotNegative, Positive, Quantile, Table, Truth
+from ptsmc_jax.values import Interval, NotNegative, Positive, Quantile, Table, Truth
 
 
 class Loop(Table, frozen=True):
@@ -105,9 +105,10 @@ class Tune(Table, frozen=True):
     level: Quantile | None = None
     torque_weight: NotNegative = 0.0
     worst_case: Truth = False
-    trials: Count = 256
-    starts: Count = 8
-    steps: Count = 150
+    # all trials are flown at once and held in memory; 64 candidates a start are compared, each with each
+    trials: Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")] = 256
+    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 8
+    steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 150
 
 
 class Scenario(Table, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ INERTIA, CLEAR = "three principal moments or a symmetric 3x3", "|q4| of at least
 FINITE, PRESCRIBED = "observer.kind = 'finite_time'\n", "observer.kind = 'prescribed_time'\n"
 OPPOSITE = "controller.error = 'multiplicative'\n"
 CHAIN = 'plant.kind = "chain"\n'
+OWN = 'plant = { kind = "system", system = "%s" }'
 
 # scenario file; what its one sentence must say of key and value; what it must say is allowed
 BAD = [
@@ -67,6 +68,18 @@ BAD = [
     ("loop.clock = 'wall'", 'loop.clock is "wall"', '"anchored" or "flight"'),
     (SAMPLED + "controller.delta = 0.04", "controller.delta is 0.04", "one control period, loop.period = 0.05"),
     (SAMPLED + "loop.period = 0.1", "controller.delta is 0.05", "one control period, loop.period = 0.1"),
+    (SAMPLED + "loop.window = 1e-16", "loop.window is 1e-16", "at least one control period, loop.period = 0.05"),
+    ("loop.window = 1e-16", "loop.window is 1e-16", "at least 0.0003, controller.t_f times 1e-05"),
+    (
+        SAMPLED + "controller = { t_f = 1e5, delta = 1.0 }\nloop.period = 0.51\nhardware.torque_lag = 0.1",
+        "loop.t_end is 100010.0",
+        "or loop.period longer than 0.51: the sampled loop would take 784392 steps, 4 a period, and at most 200000",
+    ),
+    (
+        SAMPLED + "controller = { t_f = 1e5, delta = 1.0 }\nloop.period = 1.0\ninitial.rate = [0.9, 0, 0]",
+        "loop.t_end is 100010.0",
+        "the sampled loop would take",
+    ),
     (SAMPLED + "loop.period = 1e-5", "loop.period is 1e-05", "at least loop.t_end / 200000"),
     # inertia
     ("spacecraft.inertia = [10.0, 12.0]", "spacecraft.inertia is [10.0, 12.0]", INERTIA),
@@ -300,9 +313,39 @@ BAD = [
     ("tune.free = ['eta', 'eta']", 'tune.free is ["eta", "eta"]', "names each gain once"),
     ("tune.objective = 'mean'", 'tune.objective is "mean"', '"rms"'),
     ("tune.level = 0.9", "tune.level is 0.9", ""),  # of no use without objective = "cvar"
-    ("tune.trials = 0", "tune.trials is 0", "a whole number, at least 1"),
-    ("tune.starts = 1.5", "tune.starts is 1.5", "a whole number, at least 1"),
-    ("tune.steps = -1", "tune.steps is -1", "a whole number, at least 1"),
+    ("tune.trials = 0", "tune.trials is 0", "a whole number from 1 to 1000000"),
+    ("tune.starts = 1.5", "tune.starts is 1.5", "a whole number from 1 to 100"),
+    ("tune.steps = -1", "tune.steps is -1", "a whole number from 1 to 100000"),
+    ("tune.trials = 4294967297", "tune.trials is 4294967297", "a whole number from 1 to 1000000"),
+    ("tune.starts = 101", "tune.starts is 101", "a whole number from 1 to 100"),
+    (f"tune.steps = {10**26}", "tune.steps is 100000000000000000000000000", "from 1 to 100000"),
+    # what is too much of it
+    (f"controller.eta = {'[' * 300}{']' * 300}", "has tables or arrays in each other", "at most 8 levels"),
+    (f"controller{'.a' * 300} = 1", "has tables or arrays in each other", "at most 8 levels"),
+    (f"[{'a.' * 5000}a]", "has tables or arrays in each other", "at most 8 levels"),
+    (f"controller.eta = 0x{'f' * 5000}", "a whole number of 20000 bits", "is no finite number"),
+    (f"controller.eta = 1{'0' * 400}", "controller.eta is a whole number of 1329 bits", "is no finite number"),
+    (f"spacecraft.inertia = [1{'0' * 400}, 12, 14]", "inertia is [a whole number of 1329 bits, 12", INERTIA),
+    (f"controller.error = '{'x' * 100_000}'", 'controller.error is "xxx', "... (100002 characters), but must be"),
+    (f"observer.gain = [{'1.0, ' * 10_000}]", "observer.gain is [1.0, 1.0", "three numbers greater than 0"),
+    (f"controller.{'x' * 100_000} = 1", 'controller has the key "xxx', "which is not a known one"),
+    (f"{'x' * 100_000} = 1", 'the scenario has the key "xxx', "which is not a known one"),
+    ('controller."e\\nta" = 1', 'controller has the key "e\\nta"', "which is not a known one"),
+    (SAMPLED + "hardware.delay = 1000000000", "hardware.delay is 1000000000", "at most the 800 control periods"),
+    (SAMPLED + "hardware.delay = 801", "hardware.delay is 801", "at most the 800 control periods until loop.t_end"),
+    (
+        SAMPLED + f"filter = {{ kind = 'steady_state', bandwidth = 0.1 }}\nhardware.star_tracker_every = {10**26}",
+        "hardware.star_tracker_every is 100000000000000000000000000",
+        "at most the 800 control periods",
+    ),
+    ("initial.rotvec_deg = [1.0, 2.0, 1e308]", "initial.rotvec_deg is [1.0, 2.0, 1e+308]", "squares are finite"),
+    (OWN % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it names nothing; allowed is"),
+    (OWN % ("a" * 300 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
+    (OWN % "a\\u0000b.py:arm", r'plant.system is "a\u0000b.py:arm"', "it names nothing; allowed is"),
+    (OWN % "a\\u0000b:arm", r'plant.system is "a\u0000b:arm"', "it names nothing; allowed is"),
+    (OWN % "arm.py:a b", "arm.py:a b", "it names nothing; allowed is"),
+    (OWN % "a..b:arm", 'plant.system is "a..b:arm"', "it names nothing; allowed is"),
+    (OWN % "/:arm", 'plant.system is "/:arm"', "it names nothing; allowed is"),
     ("tune.bound = {}", "tune.bound is not a known key", "nearest known one is tune.bounds"),
     ("tune.bounds = [1, 2]", "tune.bounds is [1, 2]", "two numbers for each gain"),
     ("tune.bounds.eta = 3.0", "tune.bounds is { eta = 3.0 }", "two numbers for each gain"),

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from ptsmc_jax import metrics, montecarlo, runs, scenario, store
+from ptsmc_jax import metrics, montecarlo, pace, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
 from tests.pages import checked
@@ -155,7 +155,7 @@ def test_help_and_version_do_not_load_jax():
         assert done.stdout
 
 
-@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD_SCENARIOS, ids=[row[0] for row in BAD_SCENARIOS])
+@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD_SCENARIOS, ids=[row[0][:60] for row in BAD_SCENARIOS])
 def test_a_bad_scenario_ends_the_command_with_one_sentence(command, tmp_path, text, of_what, allowed):
     (tmp_path / "bad.toml").write_text(text)
     before = sorted(tmp_path.rglob("*"))
@@ -574,3 +574,14 @@ done
         2,
         "ptsmc: the shell is tcsh, but must be bash, zsh, fish or powershell\n",
     )
+
+
+def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, monkeypatch):
+    run = ("simulate", "s.toml", "--no-figures", "--force")
+    parts = scenario.study(scenario.read("s.toml")).parts
+    steps = pace.steps(parts)
+    assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
+    assert "integration steps" not in command(*run)[1]
+    monkeypatch.setattr("tuning.cli.LONG", steps - 1)
+    assert command(*run)[1].startswith(f"flying {steps} integration steps, with their history\n")
+    assert command(*run, "--quiet")[1] == ""

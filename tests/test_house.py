@@ -52,7 +52,7 @@ FLOORS = {
         slips
     """,
     "tuning": """
-        gains
+        gains own_parts
         bounds design journal
         objective
         evaluate

@@ -28,11 +28,25 @@ def check_sentence(said, of_what, allowed):
     assert len(said) < 400
 
 
-@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD, ids=[text for text, _, _ in BAD])
+@pytest.mark.parametrize(("text", "of_what", "allowed"), BAD, ids=[text[:60] for text, _, _ in BAD])
 def test_bad_input_ends_in_one_sentence(text, of_what, allowed):
     with pytest.raises(ScenarioError) as caught:
         study(from_tables(tomllib.loads(text)))
     check_sentence(str(caught.value), of_what, allowed)
+
+
+@pytest.mark.parametrize(
+    "form", ["controller.eta = %s1%s|[|]", "eta = %s1%s|{ a = |}", "[%sa%s]|a.|", "a%s = 1%s|.a|", "a%s = 1%s| . 'b'|"]
+)
+@pytest.mark.parametrize("levels", [9, 300, 100_000])
+def test_what_is_nested_deeper_than_the_parser_goes_is_refused_as_well(tmp_path, form, levels):
+    """A key of 100 000 dots would take the parser 40 GB."""
+    path = tmp_path / "s.toml"
+    text, opens, closes = form.split("|")
+    path.write_text(text % (opens * levels, closes * levels))
+    with pytest.raises(ScenarioError) as caught:
+        read(path)
+    check_sentence(str(caught.value), "tables or arrays in each other", "at most 8 levels are allowed")
 
 
 def test_disturbance_too_fast_for_the_sampled_loop_is_refused():
@@ -82,7 +96,9 @@ def test_what_is_just_allowed_is_taken(text):
     study(from_tables(tomllib.loads(text)))
 
 
-@pytest.mark.parametrize("text", ["period = 6.0\n[controller]\ndelta = 6.0", "[controller]\nt_f = 0.15\ndelta = 0.05"])
+@pytest.mark.parametrize(
+    "text", ["period = 6.0\nwindow = 6.0\n[controller]\ndelta = 6.0", "[controller]\nt_f = 0.15\ndelta = 0.05"]
+)
 def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
     tables = tomllib.loads(f"[loop]\nmode = 'sampled'\n{text}")
     from_tables(tables)
@@ -405,6 +421,9 @@ def valid_scenarios(draw):
     delta = draw(numbers(t_f * 1e-2, t_f * 0.9))
     mode = draw(st.sampled_from(["continuous", "sampled"]))
     bounds = {"eta": [2.1, 3.3], "delta": [delta, (delta + t_f) / 2], "observer_gain": [1e-7, 1e22]}
+    period = draw(numbers(delta * 0.1, delta))
+    if mode == "sampled":
+        window = max(window, period)
     times = {
         "clock": st.sampled_from(["anchored", "flight"]),
         "t_end": numbers(t_f + window + 1e-6, t_f + window + 100.0),
@@ -432,7 +451,7 @@ def valid_scenarios(draw):
     }
     needed = {
         "controller": tables_of(gains, t_f=t_f, delta=delta),
-        "loop": tables_of(times, mode=mode, period=draw(numbers(delta * 0.1, delta)), window=window),
+        "loop": tables_of(times, mode=mode, period=period, window=window),
     }
     return draw(st.fixed_dictionaries(needed, optional=tables))
 

@@ -264,7 +264,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
 )
 def test_scenarios_that_name_no_system_are_refused(plant, said):
     with pytest.raises(ScenarioError) as error:
-        scenario.from_tables({"plant": plant})
+        scenario.study(scenario.from_tables({"plant": plant}))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -1,7 +1,7 @@
 """The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
 
-import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +17,7 @@ from tuning.options import (
     Quiet,
     ScenarioFile,
     Seed,
+    Trust,
     UsageError,
     between,
     prepare,
@@ -58,6 +59,7 @@ def montecarlo(
     dry_run: Annotated[
         bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
     ] = False,
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -85,7 +87,7 @@ def montecarlo(
     bits = 32 if precision == "32" else 64
     if (bits, device) != (64, "cpu") and cluster is not None:
         raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
-    loaded, path = prepare(scenario, "montecarlo", out, device, bits)
+    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
     if width is not None and not loaded.requirements:
         raise UsageError("--until-confident needs [requirements] in the scenario, whose shares it looks at")
     from tuning import campaign_folder
@@ -169,6 +171,7 @@ def replay(
     *,
     trial: Annotated[str, Parameter(help="Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -180,13 +183,15 @@ def replay(
     number = whole("--trial", trial)
     _configured(folder)
     from ptsmc_jax import store
-    from tuning import campaign_folder, campaign_summary, single
+    from tuning import campaign_folder, campaign_summary, own_parts, single
 
     opened = campaign_folder.opened(folder)
     if number >= opened.trials:
         raise UsageError(f"--trial is {number}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(number)
     store.check(place, force or out is None)  # a replay of the same trial is the same
+    own_parts.allow(opened.programs, folder, opened.told, trust)
+    opened = replace(opened, trusted=True)
     found = campaign_summary.replay(opened, number)
     store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, number, figures))
     if not quiet:
@@ -197,13 +202,10 @@ def replay(
 
 def _configured(folder: Path) -> None:
     """Set JAX up with as many bits as the campaign was flown with."""
+    from ptsmc_jax import store
     from ptsmc_jax.configure import configure
 
-    try:
-        bits = json.loads((folder / "versions.json").read_text(encoding="utf-8"))["precision"]
-    except (OSError, ValueError, KeyError, TypeError):  # no campaign, which is refused later
-        bits = 64
-    configure(device="cpu", bits=32 if bits == 32 else 64)
+    configure(device="cpu", bits=32 if store.made(folder).get("precision") == 32 else 64)
 
 
 def _summarised(folder, quiet: bool, figures: bool) -> int:

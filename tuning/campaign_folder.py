@@ -1,24 +1,41 @@
 """Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
 
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
 
 from ptsmc_jax import campaign as flying
 from ptsmc_jax import rows, runs, scenario, schema, store, systems
 from ptsmc_jax.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.rows import Part, Rows
+from ptsmc_jax.scenario import Study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.store import RefusedError
 from ptsmc_jax.tables import Scenario
+from tuning import own_parts
 
 FLOOR = "floor.json"  # what no controller can beat: found when flying, so that a summary needs no plant
 OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
+
+
+class Made(msgspec.Struct, frozen=True):
+    """What `versions.json` of a campaign says of it, as far as its rows are known by it."""
+
+    command: Literal["montecarlo"]
+    seed: Annotated[int, Meta(ge=0, lt=2**32)]
+    trials: Annotated[int, Meta(ge=1, le=2**32)]
+    precision: Literal[32, 64]
+    metrics: str | None = None
+    metrics_names: tuple[str, ...] | None = None
+    metrics_sha256: str | None = None
+    system_sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -31,13 +48,43 @@ class Folder:
     trials: int  # that it is to have
     own: str | None = None  # where the function stands that makes metrics of one's own
     bits: int = 64  # of every number
+    made: Made | None = None  # as its folder says; None: it is yet to be begun
+    trusted: bool = True  # systems and metrics of one's own may be run
+
+    @cached_property
+    def programs(self) -> dict[str, str]:
+        """What flying it runs, by the key that names it."""
+        return own_parts.named(self.scenario, self.own)
 
     @cached_property
     def told(self) -> dict[str, Any]:
-        """By what a campaign is known again."""
-        more = {} if self.own is None else {"metrics": self.own, **systems.source(self.own, "metrics_sha256")}
-        system = systems.source(getattr(self.scenario.plant, "system", None))
-        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **system}
+        """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
+        digests = {
+            name: getattr(self.made, name) if self.made else systems.digest(self.programs[key])
+            for key, name in own_parts.DIGESTS.items()
+            if key in self.programs
+        }
+        more = {} if self.own is None else {"metrics": self.own}
+        known = {name: found for name, found in digests.items() if found is not None}
+        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **known}
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """What its `versions.json` says."""
+        names = None if self.own is None else self.own_names
+        told = {**self.told, "trials": self.trials, "metrics_names": names}
+        return store.versions(**{name: value for name, value in told.items() if value is not None})
+
+    @cached_property
+    def own_names(self) -> list[str]:
+        """Names of the metrics of one's own."""
+        if self.made is None or self.own is None:
+            return [] if self.own is None else self.campaign.own_names()
+        if self.made.metrics_names is None:
+            raise RefusedError(
+                f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
+            )
+        return list(self.made.metrics_names)
 
     @cached_property
     def rows(self) -> Rows:
@@ -54,19 +101,35 @@ class Folder:
         return rows.key_of(schema.dump(self.scenario), self.told)
 
     @cached_property
+    def ready(self) -> Study | None:
+        """What is flown, without metrics of one's own; None where that would run a system that nobody trusts."""
+        if "plant.system" in self.programs:
+            if not self.trusted:
+                return None
+            self._check_unchanged("plant.system")
+        return scenario.study(self.scenario)
+
+    @cached_property
     def campaign(self) -> Campaign:
-        """What is flown; raises ScenarioError where the metrics of one's own are none."""
-        if self.own is not None:
-            try:
-                own: Any = systems.item(self.own, OWN)
-                if not isinstance(own, Callable):
-                    raise ValueError(f"it is a {type(own).__name__}; allowed is {OWN}")
-                made = Campaign(scenario.study(self.scenario), self.seed, own)
-                made.own_names()
-                return made
-            except ValueError as error:
-                raise ScenarioError(f"--metrics is {self.own}: {error}") from None
-        return Campaign(scenario.study(self.scenario), self.seed)
+        """What is flown. Raises ScenarioError where the metrics of one's own are none, RefusedError without trust."""
+        if self.ready is None or (self.own is not None and not self.trusted):
+            raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
+        if self.own is None:
+            return Campaign(self.ready, self.seed)
+        self._check_unchanged("--metrics")
+        try:
+            own: Any = systems.item(self.own, OWN)
+            if not isinstance(own, Callable):
+                raise ValueError(f"it is a {type(own).__name__}; allowed is {OWN}")
+            made = Campaign(self.ready, self.seed, own)
+            made.own_names()
+            return made
+        except ValueError as error:
+            raise ScenarioError(f"--metrics is {self.own}: {error}") from None
+
+    def _check_unchanged(self, key: str) -> None:
+        if self.made is not None:
+            own_parts.check_unchanged({key: self.programs[key]}, self.path, self.told)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
@@ -88,7 +151,6 @@ class Folder:
 def begin(wanted: Folder, force: bool) -> None:
     """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
     tables, path = schema.dump(wanted.scenario), wanted.path
-    versions = store.versions(**wanted.told, trials=wanted.trials)
     if force and path.is_dir():
         for kept in (wanted.rows, wanted.plan):
             for file in kept.folder.glob("*.parquet"):
@@ -108,37 +170,47 @@ def begin(wanted: Folder, force: bool) -> None:
                 raise RefusedError(
                     f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
                 )
-            if before.trials == wanted.trials:
+            if before.trials == wanted.trials and before.made == _made(wanted):
                 return
 
     def fill(making: Path) -> None:
         store.write_toml(making / "scenario.toml", tables)
-        store.write_json(making / "versions.json", versions)
+        store.write_json(making / "versions.json", wanted.versions)
 
     store.write(path, fill)
 
 
 def opened(path: Path) -> Folder:
-    """The campaign of a folder; raises RefusedError where there is none."""
+    """The campaign of a folder, of which nothing is run that it names; raises RefusedError where there is none."""
     try:
-        told = json.loads((path / "versions.json").read_text())
-        if told["command"] != "montecarlo":
+        said = store.made(path)
+        if said.get("command", "montecarlo") != "montecarlo":
             raise RefusedError(
-                f"{path} holds results of `ptsmc {told['command']}`, but must be one of `ptsmc montecarlo`"
+                f"{path} holds results of `ptsmc {said['command']}`, but must be one of `ptsmc montecarlo`"
             )
+        made = msgspec.convert(said, Made, strict=True)
         flown = scenario.read(path / "scenario.toml")
-        return Folder(path, flown, told["seed"], told["trials"], told.get("metrics"), told["precision"])
-    except (OSError, ValueError, KeyError) as error:
-        if isinstance(error, RefusedError):
-            raise
+    except ScenarioError as error:
+        raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
+    except msgspec.ValidationError:
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
+    return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, trusted=False)
+
+
+def _made(folder: Folder) -> Made:
+    """What `versions.json` is to say of it."""
+    return msgspec.convert(folder.versions, Made)
 
 
 def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
-    """Campaign and rows of a folder, on a worker that shares it; raises RefusedError where it holds another one."""
+    """Campaign and rows of a folder, on a worker that shares it; raises RefusedError where it holds another one.
+
+    The key knows scenario and digests: what is run here is what was trusted where the campaign was begun.
+    """
     folder = opened(Path(path))
     if folder.rows.key.hex() != key:
         raise RefusedError(f"{path} holds another campaign there than here")
+    folder = replace(folder, trusted=True)
     return folder.campaign, folder.rows
 
 
@@ -193,5 +265,6 @@ def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
 
 def settle(folder: Folder, trials: int) -> Folder:
     """The campaign as one of so many trials."""
-    store.write_json(folder.path / "versions.json", store.versions(**folder.told, trials=trials))
-    return opened(folder.path)
+    settled = replace(folder, trials=trials)
+    store.write_json(folder.path / "versions.json", settled.versions)
+    return settled

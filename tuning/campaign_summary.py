@@ -11,7 +11,7 @@ import polars as pl
 
 from ptsmc_jax import campaign as flying
 from ptsmc_jax import campaign_plots as plots
-from ptsmc_jax import drawing, metrics, rows, runs, schema, statistics, store
+from ptsmc_jax import drawing, metrics, rows, runs, scenario, schema, statistics, store
 from ptsmc_jax.requirements import Requirement, Verdict
 from ptsmc_jax.rollout import STATUS
 from ptsmc_jax.store import RefusedError
@@ -42,7 +42,7 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
 
 def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
     """Verdicts over the trials (the first so many), and what `summary.json` says of each."""
-    wanted = tuple(folder.campaign.ready.requirements)
+    wanted = scenario.requirements(folder.scenario)
     names = dict.fromkeys(r.metric for r in wanted)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
     verdicts = flying.verdicts(wanted, frame)
@@ -77,10 +77,10 @@ def summarise(folder: Folder) -> dict[str, Any]:
     found, drivers = {}, {}
     names = list(pl.read_parquet_schema(parts[0].path))
     drawn = names[names.index("initial_angle") :]
-    own = folder.campaign.own_names()
+    own = folder.own_names
     drawn = [name for name in drawn if name not in own]
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
-    for name in (*folder.campaign.ready.catalogue, *own):
+    for name in (*scenario.catalogue(folder.scenario), *own):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
         found[name] = _of_metric(values, finished)
         driven = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
@@ -177,21 +177,23 @@ def _off(a: Any, b: Any) -> float:
 
 def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     """Figures of a campaign by name."""
-    parts, ready, kind = folder.whole_parts(), folder.campaign.ready, folder.scenario.plant.kind
-    limits = {r.metric: r.limit for r in ready.requirements}
+    parts, kind = folder.whole_parts(), folder.scenario.plant.kind
+    limits = {r.metric: r.limit for r in scenario.requirements(folder.scenario)}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
     finished = flying.finished(frame)
     made: dict[str, Any] = {}
     shown = np.arange(min(DRAWN, frame.height))
-    t, error = flying.history(folder.campaign, shown.astype(np.uint32))
     window = frame["window_error"].to_numpy()
     if finished.any():
-        hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-        _, course = flying.history(folder.campaign, np.asarray([frame["trial"][hardest]], dtype=np.uint32))
-        made["fan"] = plots.fan(
-            t, error[finished[: shown.size]], (hardest, course[0]), ready.scenario.controller.t_f, kind
-        )
+        if folder.ready is not None:  # its histories are not kept, but flown for it
+            flown = flying.Campaign(folder.ready, folder.seed)
+            t, error = flying.history(flown, shown.astype(np.uint32))
+            hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+            _, course = flying.history(flown, np.asarray([frame["trial"][hardest]], dtype=np.uint32))
+            made["fan"] = plots.fan(
+                t, error[finished[: shown.size]], (hardest, course[0]), folder.scenario.controller.t_f, kind
+            )
         units = {name: metrics.CATALOGUES[kind].get(name, ("",))[0] for name in names}
         made["distributions"] = plots.distributions(
             {

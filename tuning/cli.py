@@ -19,6 +19,7 @@ from tuning.options import (
     SampledFile,
     ScenarioFile,
     Seed,
+    Trust,
     UsageError,
     prepare,
     whole,
@@ -35,6 +36,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
+LONG = 20_000  # integration steps of a run that takes more than a moment
 _STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
 
 
@@ -49,6 +51,7 @@ def simulate(
         str | None,
         Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
     ] = None,
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -59,15 +62,18 @@ def simulate(
     """
     key = whole("--seed", seed)
     number = None if trial is None else whole("--trial", trial)
-    loaded, folder = prepare(scenario, "simulate", out)
+    loaded, folder = prepare(scenario, "simulate", out, trust=trust)
     from ptsmc_jax import store
 
     store.check(folder, force)
-    from ptsmc_jax import runs
+    from ptsmc_jax import pace, runs
     from ptsmc_jax.scenario import study
     from tuning import single
 
-    run = runs.fly(study(loaded, drawn=number is not None), key, number)
+    ready = study(loaded, drawn=number is not None)
+    if pace.steps(ready.parts) > LONG and not quiet:
+        show.say(f"flying {pace.steps(ready.parts)} integration steps, with their history")
+    run = runs.fly(ready, key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
         show.run(single.summary(run), loaded.plant.kind, folder)
@@ -107,6 +113,7 @@ def map_(
     out: Out = None,
     seed: Seed = "0",
     device: Device = "cpu",
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -116,7 +123,7 @@ def map_(
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
     key, count = whole("--seed", seed), whole("--trials", trials, 1, 1_000_000)
-    loaded, folder = prepare(scenario, "map", out, device)
+    loaded, folder = prepare(scenario, "map", out, device, trust=trust)
     from ptsmc_jax import store
 
     store.check(folder, force)
@@ -147,6 +154,7 @@ def tune(
         bool, Parameter(negative="", help="Compare with differential evolution, and report the distance.")
     ] = False,
     device: Device = "cpu",
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -159,7 +167,7 @@ def tune(
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
     """
     key = whole("--seed", seed)
-    loaded, folder = prepare(scenario, "tune", out, device)
+    loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from tuning import report, results
 
     loaded = _with_tune(loaded)
@@ -183,6 +191,7 @@ def pareto(
     out: Out = None,
     seed: Seed = "0",
     device: Device = "cpu",
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -195,7 +204,7 @@ def pareto(
     interrupted.
     """
     key, count = whole("--seed", seed), whole("--points", points, 3, 100)
-    loaded, folder = prepare(scenario, "pareto", out, device)
+    loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
     from tuning import pareto as fronts
 
     loaded = _with_tune(loaded)
@@ -218,6 +227,7 @@ def compare(
     out: Out = None,
     seed: Seed = "0",
     device: Device = "cpu",
+    trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
@@ -231,7 +241,7 @@ def compare(
     interrupted.
     """
     key = whole("--seed", seed)
-    loaded, folder = prepare(scenario, "compare", out, device)
+    loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from tuning import compare as comparing
 
     comparing.check(loaded)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import drawing, linear, montecarlo, schema, store, study_plots
+from ptsmc_jax import drawing, linear, montecarlo, schema, store, study_plots, systems
 from ptsmc_jax.clock import Anchored, Flight
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.observers import NonlinearObserver, NoObserver
@@ -195,7 +195,8 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
     trials = max((cell.trials for cell in cells), default=0)
-    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials))
+    source = systems.source(getattr(scenario.plant, "system", None))
+    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials, **source))
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)
     rows = [["" if value != value else value for value in row] for row in cells_of]

@@ -21,6 +21,13 @@ Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
 Device = Annotated[str, Parameter(help="What it is flown on: cpu or gpu.")]
+Trust = Annotated[
+    bool,
+    Parameter(
+        negative="",
+        help="Run the Python file that results name (plant.system, --metrics): read it before, it can do what you can.",
+    ),
+]
 
 INTERRUPTED = 130  # exit status
 
@@ -48,9 +55,18 @@ def between(option: str, value: str, least: float, most: float) -> float:
 
 
 def prepare(
-    scenario: Path | None, command: str, out: Path | None, device: str = "cpu", bits: Literal[32, 64] = 64
+    scenario: Path | None,
+    command: str,
+    out: Path | None,
+    device: str = "cpu",
+    bits: Literal[32, 64] = 64,
+    *,
+    trust: bool,
 ) -> "tuple[Scenario, Path]":
-    """The checked scenario and the folder for the results; the backend is configured on the way."""
+    """The checked scenario, which may be flown, and the folder for the results; the backend is configured on the way.
+
+    trust: code that the scenario names may be run where it lies in results.
+    """
     if device != "cpu" and device != "gpu":
         raise UsageError(f"--device is {device}, but must be cpu or gpu")
     from ptsmc_jax import schema
@@ -64,5 +80,9 @@ def prepare(
         raise UsageError(f"--device is {device}, but {error}") from None
     from ptsmc_jax.scenario import from_tables
 
-    name = scenario.stem if scenario is not None else "default"
-    return from_tables(raw), out if out is not None else Path("out") / f"{command}-{name}"
+    name, loaded = scenario.stem if scenario is not None else "default", from_tables(raw)
+    if scenario is not None:
+        from tuning import own_parts
+
+        own_parts.allow_scenario(scenario, loaded, trust)
+    return loaded, out if out is not None else Path("out") / f"{command}-{name}"

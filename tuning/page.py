@@ -9,7 +9,6 @@ import csv
 import hashlib
 import json
 import shlex
-import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ptsmc_jax import schema, store
 from ptsmc_jax.store import RefusedError
 from tuning import page_charts, told
 from tuning.options import UsageError
@@ -84,20 +84,17 @@ def read(folder: Path) -> Result:
     """A result folder. Raises RefusedError where it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is one that a ptsmc command left")
-    try:
-        versions = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        versions = None
-    command = versions.get("command") if isinstance(versions, dict) else None
-    if not isinstance(versions, dict) or str(command) not in SECTIONS:
+    versions = store.made(folder)
+    command = versions.get("command")
+    if str(command) not in SECTIONS:
         raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command left")
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8")) if command != "map" else {}
         path = folder / "scenario.toml"
-        scenario = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        scenario = schema.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
         raise _unfinished(folder, versions) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     return Result(folder, versions, summary, scenario)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import schema, store
+from ptsmc_jax import schema, store, systems
 from ptsmc_jax.runs import Run
 from ptsmc_jax.tables import Scenario
 
@@ -21,7 +21,8 @@ def summary(run: Run) -> dict[str, Any]:
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", schema.dump(scenario))
-    store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial))
+    source = systems.source(getattr(scenario.plant, "system", None))
+    store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
     store.write_json(folder / "summary.json", summary(run))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())

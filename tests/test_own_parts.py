@@ -1,0 +1,240 @@
+"""A scenario with own parts is a program: reading results runs none of it, flying them asks first."""
+
+import importlib.util
+import py_compile
+import shutil
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from ptsmc_jax import scenario, schema, store, systems
+from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.store import RefusedError
+from tuning import campaign_folder, own_parts
+
+# what marks that it was run; a double integrator, and a metric of one's own
+PROGRAM = """
+from pathlib import Path
+
+with open(Path(__file__).with_suffix(".ran"), "a") as file:
+    file.write("ran ")
+
+import jax.numpy as jnp
+from ptsmc_jax.plants import system
+
+mine = system(1, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: jnp.eye(1))
+
+
+def farthest(result, parts):
+    return {"farthest": jnp.max(jnp.abs(result.log.x[:, 0]))}
+"""
+SCENARIO = """
+plant = { kind = "system", system = "my.py:mine", x0 = [1.0, 0.0] }
+loop = { mode = "sampled", period = 0.1, t_end = 6.0 }
+controller = { t_f = 5.0, delta = 0.5 }
+dispersion = { x0 = { kind = "uniform", half_width = [0.5, 0.1] } }
+requirements = { window_error = 0.5 }
+"""
+FOLDER = "out/montecarlo-mine"
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    """A process that has run nothing yet."""
+    monkeypatch.setattr(systems, "_ran", {})
+
+
+@pytest.fixture
+def flown(command, tmp_path):
+    """A campaign whose scenario and metrics name my.py, its marker removed."""
+    (tmp_path / "my.py").write_text(PROGRAM)
+    (tmp_path / "mine.toml").write_text(SCENARIO)
+    code, _, error = command(
+        "montecarlo", "mine.toml", "--trials", 20, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
+    )
+    assert (code, error) == (0, "")  # what lies beside a scenario that its user names is run without a word
+    assert ran(tmp_path)
+    systems._ran.clear()
+    return tmp_path / FOLDER
+
+
+def ran(folder):
+    """Whether my.py was run since this was asked last."""
+    marker = folder / "my.ran"
+    found = marker.exists()
+    marker.unlink(missing_ok=True)
+    return found
+
+
+def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flown, tmp_path):
+    rows = pl.read_parquet(flown / "trials")
+    code, said, error = command("summarize", FOLDER)
+    assert (code, error) == (0, "")
+    assert "farthest" in said
+    assert (flown / "figures" / "distributions.png").exists()
+    assert not (flown / "figures" / "fan.png").exists()  # of histories, which would be flown
+    assert command("worst", FOLDER, "--by", "farthest", "-n", 1)[0] == 0
+    assert pl.read_csv(flown / "worst.csv")["farthest"][0] == rows["farthest"].max()
+    assert command("report", FOLDER)[0] == 0
+    assert not ran(tmp_path)
+    assert "farthest" in (flown / "report.html").read_text()
+
+
+def test_rows_are_read_where_the_program_is_not(command, flown, tmp_path):
+    (tmp_path / "my.py").unlink()
+    for asked in ("summarize", "worst", "report"):
+        assert command(asked, FOLDER)[0] == 0, asked
+
+
+def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flown, tmp_path):
+    code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures")
+    assert (code, out) == (2, "")
+    for said in (f"{tmp_path}/my.py (plant.system)", f"{tmp_path}/my.py (--metrics)", "--trust"):
+        assert said in error
+    assert error.count("\n") == 1
+    assert not ran(tmp_path)
+    assert not (flown / "replay").exists()
+    code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures", "--trust")
+    assert (code, "equal to its row" in out) == (0, True)
+    assert f"ptsmc: runs {tmp_path}/my.py, which plant.system of {FOLDER} names\n" in error
+    assert ran(tmp_path)
+
+
+def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(command, flown, tmp_path):
+    shutil.copy(tmp_path / "my.py", flown)
+    text = (flown / "scenario.toml").read_text().replace(f"{tmp_path}/my.py", "my.py")
+    (flown / "scenario.toml").write_text(text)
+    (flown / "my.py").write_text(PROGRAM + "# another\n")
+    (tmp_path / "my.py").write_text(PROGRAM + "# another\n")
+    assert "--trust" in command("replay", FOLDER, "--trial", 3)[2]
+    for asked in (["replay", FOLDER, "--trial", 3], ["simulate", f"{FOLDER}/scenario.toml", "--out", "new"]):
+        code, out, error = command(*asked, "--trust", "--no-figures")
+        assert (code, out) == (2, "")
+        assert f"was made with another plant.system than {flown}/my.py is now" in error
+    code, _, error = command("montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest")
+    assert (code, "holds a run with system_sha256" in error) == (2, True)
+    assert not ran(flown)
+    other = campaign_folder.opened(flown)  # as a worker elsewhere does
+    with pytest.raises(RefusedError, match=r"was made with another plant\.system"):
+        campaign_folder.made_again(str(flown), other.rows.key.hex())
+    assert not ran(flown)
+
+
+def test_the_same_campaign_goes_on_without_a_flag(command, flown, tmp_path):
+    code, _, error = command(
+        "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
+    )
+    assert (code, error) == (0, "")
+    assert pl.read_parquet(flown / "trials").height == 30
+    assert campaign_folder.opened(flown).own_names == ["farthest"]
+
+
+def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, tmp_path, capsys):
+    shutil.copy(tmp_path / "my.py", flown)
+    (flown / "evil.toml").write_text(SCENARIO)
+    (flown / "scenarios").mkdir()
+    (flown / "scenarios" / "law.toml").write_text(SCENARIO.replace("my.py", "../my.py"))
+    (tmp_path / "link.toml").symlink_to(flown / "evil.toml")
+    for path in (f"{FOLDER}/scenario.toml", f"{FOLDER}/evil.toml", f"{FOLDER}/scenarios/law.toml", "link.toml"):
+        for asked in ("simulate", "tune", "montecarlo", "map", "pareto"):
+            code, out, error = command(asked, path, "--out", "new")
+            assert (code, out) == (2, "")
+            assert "names code of its own" in error
+    assert not ran(flown)
+    assert not ran(tmp_path)
+    loaded = scenario.read(flown / "evil.toml")
+    own_parts.allow_scenario(flown / "evil.toml", loaded, True)
+    assert capsys.readouterr().err == f"ptsmc: runs {flown}/my.py, which plant.system of {flown}/evil.toml names\n"
+
+
+@pytest.mark.parametrize(
+    ("system", "runs"),
+    [
+        ("my.py:mine", None),
+        ("below/my.py:mine", None),
+        ("below/../my.py:mine", None),
+        ("../my.py:mine", "{above}/my.py"),
+        ("link.py:mine", "{above}/my.py"),
+        ("{above}/my.py:mine", "{above}/my.py"),
+        ("package.module:mine", "the module package.module"),
+    ],
+)
+def test_what_a_users_own_scenario_runs_is_said_where_it_does_not_lie_beside_it(tmp_path, capsys, system, runs):
+    home = tmp_path / "home"
+    (home / "below").mkdir(parents=True)
+    for folder in (tmp_path, home, home / "below"):
+        (folder / "my.py").write_text(PROGRAM)
+    (home / "link.py").symlink_to(tmp_path / "my.py")
+    path = home / "mine.toml"
+    path.write_text(SCENARIO.replace("my.py:mine", system.format(above=tmp_path)))
+    own_parts.allow_scenario(path, scenario.read(path), False)
+    said = capsys.readouterr().err
+    wanted = "" if runs is None else f"ptsmc: runs {runs.format(above=tmp_path)}, which plant.system of {path} names\n"
+    assert said == wanted
+    assert not any(ran(folder) for folder in (tmp_path, home, home / "below"))
+
+
+def test_reading_a_scenario_imports_no_module_and_no_package_around_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("around").mkdir()
+    Path("around/__init__.py").write_text("raise SystemExit('was run')\n")
+    Path("around/inside.py").write_text(PROGRAM)
+    tables = {"plant": {"kind": "system", "system": "around.inside:mine", "x0": [1.0, 0.0]}}
+    loaded = scenario.replace(scenario.from_tables(tables), controller__eta=4.0, tune={})
+    assert schema.dump(loaded)["plant"]["system"] == "around.inside:mine"
+    with pytest.raises(ScenarioError, match=r"running around\.inside fails: SystemExit: was run"):
+        scenario.study(loaded)
+    assert systems.digest("around.inside:mine") is None
+
+
+def test_what_is_run_is_the_source_and_no_compiled_copy_that_came_with_it(tmp_path):
+    file = tmp_path / "my.py"
+    file.write_text(PROGRAM.replace("system(1", "no_system_at_all(1"))
+    cached = Path(importlib.util.cache_from_source(str(file)))
+    py_compile.compile(str(file), str(cached), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    file.write_text(PROGRAM)  # the compiled copy says that it need not be compared
+    assert systems.load(f"{file}:mine").inputs == 1
+
+
+def test_a_file_that_changes_is_run_anew_and_one_that_does_not_is_not(tmp_path):
+    file = tmp_path / "my.py"
+    file.write_text(PROGRAM)
+    first = systems.load(f"{file}:mine")
+    assert systems.load(f"{file}:mine") is first
+    file.write_text(PROGRAM.replace("mine = system(1", "mine = 3  # system(1"))
+    with pytest.raises(ValueError, match="has a int of that name"):
+        systems.load(f"{file}:mine")
+
+
+def test_a_run_says_which_program_it_was_made_with(command, tmp_path):
+    (tmp_path / "my.py").write_text(PROGRAM)
+    (tmp_path / "mine.toml").write_text(SCENARIO)
+    assert command("simulate", "mine.toml", "--out", "run", "--quiet", "--no-figures")[0] == 0
+    assert store.made(tmp_path / "run")["system_sha256"] == systems.digest(f"{tmp_path}/my.py:mine")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("versions.json", "[" * 100_000),
+        ("versions.json", "[3]"),
+        ("versions.json", '{"command": "montecarlo", "seed": -1, "trials": 20, "precision": 64}'),
+        ("versions.json", '{"command": "montecarlo", "seed": 0, "trials": "many", "precision": 64}'),
+        ("scenario.toml", f"plant = {'[' * 9}{']' * 9}"),
+        ("scenario.toml", "plant = 3"),
+        ("summary.json", "[" * 100_000),
+    ],
+)
+def test_folders_that_nobody_could_have_made_are_refused_in_one_sentence(command, tmp_path, name, text):
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    said = '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64}'
+    for each, content in {"versions.json": said, "scenario.toml": "", "summary.json": "{}", name: text}.items():
+        (folder / each).write_text(content)
+    for asked in (["summarize"], ["worst"], ["replay", "--trial", "1"], ["report"]):
+        if name == "summary.json" and asked != ["report"]:
+            continue
+        code, out, error = command(asked[0], "theirs", *asked[1:])
+        assert (code, out) == (2, ""), asked
+        assert error.count("\n") == 1
