@@ -30,6 +30,7 @@ FLOORS = {
         lanes
         kernel
         theory linear estimation
+        hold
         requirements
         dispersions
         values systems

@@ -1,5 +1,6 @@
 """Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
 
+import json
 import os
 import sys
 from collections.abc import Callable, Iterator
