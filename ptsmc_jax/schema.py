@@ -100,7 +100,7 @@ def load(path: str | Path) -> dict[str, Any]:
     plant = raw.get("plant")
     where = plant.get("system") if isinstance(plant, dict) else None
     file, _, name = where.rpartition(":") if isinstance(where, str) else ("", "", "")
-    if isinstance(plant, dict) and file.endswith(".py") and not os.path.isabs(file) and "\0" not in file:
+    if isinstance(plant, dict) and file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
         plant["system"] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
     return raw
 

@@ -28,7 +28,7 @@ def named(where: str, allowed: str) -> tuple[str, str]:
     """The file or module, and the name in it; looks at the text only. Raises ValueError where it is neither."""
     place, _, name = where.rpartition(":")
     file = place.endswith(".py")
-    if not name.isidentifier() or len(where) > LONGEST or "\0" in where:
+    if not name.isidentifier() or len(where) > LONGEST or not where.isprintable():
         place = ""
     if not place or not (file or all(part.isidentifier() for part in place.split("."))):
         raise ValueError(f"it names nothing; allowed is {allowed}")

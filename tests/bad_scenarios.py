@@ -345,6 +345,7 @@ BAD = [
     (OWN % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it names nothing; allowed is"),
     (OWN % ("a" * 300 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
     (OWN % "a\\u0000b.py:arm", r'plant.system is "a\u0000b.py:arm"', "it names nothing; allowed is"),
+    (OWN % "a\\u001b[2K.py:arm", r'plant.system is "a\u001b[2K.py:arm"', "it names nothing; allowed is"),
     (OWN % "a\\u0000b:arm", r'plant.system is "a\u0000b:arm"', "it names nothing; allowed is"),
     (OWN % "arm.py:a b", "arm.py:a b", "it names nothing; allowed is"),
     (OWN % "a..b:arm", 'plant.system is "a..b:arm"', "it names nothing; allowed is"),

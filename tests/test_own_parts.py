@@ -221,6 +221,11 @@ def test_a_run_says_which_program_it_was_made_with(command, tmp_path):
         ("versions.json", "[3]"),
         ("versions.json", '{"command": "montecarlo", "seed": -1, "trials": 20, "precision": 64}'),
         ("versions.json", '{"command": "montecarlo", "seed": 0, "trials": "many", "precision": 64}'),
+        (
+            "versions.json",
+            '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64, "metrics": "m\\u0000.py:f"}',
+        ),
+        ("scenario.toml", 'plant = { kind = "system", system = "my\\u001b[2K.py:mine" }'),
         ("scenario.toml", f"plant = {'[' * 9}{']' * 9}"),
         ("scenario.toml", "plant = 3"),
         ("summary.json", "[" * 100_000),

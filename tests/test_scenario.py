@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import clock, dispersions, schema, sensors, signal_tables, signals, store
+from ptsmc_jax import clock, dispersions, pace, schema, sensors, signal_tables, signals, store
 from ptsmc_jax.attitude_keys import quaternion
 from ptsmc_jax.pace import Reach
 from ptsmc_jax.scenario import from_tables, read, replace, study
@@ -310,6 +310,15 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
         ticks = parts.clock.ticks(vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
+
+
+def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
+    scenario = from_tables(tomllib.loads(SAMPLED + "loop.period = 0.5\ncontroller = { t_f = 6e4, delta = 1.0 }"))
+    reach = Reach(6e4, 12e4, delta=1.0, smallest_delta=1.0, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3)
+    assert 120_020 <= pace.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
+    with pytest.raises(ScenarioError) as caught:
+        study(scenario, reach=reach)
+    check_sentence(str(caught.value), "tune.bounds.t_f asks for runs of 120010 s", "take 240020 steps, 1 a period")
 
 
 def test_read_reads_the_scenario_that_comes_with_the_project():

@@ -190,10 +190,14 @@ def opened(path: Path) -> Folder:
                 f"{path} holds results of `ptsmc {said['command']}`, but must be one of `ptsmc montecarlo`"
             )
         made = msgspec.convert(said, Made, strict=True)
+        if made.metrics is not None:
+            systems.named(made.metrics, OWN)
         flown = scenario.read(path / "scenario.toml")
     except ScenarioError as error:
         raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
-    except msgspec.ValidationError:
+    except RefusedError:
+        raise
+    except (ValueError, msgspec.ValidationError):
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
     return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, trusted=False)
 
