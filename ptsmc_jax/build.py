@@ -31,7 +31,7 @@ def vector(values: Any) -> Any:
     return jnp.asarray(np.asarray(values, dtype=float))
 
 
-def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
+def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any, Any]:
     table = scenario.controller
     return (
         vector(table.t_f),
@@ -39,6 +39,7 @@ def _gains(scenario: Scenario) -> tuple[Any, Any, Any, Any, Any]:
         vector(table.delta),
         vector(table.k1),
         vector(table.sign_width),
+        vector(table.surface_rate),
     )
 
 

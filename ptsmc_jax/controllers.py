@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
-from ptsmc_jax.laws import Motion, Prescribed, SecondOrder
+from ptsmc_jax.laws import Motion, Prescribed, SecondOrder, surface_roots
 from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft, System
 from ptsmc_jax.signals import Target
@@ -53,7 +53,7 @@ class PrescribedTime(_Attitude):
     sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the bound grows
     like 1/q4. Between attitudes on either side of the identity the path leads past it, which may be the long way round:
     from 150 to -150 degrees about an axis the body turns by 300 degrees. After the hand-over nothing stays "at the
-    origin": the rates are 1 and K1/2.
+    origin": the rates are c (`surface_rate`, 1 1/s in the paper) and K1/2.
     """
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
@@ -245,7 +245,8 @@ class PrescribedTimeChain(Prescribed):
     For order 2 it is (24) on (6). Differences from the paper: its sums of (38), (40) and (52) run to n-1, but x_(n+1)
     does not exist: they end at n-2; the s of Theorem 3 lacks the factor (t_f - t)^(eta+n-1) of (36); in (51) "-K s s"
     must read -K1 s^2; sign(s) is tanh(s / sign_width) (0: exact). The paper's law has no observer, d_hat = 0 and
-    K2 = K; with an observer (Remark 3) its estimate and its bound take their place.
+    K2 = K; with an observer (Remark 3) its estimate and its bound take their place. With `surface_rate` c the poles of
+    (39) are c times those of a: a_i c^(n-i) stands for a_i, and c = 1 is the paper's.
     """
 
     model: Chain  # the nominal plant
@@ -274,9 +275,10 @@ class PrescribedTimeChain(Prescribed):
         n = self.order
         tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
         c = expansion(self.eta, n)
-        weights = [jnp.where(hold, held, c[i] * tau**i) for i, held in enumerate([*self.a, 1.0])]
+        a = self.surface()
+        weights = [jnp.where(hold, held, c[i] * tau**i) for i, held in enumerate([*a, 1.0])]
         s = jnp.dot(jnp.stack(weights), x)
-        rates = [jnp.where(hold, self.a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
+        rates = [jnp.where(hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
         pull = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
         known = jnp.dot(jnp.stack(rates), x[1:]) + pull * s
         wanted = -known - k2 * numerics.smooth_sign(s, self.sign_width)
@@ -287,15 +289,12 @@ class PrescribedTimeChain(Prescribed):
         """K2."""
         return k2
 
-    def hold_rate(self) -> float:
-        """Fastest decay after the hand-over [1/s]: the roots of (39) on the surface, K1 toward it."""
-        return max(float(self.k1), float(np.max(np.abs(_surface_roots(self.a)))))
+    def surface(self) -> Float[Array, " roots"]:
+        """a_i c^(n-i) [1/s^(n-i)]: time runs c times as fast on the surface."""
+        n = self.order
+        return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])
 
 
 def hurwitz(a: Any) -> bool:
     """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 left of the axis."""
-    return bool(np.all(np.real(_surface_roots(a)) < 0.0))
-
-
-def _surface_roots(a: Any) -> np.ndarray:
-    return np.roots([1.0, *reversed([float(v) for v in a])])
+    return bool(np.all(np.real(surface_roots(a)) < 0.0))

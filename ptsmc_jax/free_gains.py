@@ -189,6 +189,9 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
     if name == "p" and "gamma" not in free and hasattr(scenario.controller, "gamma"):
         above = _least_p(scenario)
         return above + 0.05 * (2.0 - above), 2.0 - 0.05 * (2.0 - above)
+    if name == "surface_rate":  # two decades; sampled, the frozen loop is stable for (c + K1/2) h < 2: to half of that
+        high = min(700.0 / t_f, 1.0 / scenario.loop.period) if scenario.loop.mode == "sampled" else 700.0 / t_f
+        return 0.01 * high, high
     size = 1.0
     if scenario.spacecraft is not None:  # beside a mean moment of 12 kg m^2
         moments = np.asarray(scenario.spacecraft.inertia)

@@ -21,6 +21,7 @@ class Controller(Table, frozen=True):
         delta: hand-over to constant gains so long before t_f (Remark 1) [s]
         k1: K1, rate of s from the hand-over on, halved by (60) [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
+        surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
         disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
@@ -33,6 +34,7 @@ class Controller(Table, frozen=True):
     delta: Positive = 0.05
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
+    surface_rate: Positive = 1.0
     disturbance_rate_bound: NotNegative = 1e-3
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
@@ -120,6 +122,7 @@ class SystemController(Table, frozen=True):
         delta: hand-over to constant gains so long before t_f (Remark 1) [s]
         k1: K1, rate of s from the hand-over on [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
+        surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [unit of d/s]
         disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [unit of d]
         initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
@@ -131,6 +134,7 @@ class SystemController(Table, frozen=True):
     delta: Positive = 0.05
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
+    surface_rate: Positive = 1.0
     disturbance_rate_bound: NotNegative = 0.01
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
@@ -142,6 +146,7 @@ class ChainController(SystemController, frozen=True):
     Attributes:
         eta: power of the approach; default: order + 1
         a: a_1 to a_(order-1) of the surface (39), stable; default: all poles at -1
+        surface_rate: the poles of (39) are this times those of a; 1 in the paper [1/s]
     """
 
     eta: Annotated[float, Meta(gt=0, description="a number greater than the order (Theorems 1 and 3)")] = 3.0

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import numerics
@@ -16,10 +17,15 @@ Vector = Float[Array, " m"]
 class SurfaceGains(NamedTuple):
     """What both phases of the law share: s = c eps' + e eps, desired 2 eps'' = -a eps' - b s - switching."""
 
-    c: Array  # [s]
-    e: Array  # [-]
+    c: Array  # [s] before the hand-over, [-] after
+    e: Array  # [-] before the hand-over, [1/s] after
     a: Array  # [1/s]
     b: Array  # [1/s^2] before the hand-over, [1/s] after
+
+
+def surface_roots(a: Any) -> np.ndarray:
+    """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
+    return np.roots([1.0, *reversed([float(v) for v in a])])
 
 
 class Motion(NamedTuple):
@@ -93,7 +99,8 @@ class Prescribed(Law):
     delta: Leaf
     k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
     sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
-    free: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "t_f")
+    surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
+    free: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
@@ -107,9 +114,18 @@ class Prescribed(Law):
         after = self.switching_rate(k2, visited) / self.sign_width
         return self.t_f ** (self.order - 1) * after, after
 
-    def hold_rate(self) -> float:
-        """Fastest decay after the hand-over [1/s]."""
+    def reaching_rate(self) -> Scalar:
+        """Rate at which s falls after the hand-over, but for the switching term [1/s]: K1 of (10), (29) and (40)."""
+        return self.k1
+
+    def surface(self) -> Float[Array, " roots"]:
+        """a_1 .. a_(n-1) of the surface after the hand-over, s = x_n + a_(n-1) x_(n-1) + .. + a_1 x_1 [1/s^(n-i)]."""
         raise NotImplementedError
+
+    def hold_rates(self) -> dict[str, float]:
+        """Fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
+        on = float(np.max(np.abs(surface_roots(self.surface()))))
+        return {"k1": float(self.reaching_rate()), "surface_rate": on}
 
 
 @dataclass(frozen=True)
@@ -117,9 +133,10 @@ class SecondOrder(Prescribed):
     """The law of an error vector eps whose second derivative the input sets: (29), of which (57) and (60) are a case.
 
     s = tau eps' + eta eps and 2 eps'' = -2 (eta-1) eps'/tau - 2 eta s/tau^2 - N K2 sign(s) before the hand-over (26),
-    s = eps' + eps and 2 eps'' = -2 eps' - b s - N K2 sign(s) after it (28), tau = t_f - t. N is the Frobenius norm of
-    2 d(eps'')/dd, |T J^-1| in (57) and 2 |dF/dx2| in (29): the paper names no norm; this one is smooth and not below
-    the spectral norm that the proof needs where K2 bounds the 2-norm of the estimation error. b is `pull`.
+    s = eps' + c eps and 2 eps'' = -2 c eps' - b s - N K2 sign(s) after it (28), tau = t_f - t. N is the Frobenius norm
+    of 2 d(eps'')/dd, |T J^-1| in (57) and 2 |dF/dx2| in (29): the paper names no norm; this one is smooth and not below
+    the spectral norm that the proof needs where K2 bounds the 2-norm of the estimation error. c is `surface_rate`, in
+    the paper 1 1/s, and b is `pull`.
 
     Differences from the paper: (29) lacks the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference; (60)
     and (57) have them. sign(s) is tanh(s / sign_width), per component (0: exact).
@@ -128,6 +145,14 @@ class SecondOrder(Prescribed):
     def pull(self) -> Scalar:
         """The coefficient b after the hand-over [1/s]: 2 K1 of (29)."""
         return 2.0 * self.k1
+
+    def reaching_rate(self) -> Scalar:
+        """Half of `pull` [1/s]: s' = -b/2 s but for the switching term."""
+        return 0.5 * self.pull()
+
+    def surface(self) -> Float[Array, "1"]:
+        """(c,) [1/s]."""
+        return jnp.reshape(self.surface_rate, 1)
 
     def influence(self, x: Any, target: Any) -> Scalar:
         """The factor N, what a unit of disturbance does to 2 eps'' at most."""
@@ -146,8 +171,8 @@ class SecondOrder(Prescribed):
         tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
         return SurfaceGains(
             c=tau,
-            e=jnp.where(hold, 1.0, self.eta),
-            a=jnp.where(hold, 2.0, 2.0 * (self.eta - 1.0) / tau),
+            e=jnp.where(hold, self.surface_rate, self.eta),
+            a=jnp.where(hold, 2.0 * self.surface_rate, 2.0 * (self.eta - 1.0) / tau),
             b=jnp.where(hold, self.pull(), 2.0 * self.eta / tau**2),
         )
 
@@ -164,7 +189,3 @@ class SecondOrder(Prescribed):
         switching = self.influence(x, target) * k2 * numerics.smooth_sign(s, self.sign_width)
         wanted = -switching - gains.a * error_rate - gains.b * s
         return self.invert(x, target, wanted, d_hat), s
-
-    def hold_rate(self) -> float:
-        """Fastest decay after the hand-over [1/s]: 1 on the surface, half of `pull` toward it."""
-        return max(1.0, float(self.pull()) / 2)

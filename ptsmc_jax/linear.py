@@ -15,18 +15,19 @@ from ptsmc_jax.rollout import Parts
 
 
 def gains(
-    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float
+    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gains kp [1/s^2] and kd [1/s], (times,), at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
 
-    eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; (K1 + slope)/2 and one more after.
+    eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; c k and c + k after it, with
+    k = (K1 + slope)/2 and c the surface_rate [1/s].
     """
     tau = t_f - np.asarray(t, dtype=float)
     hold = tau <= delta * (1 + 1e-9)
     safe = np.where(hold, 1.0, tau)
     after = (k1 + slope) / 2
-    kp = np.where(hold, after, eta**2 / safe**2 + slope * eta / 2)
-    kd = np.where(hold, 1.0 + after, (2 * eta - 1) / safe + slope * safe / 2)
+    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + slope * eta / 2)
+    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + slope * safe / 2)
     return kp, kd
 
 
@@ -109,10 +110,10 @@ def margins(parts: Parts) -> dict[str, Margins]:
     """Stability margins of a sampled run's law: at the last sample before the hand-over and in hold."""
     law, clock = parts.controller, typing.cast(Any, parts.clock)
     h, late = float(clock.period), float(0 if parts.actuators is None else parts.actuators.delay)
-    t_f, eta, delta, k1 = (float(v) for v in (law.t_f, law.eta, law.delta, law.k1))
+    t_f, eta, delta, k1, rate = (float(v) for v in (law.t_f, law.eta, law.delta, law.k1, law.surface_rate))
     found = {}
     for name, tau in (("hand_over", delta + h), ("hold", 0.0)):
-        kp, kd = (float(v) for v in gains(np.asarray(t_f - tau), t_f, eta, delta, k1, 0.0))
+        kp, kd = (float(v) for v in gains(np.asarray(t_f - tau), t_f, eta, delta, k1, 0.0, rate))
         gain = _last(lambda g, kp=kp, kd=kd: radius(g * kp, g * kd, h, late) < 1.0, 1e-6, 1e6)
         delay = _last(lambda d, kp=kp, kd=kd: radius(kp, kd, h, late + d) < 1.0, 0.0, 200.0) * h
         if not np.isfinite(delay):  # beyond 200 periods the loop is as good as continuous: its phase margin
@@ -140,12 +141,13 @@ def noise(parts: Parts) -> Noise:
     law, clock, sensors = parts.controller, typing.cast(Any, parts.clock), parts.sensors
     h, late = float(clock.period), 0 if parts.actuators is None else int(parts.actuators.delay)
     t_f, eta, delta, k1, width = (float(v) for v in (law.t_f, law.eta, law.delta, law.k1, law.sign_width))
+    rate = float(law.surface_rate)
     bound = parts.observer.error_bound()
     k2 = float(bound.floor)
     push = float(np.linalg.norm(np.asarray(law.model.inertia_inverse)))
     slope = push * k2 / width if width > 0.0 else 0.0
     t = np.arange(int(np.ceil((t_f + float(parts.window)) / h)) + 1) * h
-    kp, kd = gains(t, t_f, eta, delta, k1, slope)
+    kp, kd = gains(t, t_f, eta, delta, k1, slope, rate)
     inertia = np.diag(np.asarray(law.model.inertia))
     gain = np.asarray(getattr(parts.observer, "gain", np.zeros(3)))
     variance, torque = np.zeros(len(t)), 0.0

@@ -46,14 +46,15 @@ class Reach:
     largest_gain: float
     k1: float  # largest [1/s]
     sign_width: float  # smallest
+    surface_rate: float  # largest [1/s]
 
 
 def reach_of(scenario: Scenario) -> Reach:
     """The reach of a scenario's own gains: none beyond them."""
     table = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
-    k1, width = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0)
-    return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width)
+    k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
+    return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
 
 
 def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
@@ -210,9 +211,8 @@ def _grid(
     if not isinstance(observer, observers.NoObserver):  # K2 is largest with the smallest gain
         resolved = _with_gain(observer, reach.largest_gain).fastest()
         observer = _with_gain(observer, reach.gain)
-    widest = dataclasses.replace(
-        controller, t_f=build.vector(reach.t_f), k1=build.vector(reach.k1), sign_width=build.vector(reach.sign_width)
-    )
+    names = ("t_f", "k1", "sign_width", "surface_rate")
+    widest = dataclasses.replace(controller, **{name: build.vector(getattr(reach, name)) for name in names})
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:
         for t_f in (reach.smallest_t_f, reach.t_f):
@@ -220,17 +220,19 @@ def _grid(
             before, after = (float(v) for v in _boundary_layer(law, observer, visited))
             layer = (max(layer[0], before), max(layer[1], after))
     layer = (max(layer[0], resolved), max(layer[1], resolved))
-    rate, frequency = widest.hold_rate(), _fastest(frequencies)
+    rates, frequency = widest.hold_rates(), _fastest(frequencies)
     order = 1 if isinstance(scenario.plant, plant_tables.SpacecraftPlant) else controller.order
 
-    def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0)) -> float:
+    def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
         taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
         return taken if taken == taken else math.inf
 
-    needed = steps(frequency, layer)
+    rate = max(rates.values())
+    needed = steps(frequency, layer, rate)
     if not needed <= MOST_STEPS:
         asks = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
         by_key = {key: steps(value) for key, value in frequencies.items()}
+        by_key |= {f"controller.{key}": steps(rate=value) for key, value in rates.items()}
         by_key["controller.sign_width"] = steps(layer=layer)
         worst = max(by_key, key=lambda key: by_key[key])
         if by_key[worst] <= steps() * 1.5:

@@ -197,7 +197,7 @@ def _sign_of_q4() -> Slip:
     }
     ready = study(from_tables(tables))
     law = ready.parts.controller
-    printed = _Unaligned(law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width)
+    printed = _Unaligned(law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width, law.surface_rate)
     found = []
     for controller in (printed, law):
         run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))

@@ -75,7 +75,7 @@ class Limit(Table, frozen=True):
 
 
 Free = Literal[
-    "eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth",
+    "eta", "delta", "observer_gain", "k1", "sign_width", "surface_rate", "t_f", "filter_bandwidth",
     "k_p", "k_d", "p", "b", "k", "a1", "b1", "a2", "b2", "gamma", "m", "n",
 ]  # fmt: skip
 FREE: tuple[str, ...] = typing.get_args(Free)

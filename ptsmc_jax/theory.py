@@ -35,7 +35,7 @@ class ErrorMotion(NamedTuple):
 
 
 class ChainMotion(NamedTuple):
-    """States of a chain, s, and x_n' before the hand-over."""
+    """States of a chain, s, and x_n'."""
 
     x: Array  # (n,)
     s: Array
@@ -196,18 +196,26 @@ def residual_error(acceleration: Scalar, eta: Scalar, delta: Scalar) -> tuple[Sc
     return acceleration * delta**2 * share, acceleration * delta**2 * (0.5 - share)
 
 
-def hold_floor(disturbance_rate: Scalar, gain: Scalar, k1: Scalar, switching: Scalar, width: Scalar) -> Scalar:
-    """What an axis holds after the hand-over [-], about: |d'| / (l (K1 + |T J^-1| K2 / width)).
+def hold_floor(
+    disturbance_rate: Scalar, gain: Scalar, k1: Scalar, switching: Scalar, width: Scalar, surface_rate: Scalar
+) -> Scalar:
+    """What an axis holds after the hand-over [-], about: |d'| / (l c (K1 + |T J^-1| K2 / width)).
 
-    disturbance_rate: |d'| [N m/s]; gain: l [N m s]; switching: |T J^-1| K2 [1/s^2]; width: of the smooth sign.
+    The estimate of a ramp lags by J d' / l, which s = c eps holds off. disturbance_rate: |d'| [N m/s]; gain: l [N m s];
+    switching: |T J^-1| K2 [1/s^2]; width: of the smooth sign [1/s]; surface_rate: c [1/s].
     """
-    return disturbance_rate / (gain * (k1 + switching / width))
+    return disturbance_rate / (gain * surface_rate * (k1 + switching / width))
 
 
 def _start(parts: Parts) -> tuple[Array, Array]:
     """The errors and their derivatives at t = 0, (m,) each."""
     target = parts.reference(jnp.zeros_like(parts.t_end))
     return parts.controller.errors(parts.controller.align(parts.initial, target), target)
+
+
+def starts(parts: Parts) -> Float[Array, "m n"]:
+    """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
+    return parts.initial[None] if isinstance(parts.plant, Chain) else jnp.stack(_start(parts), axis=1)
 
 
 def sliding_envelope(parts: Parts) -> tuple[float, float]:
@@ -260,13 +268,12 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 @jax.jit
 def _error_bound(parts: Parts, t: Array, s0: Scalar, floor: Scalar) -> Array:
     law = parts.controller
-    starts = parts.initial[None] if isinstance(parts.plant, Chain) else jnp.stack(_start(parts), axis=1)
 
     def component(time: Scalar, x0: Vector) -> Scalar:
         centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, floor)
         return jnp.abs(centre[0]) + half[0]
 
-    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(starts))(t)
+    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(starts(parts)))(t)
     return jnp.sqrt(jnp.sum(sizes**2, axis=1))
 
 

@@ -26,6 +26,9 @@ BAD = [
     ("controller.t_f = 0.05", "controller.delta is 0.05", "less than controller.t_f, 0.05"),
     ("controller.t_f = 0", "controller.t_f is 0", "greater than 0"),
     ("controller.k1 = 0.0", "controller.k1 is 0.0", "greater than 0"),
+    ("controller.k1 = 1e7", "controller.k1 is 10000000.0", "lower: the continuous loop would need"),
+    ("controller.surface_rate = 0.0", "controller.surface_rate is 0.0", "greater than 0"),
+    ("controller.surface_rate = 1e6", "controller.surface_rate is 1000000.0", "lower: the continuous loop would need"),
     ("controller.sign_width = -1e-3", "controller.sign_width is -0.001", "at least 0"),
     ("controller.sign_width = 1e-9", "controller.sign_width is 1e-09", "larger, or 0 for the exact sign"),
     ("controller.disturbance_rate_bound = -1.0", "controller.disturbance_rate_bound is -1.0", "at least 0"),
@@ -319,6 +322,11 @@ BAD = [
     (SAMPLED + "tune.bounds.delta = [0.04, 3.0]", "tune.bounds.delta is [0.04, 3.0]", "from 0.05 and below 30.0"),
     ("tune.bounds.observer_gain = [0.0, 9.0]", "tune.bounds.observer_gain is [0.0, 9.0]", "above 0.0"),
     ("tune = { free = ['k1'], bounds = { k1 = [-1.0, 9.0] } }", "tune.bounds.k1 is [-1.0, 9.0]", "above 0.0"),
+    (
+        "tune = { free = ['surface_rate'], bounds = { surface_rate = [0.0, 9.0] } }",
+        "tune.bounds.surface_rate is [0.0, 9.0]",
+        "above 0.0",
+    ),
     (
         "tune = { free = ['sign_width'], bounds = { sign_width = [0, 9] } }",
         "tune.bounds.sign_width is [0.0",

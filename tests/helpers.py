@@ -71,6 +71,7 @@ def parts(
     t_end: float | None = None,
     sign_width=1e-3,
     k1=1.0,
+    surface_rate=1.0,
     saves: Any = (),
     reach: tuple[float, float] | None = None,
     law: Any = controllers.PrescribedTime,
@@ -79,7 +80,7 @@ def parts(
     body = plants.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
-        timing: Any = clock.graded(t_f, delta, t_end, 1.0, k1 / 2, 0.1, (0.2 * t_f, 0.2), saves)
+        timing: Any = clock.graded(t_f, delta, t_end, 1.0, max(k1 / 2, surface_rate), 0.1, (0.2 * t_f, 0.2), saves)
     elif flight:
         timing = clock.flight(period, t_end)
     else:
@@ -90,7 +91,7 @@ def parts(
         disturbance=disturbance
         or signals.Sinusoid(vector([0.01] * 3), vector([0.1] * 3), vector([0.0] * 3), vector([0.0] * 3)),
         reference=reference or signals.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
-        controller=law(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width))),
+        controller=law(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))),
         observer=observers.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
         sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,
@@ -108,6 +109,7 @@ def chain_parts(
     delta=0.05,
     *,
     k1=1.0,
+    surface_rate=1.0,
     a: Any = None,
     bound=0.0,
     sign_width=1e-3,
@@ -124,15 +126,15 @@ def chain_parts(
     model = plants.chain(n, f, g)
     eta = n + 1.0 if eta is None else eta
     a = [float(math.comb(n - 1, i)) for i in range(n - 1)] if a is None else a
-    gains = (vector(t_f), vector(eta), vector(delta), vector(k1), vector(sign_width))
-    law = controllers.PrescribedTimeChain(model, *gains, vector(a))
+    gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
+    law = controllers.PrescribedTimeChain(model, *gains, a=vector(a))
     if period is not None:
         timing: Any = clock.anchored(period, t_end, t_f, 2.0 + delta)
     elif steps is not None:
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
     else:
-        timing = clock.graded(t_f, delta, t_end, 1.0, law.hold_rate(), 0.0, (0.0, 0.0), (), n)
+        timing = clock.graded(t_f, delta, t_end, 1.0, max(law.hold_rates().values()), 0.0, (0.0, 0.0), (), n)
     return Parts(
         plant=model,
         disturbance=disturbance or signals.Constant(jnp.zeros(1)),

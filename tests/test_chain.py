@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax import controllers, lanes, observers, plants, rollout, signals, theory
+from ptsmc_jax import controllers, hold, lanes, observers, plants, rollout, signals, theory
 from tests.helpers import chain_parts, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -28,7 +28,7 @@ def test_order_two_is_the_law_of_the_second_order_system(eta, t):
     def g(x):
         return 2.0 + x[1] ** 2
 
-    run = chain_parts([5.0, 3.0], eta=eta, k1=1.7, bound=0.2, sign_width=0.1, f=f, g=g)
+    run = chain_parts([5.0, 3.0], eta=eta, k1=1.7, surface_rate=1.3, bound=0.2, sign_width=0.1, f=f, g=g)
     drift, gain, tau = np.sin(1.3) + 0.12, 2.16, 5.0 - t
     d_hat = jnp.zeros(1)
 
@@ -37,8 +37,8 @@ def test_order_two_is_the_law_of_the_second_order_system(eta, t):
     u, found = run.controller.torque(vector(t), BEFORE, vector(x), None, d_hat, vector(0.2))
     np.testing.assert_allclose((u[0], found[0]), (expected, s), rtol=1e-13)
 
-    s = x[0] + x[1]
-    expected = (-drift - 0.2 * np.tanh(s / 0.1) - 1.7 * s - x[1]) / gain
+    s = 1.3 * x[0] + x[1]
+    expected = (-drift - 0.2 * np.tanh(s / 0.1) - 1.7 * s - 1.3 * x[1]) / gain
     u, found = run.controller.torque(vector(t), HOLD, vector(x), None, d_hat, vector(0.2))
     np.testing.assert_allclose((u[0], found[0]), (expected, s), rtol=1e-13)
 
@@ -72,7 +72,7 @@ def test_sliding_variable_obeys_the_equation_that_the_law_is_made_from(n, hold):
     """s' along the true motion, by automatic differentiation, against (42) and (51) by hand."""
     eta, tau = n + 0.6, 2.2
     a = [0.7, 2.1, 3.0, 2.5][: n - 1]
-    run = chain_parts([1.0] * n, 5.0, eta, k1=1.4, a=a, sign_width=0.5)
+    run = chain_parts([1.0] * n, 5.0, eta, k1=1.4, surface_rate=1.3, a=a, sign_width=0.5)
     law, t, phase = run.controller, vector(5.0 - tau), jnp.asarray(hold)
     x = vector(np.random.default_rng(n).normal(size=n))
     d, d_hat, k2 = vector([0.3]), vector([0.1]), vector(0.4)
@@ -156,8 +156,15 @@ SCENARIO = st.fixed_dictionaries(
         "share": st.floats(-1.0, 1.0),
         "frequency": st.floats(0.0, 3.0),
         "phase": st.floats(-3.0, 3.0),
+        "k1": st.floats(0.2, 4.0),
+        "surface_rate": st.floats(0.1, 3.0),
+        "damping": st.floats(0.2, 1.0),
     }
 )
+
+
+# a_1 .. a_(n-1) for a pair of poles of this damping at 1 1/s, and a third one at -1
+SURFACES = {2: lambda z: [1.0], 3: lambda z: [1.0, 2 * z], 4: lambda z: [1.0, 1 + 2 * z, 1 + 2 * z]}
 
 
 @settings(max_examples=400, deadline=None, derandomize=True, database=None)
@@ -171,7 +178,7 @@ def test_chain_stays_inside_the_corrected_envelopes(n, case):
     wave = signals.Sinusoid(*(vector([v]) for v in sine))
     run = chain_parts(
         case["x0"][:n], t_f, n + case["above"], case["delta"] * t_f, bound=bound, sign_width=width, disturbance=wave,
-        steps=(800, 20),
+        k1=case["k1"], surface_rate=case["surface_rate"], a=SURFACES[n](case["damping"]), steps=(800, 1200),
     )  # fmt: skip
     result = fly(run, record=True)
     assert int(result.status) in rollout.FINISHED  # pushed off the origin it started from: missed
@@ -184,6 +191,9 @@ def test_chain_stays_inside_the_corrected_envelopes(n, case):
     centre, half = (np.asarray(v) for v in found)
     largest = 1e-7 * np.abs(log.x).max(axis=0) + 1e-12
     assert np.all(np.abs(log.x[: t.size] - centre) <= half * (1 + 1e-6) + largest)
+    t = log.t[t.size :]
+    assert np.all(np.abs(log.s[-t.size :, 0]) <= hold.sliding_bound(run, t) * (1 + 1e-6) + rounding)
+    assert np.all(np.abs(log.x[-t.size :, 0]) <= hold.error_bound(run, t) * (1 + 1e-6) + largest[0])
 
 
 @jax.jit
@@ -291,17 +301,18 @@ def test_plant_with_drift_and_gain_is_linearised_exactly():
 def test_batches_of_chains_and_their_gradients():
     run = chain_parts([5.0, 3.0, 2.0], delta=0.5, period=0.05, noise=[1e-4, 1e-4, 1e-4], bound=0.01)
 
-    def error(eta, delta, trial):
-        return rollout.simulate(with_controller(run, eta=eta, delta=delta), 3, trial).metrics.window_error
+    def error(eta, delta, k1, surface_rate, trial):
+        law = {"eta": eta, "delta": delta, "k1": k1, "surface_rate": surface_rate}
+        return rollout.simulate(with_controller(run, **law), 3, trial).metrics.window_error
 
     trials = jnp.arange(6, dtype=jnp.uint32)
-    point = (vector(4.5), vector(0.53))
+    point = (vector(4.5), vector(0.53), vector(1.2), vector(1.7))
     one = jax.jit(jax.vmap(lambda trial: error(*point, trial)))(trials)
     np.testing.assert_allclose(jax.jit(lanes.vmap(lambda trial: error(*point, trial)))(trials), one, rtol=1e-12)
     assert np.std(one) > 0.0
 
     value = jax.jit(error)
-    forward = jax.jit(jax.jacfwd(error, (0, 1)))(*point, trials[0])
+    forward = jax.jit(jax.jacfwd(error, (0, 1, 2, 3)))(*point, trials[0])
     for k, slope in enumerate(forward):
         h = 1e-6
         up, down = (value(*(p + s * h * (j == k) for j, p in enumerate(point)), trials[0]) for s in (1, -1))

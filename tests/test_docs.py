@@ -156,7 +156,7 @@ def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_p
 
 # --- docstrings ---
 
-PHYSICS = """attitude plants signals laws controllers baselines observers hardware sensors theory linear draws
+PHYSICS = """attitude plants signals laws controllers baselines observers hardware sensors theory hold linear draws
     dispersions clock""".split()
 ARRAYS = re.compile(r"\b(Array|Float|Int|Bool|UInt32|ndarray|ArrayLike|Leaf)\b")
 UNIT = re.compile(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, pace, rollout, scenario, sensors
+from ptsmc_jax import linear, montecarlo, pace, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, vector
@@ -23,7 +23,7 @@ BASE = {
     "dispersion": {"attitude": {"kind": "normal", "std_deg": 10.0}},
 }
 TUNED = {
-    "free": ["eta", "delta", "observer_gain", "k1", "sign_width", "t_f", "filter_bandwidth"],
+    "free": ["eta", "delta", "observer_gain", "k1", "sign_width", "surface_rate", "t_f", "filter_bandwidth"],
     "bounds": {"t_f": [6.0, 12.0], "delta": [0.2, 3.0], "filter_bandwidth": [0.05, 4.0]},
 }
 OTHERS = {
@@ -38,6 +38,7 @@ OTHERS = {
         "eta": 3.7,
         "k1": 2.0,
         "sign_width": 1e-2,
+        "surface_rate": 2.4,
         "filter_bandwidth": 2.0,
         "observer_gain": 4.0,
     },
@@ -152,6 +153,29 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
 
 
 @pytest.mark.parametrize(
+    ("period", "t_f", "expected"),
+    [
+        (0.05, 35.0, (0.2, 20.0)),
+        (None, 35.0, (0.2, 20.0)),
+        (0.5, 35.0, (0.02, 2.0)),
+        (0.05, 3500.0, (0.002, 2.0)),  # moved to hold the scenario's own, 1 1/s
+    ],
+)
+def test_default_bounds_of_the_surfaces_rate_go_with_t_f_and_end_at_half_of_the_sampled_loops_border(
+    period, t_f, expected
+):
+    loop = {"t_end": t_f + 10.0} if period is None else {"mode": "sampled", "period": period, "t_end": t_f + 10.0}
+    law = {"t_f": t_f, "delta": 0.5, "error": "multiplicative"}
+    made = from_tables({"controller": law, "loop": loop, "tune": {"free": ["surface_rate"]}})
+    assert made.tune is not None
+    np.testing.assert_allclose(made.tune.bounds["surface_rate"], expected)
+    if period is not None:  # the border itself, without K1 and the switching term
+        for c, stable in ((1.999 / period, True), (2.001 / period, False)):
+            kp, kd = linear.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
+            assert (linear.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
+
+
+@pytest.mark.parametrize(
     ("law", "gain", "value"),
     [
         ({"eta": 12.0}, "eta", 12.0),
@@ -159,6 +183,7 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
         ({"delta": 9.0}, "delta", 9.0),
         ({"delta": 0.02}, "delta", 0.02),
         ({"sign_width": 0.5, "delta": 0.5}, "sign_width", 0.5),
+        ({"surface_rate": 130.0}, "surface_rate", 130.0),
         ({"kind": "pd", "k_d": 40.0}, "k_d", 40.0),
         ({"kind": "terminal", "p": 1.98}, "p", 1.98),
         ({"kind": "fixed_time", "n": 0.97}, "n", 0.97),

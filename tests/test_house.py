@@ -30,6 +30,7 @@ FLOORS = {
         lanes
         kernel
         theory linear
+        hold
         requirements
         dispersions
         values systems

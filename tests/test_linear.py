@@ -15,7 +15,7 @@ from tests.helpers import FIRST_FLIGHT, parts, vector
 @pytest.mark.parametrize("t", [3.0, 18.9, 19.6])
 def test_gains_are_the_slopes_of_the_law(t):
     """Acceleration of eps by eps and eps' at the reference, by automatic differentiation of the closed loop."""
-    run = parts(20.0, 3.4, 1.0, inertia=(10.0,) * 3, k1=1.7, sign_width=0.05)
+    run = parts(20.0, 3.4, 1.0, inertia=(10.0,) * 3, k1=1.7, sign_width=0.05, surface_rate=2.3)
     law, k2 = run.controller, vector(0.02)
     hold = jnp.asarray(t >= 19.0)
 
@@ -26,7 +26,7 @@ def test_gains_are_the_slopes_of_the_law(t):
 
     by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))
     slope = np.sqrt(3.0) / 10.0 * 0.02 / 0.05
-    kp, kd = (float(v) for v in linear.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope))
+    kp, kd = (float(v) for v in linear.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope, 2.3))
     np.testing.assert_allclose(by_error, -kp * np.eye(3), atol=1e-9 * kp)
     np.testing.assert_allclose(by_rate, -kd * np.eye(3), atol=1e-9 * kd)
 
@@ -66,7 +66,7 @@ def test_margins_end_where_the_loop_does():
     run = dataclasses.replace(run, actuators=hardware.Actuators(delay=1))
     for name, at in linear.margins(run).items():
         tau = 0.55 if name == "hand_over" else 0.0
-        kp, kd = (float(v) for v in linear.gains(np.asarray(20.0 - tau), 20.0, 3.0, 0.5, 1.0, 0.0))
+        kp, kd = (float(v) for v in linear.gains(np.asarray(20.0 - tau), 20.0, 3.0, 0.5, 1.0, 0.0, 1.0))
         assert at.radius == linear.radius(kp, kd, 0.05, 1.0) < 1.0
         for share in (0.999, 1.001):
             assert (linear.radius(share * at.gain * kp, share * at.gain * kd, 0.05, 1.0) < 1.0) == (share < 1)

@@ -46,8 +46,8 @@ def test_disturbance_too_fast_for_the_sampled_loop_is_refused():
     "key",
     """controller.t_f controller.eta controller.delta controller.k1 controller.sign_width loop.t_end loop.window
     controller.disturbance_rate_bound controller.initial_estimate_error loop.period loop.settling_angle
-    spacecraft.inertia observer.gain disturbance.amplitude disturbance.frequency disturbance.phase initial.rate
-    initial.rotvec_deg initial.mrp""".split(),
+    controller.surface_rate spacecraft.inertia observer.gain disturbance.amplitude disturbance.frequency
+    disturbance.phase initial.rate initial.rotvec_deg initial.mrp""".split(),
 )
 @pytest.mark.parametrize("mode", ["continuous", "sampled"])
 @pytest.mark.parametrize("size", ["1e300", "1e-300"])
@@ -188,6 +188,7 @@ t_f = 20.0
 eta = 4.0
 delta = 0.5
 k1 = 1.5
+surface_rate = 2.5
 sign_width = 2e-3
 disturbance_rate_bound = 3e-3
 initial_estimate_error = 4e-3
@@ -233,6 +234,7 @@ def test_every_key_reaches_its_part():
         (parts.controller.eta, 4.0),
         (parts.controller.delta, 0.5),
         (parts.controller.k1, 1.5),
+        (parts.controller.surface_rate, 2.5),
         (parts.controller.sign_width, 2e-3),
         (parts.observer.disturbance_rate_bound, 3e-3),
         (parts.observer.initial_error, 4e-3),
@@ -286,7 +288,7 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
     parts = study(
         scenario,
-        reach=Reach(30.0, 35.0, delta=4.0, smallest_delta=0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3),
+        reach=Reach(30.0, 35.0, 4.0, 0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3, surface_rate=1.0),
     ).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
         ticks = parts.clock.ticks(vector(t_f), vector(delta))
@@ -411,6 +413,7 @@ def valid_scenarios(draw):
         "settling_angle": numbers(1e-9, 1.0),
     }
     gains = {"eta": numbers(2.01, 9.0), "k1": numbers(1e-9, 9.0), "sign_width": numbers(0.0, 1.0)}
+    gains["surface_rate"] = numbers(1e-9, 9.0)
     tables = {
         "spacecraft": st.fixed_dictionaries(
             {"inertia": st.one_of(MOMENTS, TENSORS.map(lambda tensor: ((tensor + tensor.T) / 2).tolist()))}

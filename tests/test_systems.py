@@ -60,7 +60,9 @@ def as_system(run, reference):
     return replace(
         run,
         plant=model,
-        controller=controllers.PrescribedTimeSystem(model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width),
+        controller=controllers.PrescribedTimeSystem(
+            model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width, law.surface_rate
+        ),
         observer=replace(run.observer, model=model),
         reference=signals.Now(),
         initial=jnp.concatenate([error, run.initial.w]),
@@ -71,7 +73,7 @@ def as_system(run, reference):
 @pytest.mark.parametrize("seed", range(4))
 def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derived_by_hand(seed, hold):
     rng = np.random.default_rng(seed)
-    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1)
+    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1, surface_rate=1.3)
     own = as_system(run, SPIN)
     q = rng.normal(size=4)
     q[3] = abs(q[3]) + 0.5

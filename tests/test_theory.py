@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax import clock, observers, rollout, signals, theory
+from ptsmc_jax import clock, hold, observers, rollout, signals, theory
 from tests.helpers import FULL_INERTIA, PAPER_ATTITUDE, chain_parts, parts, vector, with_controller
 
 
@@ -114,6 +114,8 @@ SPACECRAFT = st.fixed_dictionaries(
         "frequency": st.floats(0.01, 10.0),
         "phase": st.floats(-3.0, 3.0),
         "sharp": st.floats(0.01, 1.0),
+        "k1": st.floats(0.2, 4.0),
+        "surface_rate": st.floats(0.1, 2.0),
     }
 )
 
@@ -121,7 +123,7 @@ SPACECRAFT = st.fixed_dictionaries(
 @settings(max_examples=320, deadline=None, derandomize=True, database=None)
 @given(case=SPACECRAFT)
 def test_spacecraft_stays_inside_the_corrected_bounds(case):
-    """(55) with sqrt(3) c and l_m of a full inertia; (32) and (20) with what the smooth sign leaves."""
+    """(55) with sqrt(3) c and l_m of a full inertia; (32), (20) and (23) with what the smooth sign leaves."""
     rng = np.random.default_rng(case["seed"])
     body, t_f = random_body(rng), case["t_f"]
     axis = rng.normal(size=3)
@@ -140,8 +142,9 @@ def test_spacecraft_stays_inside_the_corrected_bounds(case):
     # the boundary layer's rate times the largest step stays below 1.2
     layer = float(run.controller.switching_rate(jnp.maximum(bound.start, bound.floor))) * t_f
     width = max(layer * 1.5 * t_f / 600 / 1.2 / case["sharp"], 1e-9)
-    grid = clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 600), jnp.zeros(0), 600, 100)
-    run = dataclasses.replace(with_controller(run, sign_width=vector(width)), observer=observer, clock=grid)
+    grid = clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 600), jnp.zeros(0), 600, 400)
+    law = {"sign_width": vector(width), "k1": vector(case["k1"]), "surface_rate": vector(case["surface_rate"])}
+    run = dataclasses.replace(with_controller(run, **law), observer=observer, clock=grid)
     result = rollout.simulate_jit(run, record=True)
     assert int(result.status) == rollout.OK
     log = jax.tree.map(np.asarray, result.log)
@@ -153,6 +156,11 @@ def test_spacecraft_stays_inside_the_corrected_bounds(case):
     assert np.all(size <= theory.sliding_bound(run, t) * (1 + 1e-6) + 1e-9 * size.max())
     error = np.linalg.norm(log.error[before], axis=1)
     assert np.all(error <= theory.error_bound(run, t) * (1 + 1e-6) + 1e-9)
+    # after it steps of at most 0.06 s take (2 0.06)^5 / 120 of what decays, 400 times
+    later, t = ~before, log.t[~before]
+    size, error = (np.linalg.norm(v[later], axis=1) for v in (log.s, log.error))
+    assert np.all(size <= hold.sliding_bound(run, t) * (1 + 1e-4) + 1e-9)
+    assert np.all(error <= hold.error_bound(run, t) * (1 + 1e-4) + 1e-9)
 
 
 def slew(seed, eta, t_f):
@@ -222,17 +230,29 @@ def test_residual_error_is_what_a_constant_disturbance_leaves():
     np.testing.assert_allclose(log.x[np.argmax(log.t >= 30.0), 0], at_t_f, rtol=0.25)  # the hold law acts meanwhile
 
 
-def test_hold_floor_is_what_an_axis_holds():
-    """Rule 3.7: a ramp of the disturbance leaves d'/(l (K1 + |T J^-1| K2/width)) in the end."""
+@pytest.mark.parametrize("rate", [1.0, 2.5])
+def test_hold_floor_is_what_an_axis_holds(rate):
+    """Rule 3.7: a ramp of the disturbance leaves d'/(l c (K1 + |T J^-1| K2/width)) in the end."""
     ramp = 2e-5
     gain, width = 20.0, 0.05
     wave = signals.Sinusoid(*(vector([v] * 3) for v in (ramp / 1e-3, 1e-3, 0.0, 0.0)))
     run = parts(
-        10.0, 3.0, 0.5, gain, inertia=(10.0,) * 3, disturbance=wave, rate_bound=ramp, sign_width=width, t_end=60.0
+        10.0,
+        3.0,
+        0.5,
+        gain,
+        inertia=(10.0,) * 3,
+        disturbance=wave,
+        rate_bound=ramp,
+        sign_width=width,
+        t_end=60.0,
+        surface_rate=rate,
     )
     log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True).log)
     switching = float(np.sqrt(3.0) / 10.0 * run.observer.error_bound().floor)
-    expected = theory.hold_floor(vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width))
+    expected = theory.hold_floor(
+        vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate)
+    )
     np.testing.assert_allclose(np.abs(log.error[-1]), expected, rtol=2e-2)  # cos(1e-3 t) is not yet a ramp's
 
 

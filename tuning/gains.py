@@ -19,7 +19,15 @@ from ptsmc_jax.rollout import Parts
 from ptsmc_jax.sensors import Sensors
 from ptsmc_jax.tables import Scenario
 
-_STATE_UNITS = {"eta": "-", "delta": "s", "observer_gain": "1/s", "k1": "1/s", "sign_width": "x1", "t_f": "s"}
+_STATE_UNITS = {
+    "eta": "-",
+    "delta": "s",
+    "observer_gain": "1/s",
+    "k1": "1/s",
+    "sign_width": "x1",
+    "surface_rate": "1/s",
+    "t_f": "s",
+}
 # gain: unit, by the kind of the plant
 UNITS = {
     "spacecraft": {
@@ -28,6 +36,7 @@ UNITS = {
         "observer_gain": "N m s",
         "k1": "1/s",
         "sign_width": "-",
+        "surface_rate": "1/s",
         "t_f": "s",
         "filter_bandwidth": "rad/s",
         "k_p": "1/s^2",
@@ -106,7 +115,7 @@ def _check_clock(parts: Parts) -> None:
 def gains_of(parts: Parts) -> dict[str, float]:
     """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
     controller = parts.controller
-    law = [name for name in controller.free if name not in ("k1", "sign_width", "t_f")]
+    law = [name for name in controller.free if name not in ("k1", "sign_width", "surface_rate", "t_f")]
     gains = {name: float(getattr(controller, name)) for name in law}
     each = [float(v) for v in getattr(parts.observer, "gain", ())]
     if each:
@@ -145,7 +154,8 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     delta is a period or more, and half of t_f or less where a period is.
     """
     shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
-    gains = {"eta": 3.0, "delta": max(min(0.05, 0.5 * scenario.controller.t_f), shortest), "k1": 1.0}
+    delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
+    gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "surface_rate": 1.0}
     if isinstance(scenario.plant, plant_tables.ChainPlant):
         gains["eta"] = scenario.plant.order + 1.0
     papers = isinstance(scenario.observer, law_tables.NonlinearObserver | law_tables.EachNonlinearObserver)

@@ -287,6 +287,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
         largest_gain=largest_gain,
         k1=interval("k1", own.k1)[1],
         sign_width=interval("sign_width", own.sign_width)[0],
+        surface_rate=interval("surface_rate", own.surface_rate)[1],
     )
 
 

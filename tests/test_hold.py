@@ -1,0 +1,121 @@
+"""After the hand-over: runs of every order and both error laws against the closed form, and its slopes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import clock, controllers, hold, rollout, signals, theory
+from tests.helpers import FULL_INERTIA, chain_parts, parts, vector
+
+QUIET = signals.Constant(jnp.zeros(3))
+AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
+SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
+# c, and the rate toward the surface: slower, the same (the root repeats), faster
+RATES = [(0.3, 1.1), (1.0, 1.0), (1.0, 0.5), (2.5, 2.5), (2.5, 0.7)]
+GRID = (4000, 800)
+
+
+def flown(law, c, k):
+    """A run without disturbance or switching from 2 s before t_f = 10 s, where much is left to do; one program."""
+    t_end = 12.0
+    grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
+    if isinstance(law, int):
+        run = chain_parts([1.0, -0.5, 0.3][:law], 10.0, law + 1.0, 2.0, k1=k, surface_rate=c)
+    else:  # K1/2 is what acts
+        run = parts(10.0, 3.0, 2.0, inertia=FULL_INERTIA, q=AWAY, reference=SPIN, disturbance=QUIET, rate_bound=0.0,
+                    k1=2 * k, surface_rate=c, law=law, t_end=t_end)  # fmt: skip
+    return replace(run, clock=grid)
+
+
+@jax.jit
+def exact(run, t):
+    """Error and s of the closed forms, before the hand-over and on from there."""
+    law = run.controller
+
+    def component(x0):
+        at = theory.exact_chain(law.hand_over, law.t_f, law.eta, x0).x
+        moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate(), at))(t - law.hand_over)
+        return moved.x[:, 0], moved.s, moved.acceleration
+
+    return jax.vmap(component, out_axes=1)(theory.starts(run))
+
+
+@pytest.mark.parametrize(("c", "k"), RATES)
+@pytest.mark.parametrize(
+    "law", [controllers.PrescribedTime, controllers.PrescribedTimeMultiplicative, 2, 3],
+    ids=["additive", "multiplicative", "chain of order 2", "chain of order 3"],
+)  # fmt: skip
+def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
+    """From t = 0 on in closed form. RK4 leaves below 1e-11: its steps are an eighth of the default grid's."""
+    run = flown(law, c, k)
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True))
+    after = result.log.t >= 8.0
+    error = result.log.x[:, :1] if isinstance(law, int) else result.log.error
+    wanted, s, acceleration = (np.asarray(v) for v in exact(run, vector(result.log.t[after])))
+    assert np.abs(wanted[0]).max() > 5e-3  # something is left at the hand-over
+    np.testing.assert_allclose(error[after], wanted, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(result.log.s[after], s, rtol=0, atol=1e-10)
+    if isinstance(law, int):
+        np.testing.assert_allclose(result.log.u[after], acceleration, rtol=0, atol=1e-9)  # gains of up to 20
+
+
+@pytest.mark.parametrize(("c", "k"), [*RATES, (1.0, 1.0 + 1e-9)])
+def test_order_two_by_hand(c, k):
+    t, x, x_dot = np.array([0.0, 0.3, 2.0, 30.0]), 0.7, -1.9
+    s = x_dot + c * x
+    between = t * np.exp(-c * t) if abs(c - k) < 1e-6 else (np.exp(-k * t) - np.exp(-c * t)) / (c - k)
+    for time, expected in zip(t, np.exp(-c * t) * x + s * between, strict=True):
+        found = hold.exact_hold(vector(time), vector([c]), vector(k), vector([x, x_dot]))
+        np.testing.assert_allclose(found.x[0], expected, rtol=1e-7 if 0 < abs(c - k) < 1e-6 else 1e-12, atol=1e-14)
+        np.testing.assert_allclose(found.s, s * np.exp(-k * time), rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(
+            found.acceleration, -(c + k) * found.x[1] - c * k * found.x[0], rtol=1e-12, atol=1e-15
+        )
+
+
+def test_surface_of_a_chain_at_another_rate_has_its_poles_times_that():
+    a = [2.0, 3.0, 1.7]
+    law = chain_parts([1.0] * 4, a=a, surface_rate=2.5).controller
+    found = np.sort_complex(controllers.surface_roots(law.surface()))
+    np.testing.assert_allclose(found, np.sort_complex(2.5 * controllers.surface_roots(a)), rtol=1e-12)
+    np.testing.assert_array_equal(chain_parts([1.0] * 4, a=a).controller.surface(), a)  # the paper's, to the last bit
+    assert law.hold_rates()["surface_rate"] == pytest.approx(np.abs(found).max())
+
+
+def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
+    """RMS of the error over the window, from rest at the paper's attitude: also where the two rates are the same."""
+    late = np.linspace(10.0, 11.0, 401)
+
+    def expected(run, c):
+        run = replace(run, controller=replace(run.controller, surface_rate=c))
+        square = jnp.sum(exact(run, vector(late))[0] ** 2, axis=1)
+        return jnp.sqrt(jnp.trapezoid(square, vector(late)))
+
+    def measured(run, c):
+        run = replace(run, controller=replace(run.controller, surface_rate=c))
+        return rollout.simulate(run).metrics.window_error
+
+    value, slope = jax.jit(measured), jax.jit(jax.jacfwd(measured, 1))
+    for c, k in ((1.0, 1.0), (2.5, 0.7)):
+        run, at, h = flown(controllers.PrescribedTime, c, k), vector(c), 1e-5
+        forward = float(slope(run, at))
+        # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
+        np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
+        difference = (float(value(run, at + h)) - float(value(run, at - h))) / (2 * h)
+        np.testing.assert_allclose(forward, difference, rtol=1e-8)  # h^2 and rounding 1e-16 / h beside a slope of 0.01
+
+
+def test_envelopes_after_the_hand_over_are_not_empty():
+    """Where nothing pushes they fall as the run does, some times what is flown: the sign of s is not made use of."""
+    run = flown(2, 2.5, 0.7)
+    log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True).log)
+    t = log.t[log.t >= 8.0]
+    for size, bound in (
+        (np.abs(log.s[-t.size :, 0]), hold.sliding_bound(run, t)),
+        (np.abs(log.x[-t.size :, 0]), hold.error_bound(run, t)),
+    ):
+        ratio = size / bound
+        assert 0.1 < ratio[-1] <= ratio.max() <= 1.0
