@@ -19,6 +19,7 @@ from ptsmc_jax import (
     observers,
     plant_tables,
     plants,
+    scales,
     signal_tables,
     signals,
 )
@@ -143,7 +144,7 @@ def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
     if not filtered and all(noise is None for noise in noises):
         return None
     star, every = table.attitude_noise or 0.0, table.star_tracker_every or 1
-    gyro = free_gains.gyro_noise(table, period)
+    gyro = scales.gyro_noise(table, period)
     walk = table.rate_bias_walk
     estimator = None
     if isinstance(scenario.filter, device_tables.SteadyStateFilter):

@@ -5,7 +5,7 @@ import math
 import msgspec
 import numpy as np
 
-from ptsmc_jax import device_tables, law_tables, plant_tables, schema, sensors, tables
+from ptsmc_jax import device_tables, law_tables, plant_tables, scales, schema, sensors, tables
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
@@ -37,12 +37,9 @@ def filter_bandwidth(scenario: Scenario) -> float:
         return scenario.filter.bandwidth
     table, period = scenario.hardware, scenario.loop.period
     assert isinstance(table, device_tables.Hardware)
-    return sensors.best_bandwidth(table.attitude_noise or 0.0, gyro_noise(table, period), period, _interval(scenario))
-
-
-def gyro_noise(table: device_tables.Hardware, period: float) -> float:
-    """Noise of the gyro, 1 sigma a sample [rad/s]."""
-    return table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
+    return sensors.best_bandwidth(
+        table.attitude_noise or 0.0, scales.gyro_noise(table, period), period, _interval(scenario)
+    )
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:

@@ -37,7 +37,8 @@ def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: 
 
     x(t) = e^(A t) x(0) with A of `hold_matrix`, whose roots may repeat. For order 2, of each component of the error:
     s(t) = s(0) e^(-k t), s(0) = x'(0) + c x(0), and x(t) = e^(-c t) x(0) + s(0) (e^(-k t) - e^(-c t)) / (c - k), where
-    k = c: s(0) t e^(-c t); c is the `surface_rate`, k = K1/2 for a spacecraft.
+    k = c: s(0) t e^(-c t); c is the `surface_rate` and k = K1/2 for a spacecraft. after [s]; x in the states' own
+    units; surface and rate as `hold_matrix` has them.
 
     From rest at 1, with c = k = 2 1/s, half a second later (1 + 2 0.5) e^(-1) is left:
 

@@ -24,7 +24,7 @@ class SurfaceGains(NamedTuple):
 
 
 def surface_roots(a: Any) -> np.ndarray:
-    """The n-1 roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s]: how the error moves on a surface (39)."""
+    """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
     return np.roots([1.0, *reversed([float(v) for v in a])])
 
 

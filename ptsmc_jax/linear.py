@@ -96,6 +96,20 @@ def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = 
     return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - float(anchored)) * h)
 
 
+def largest_reaching(surface: float, late: float = 0.0) -> float:
+    """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
+
+    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. late: delay in periods.
+    The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
+    a period whatever the loop does, as long as it knows the torque that acts.
+    """
+
+    def stable(reaching: float) -> bool:
+        return radius(surface * reaching, surface + reaching, 1.0, late) < 1.0
+
+    return _last(stable, 1e-6, 4.0) if stable(1e-6) else 0.0
+
+
 @dataclass(frozen=True)
 class Margins:
     """Of the frozen loop at one instant."""

@@ -156,8 +156,8 @@ def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_p
 
 # --- docstrings ---
 
-PHYSICS = """attitude plants signals laws controllers baselines observers hardware sensors theory hold linear draws
-    dispersions clock""".split()
+PHYSICS = """attitude plants signals laws controllers baselines observers hardware sensors theory hold linear
+    scales draws dispersions clock""".split()
 ARRAYS = re.compile(r"\b(Array|Float|Int|Bool|UInt32|ndarray|ArrayLike|Leaf)\b")
 UNIT = re.compile(
     r"\[[^][]+\]|in the (?:states'|inputs'|states' own|inputs' own) units|in the units of|unit quaternion", re.I

@@ -38,7 +38,7 @@ FLOORS = {
         tables
         layouts
         schema
-        attitude_keys
+        attitude_keys scales
         free_gains
         checks
         build

@@ -1,0 +1,140 @@
+"""Dimensionless gains, and between which values gains matter and are stable, against draws and loops by hand."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import attitude, linear, observers, plants, scales, scenario
+from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.signals import Target
+from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, parts, vector
+
+ARM = {"plant": {"kind": "system", "system": plants.system(
+    1, F=lambda t, x, v: v, H=lambda t, x, v: 0.0 * x, G=lambda t, x, v: jnp.eye(1)), "x0": [1.0, 0.0]}}  # fmt: skip
+
+
+def flight(**changes):
+    return scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **changes)
+
+
+@pytest.mark.parametrize("inertia", [[10.0, 12.0, 14.0], [list(row) for row in FULL_INERTIA]])
+def test_a_dead_beat_observer_leaves_what_it_says_of_the_slowest_error(inertia):
+    """E of the observer that flies, its largest eigenvalue; per axis where the axes are principal ones."""
+    gain = scales.dead_beat_gain(flight(spacecraft__inertia=inertia))
+    body = plants.spacecraft(inertia)
+    observer = observers.NonlinearObserver(body, vector([gain] * 3), vector(1e-3), vector(0.0))
+    kept = np.abs(np.linalg.eigvals(np.eye(3) - 0.05 * np.asarray(observer.update_matrix(vector(0.05)))))  # of I - E
+    np.testing.assert_allclose(kept.max(), 5e-5, rtol=1e-8)  # rounding of 1 beside 5e-5
+    found = scales.observer_decay(flight(spacecraft__inertia=inertia, observer__gain=[3.0, 40.0, gain]))
+    np.testing.assert_allclose(found, np.array([3.0, 40.0, gain]) * np.diag(body.inertia_inverse) * 0.05)
+    if inertia[0] == 10.0:
+        np.testing.assert_allclose(found[2], math.log(2e4))  # 9.9
+    assert np.all(scales.observer_decay(flight(observer={"kind": "none"})) == 0.0)
+
+
+def growth(c, k, late, keep=0.6, period=1.0):
+    """A period's growth of an axis under the hold law, sampled, late by whole periods, with the digital observer."""
+    state, estimate = np.array([1.0, 0.3]), 0.0
+    commands, sizes = [0.0] * late, []
+    for _ in range(3000):
+        s = state[1] + c * state[0]
+        commands.append(-c * state[1] - k * s - estimate)
+        acts, before = commands.pop(0), state[1]
+        a = acts + 0.2  # what the observer has to find
+        state = np.array([state[0] + period * state[1] + period**2 / 2 * a, state[1] + period * a])
+        estimate = keep * estimate + (1 - keep) * ((state[1] - before) / period - acts)
+        sizes.append(np.abs(state).sum())
+    late_on = np.log(np.array(sizes[-1500:]) + 1e-300)
+    return np.polyfit(np.arange(1500), late_on, 1)[0]
+
+
+@pytest.mark.parametrize("late", [0, 1, 2])
+@pytest.mark.parametrize("surface", [0.02, 0.1, 0.25])
+def test_border_of_the_hold_phase_is_where_a_loop_stepped_by_hand_begins_to_grow(surface, late):
+    """With the observer in the loop, which the border leaves out; what a constant disturbance leaves is a constant."""
+    border = linear.largest_reaching(surface, float(late))
+    inside, outside = growth(surface, 0.98 * border, late), growth(surface, 1.02 * border, late)
+    assert inside < 1e-6 < 1e-3 < outside
+    # the two rates may change places
+    np.testing.assert_allclose(linear.largest_reaching(border, float(late)), surface, rtol=1e-6)
+    if late == 0:
+        np.testing.assert_allclose(border, 2.0 - surface, rtol=1e-9)
+
+
+def test_largest_k1_is_twice_the_border_for_a_spacecraft_and_none_beyond_it():
+    np.testing.assert_allclose(scales.largest_k1(flight()), 2.0 * (2.0 / 0.05 - 1.0), rtol=1e-9)
+    late = flight(hardware__delay=1, controller__surface_rate=3.0)
+    np.testing.assert_allclose(scales.largest_k1(late), 2.0 * linear.largest_reaching(0.15, 1.0) / 0.05)
+    assert scales.largest_k1(flight(controller__surface_rate=41.0)) == 0.0
+    loop = {"mode": "sampled", "period": 0.05}
+    for plant in ({"kind": "chain", "order": 2}, ARM["plant"]):
+        other = scenario.from_tables({"plant": plant, "loop": loop})
+        np.testing.assert_allclose(scales.largest_k1(other), 2.0 / 0.05 - 1.0, rtol=1e-9)
+    with pytest.raises(ValueError, match="order 2, not for 3"):
+        scales.largest_k1(scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": loop}))
+
+
+@pytest.mark.parametrize("rate", [0.3, 1.0, 6.0])
+def test_noise_of_s_is_that_of_drawn_samples(rate):
+    """20 000 samples of a body on its reference: 1 sigma to 1/(2 20 000)^(1/2), 0.5 %, three times that allowed."""
+    table = flight(controller__surface_rate=rate, hardware__attitude_noise=2e-5, hardware__rate_noise=1e-5)
+    law, normals = parts(20.0, surface_rate=rate).controller, np.random.default_rng(1).normal(size=(20_000, 6))
+    rest = Target(vector(0.0, 0.0, 0.0, 1.0), jnp.zeros(3), jnp.zeros(3))
+
+    def s(n):
+        q = attitude.multiply(rest.q, attitude.from_rotation_vector(2e-5 * n[:3]))
+        seen = AttitudeState(q, 1e-5 * n[3:])
+        return law.torque(vector(25.0), jnp.asarray(True), seen, rest, jnp.zeros(3), vector(0.0))[1]
+
+    found = np.std(np.asarray(jax.vmap(s)(vector(normals))), axis=0)
+    np.testing.assert_allclose(found, scales.noise_of_s(table), rtol=0.015)
+
+
+def test_noise_of_s_of_a_chain_has_the_surfaces_weights():
+    """S = x_3 + 2 c x_2 + c^2 x_1 with c = 3: (9 4e-4, 6 3e-4, 1e-3)."""
+    tables = {
+        "plant": {"kind": "chain", "order": 3},
+        "controller": {"surface_rate": 3.0},
+        "loop": {"mode": "sampled"},
+        "hardware": {"state_noise": [4e-4, 3e-4, 1e-3]},
+    }
+    expected = math.sqrt(3.6e-3**2 + 1.8e-3**2 + 1e-3**2)
+    np.testing.assert_allclose(scales.noise_of_s(scenario.from_tables(tables)), expected)
+    assert scales.noise_of_s(scenario.from_tables({})) == 0.0
+
+
+def test_mean_slope_of_a_noisy_smooth_sign():
+    """Against 400 000 draws by central differences, and its two limits."""
+    noise, draws = 2.0, 2.0 * np.random.default_rng(2).normal(size=400_000)
+    for width in (0.7, 2.0, 9.0):
+        step = 0.05
+        drawn = np.mean(np.tanh((draws + step) / width) - np.tanh((draws - step) / width)) / (2 * step)
+        np.testing.assert_allclose(scales.smooth_slope(width, noise), drawn, rtol=0.01)  # 1.5 / 400 000^(1/2), and more
+    np.testing.assert_allclose(scales.smooth_slope(1e5, noise), 1e-5, rtol=1e-8)
+    np.testing.assert_allclose(scales.smooth_slope(1e-5, noise), math.sqrt(2 / math.pi) / noise, rtol=1e-8)
+    for other in (1.0 - 1e-9, 1.0 + 1e-9):  # where the grid changes
+        np.testing.assert_allclose(scales.smooth_slope(other, 1.0), scales.smooth_slope(1.0, 1.0), rtol=1e-7)
+
+
+def test_between_the_widths_that_matter_the_slope_changes_and_outside_it_does_not():
+    noise, k1, switching = 3e-6, 1.5, 4e-3
+    narrow, wide = scales.widths_that_matter(switching, k1, noise)
+    exact = math.sqrt(2 / math.pi) / noise
+    # the next term of the share is (width / noise)^4: a seventh of it at 5 %
+    np.testing.assert_allclose(1.0 - scales.smooth_slope(narrow, noise) / exact, 0.05, rtol=0.2)
+    np.testing.assert_allclose(switching * scales.smooth_slope(wide, noise) / k1, 0.05, rtol=1e-3)
+    assert narrow < wide
+
+
+def test_units_of_the_gains():
+    found = scales.units(flight())
+    noise = 0.5 * math.hypot(1e-6, 2e-5)
+    expected = {"delta": 0.05, "observer_gain": 280.0, "k1": 20.0, "surface_rate": 20.0, "sign_width": noise}
+    assert found == pytest.approx(expected)
+    quiet = flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)
+    assert set(scales.units(quiet)) == set(expected) - {"sign_width"}
+    with pytest.raises(ValueError, match="a system of one's own"):
+        scales.units(scenario.from_tables(ARM))
