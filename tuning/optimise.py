@@ -181,7 +181,8 @@ def search(
 
 def _planned(problem: Problem, starts: int, steps: int, again: int, *, exact: bool) -> tuple[dict, dict]:
     """What each step of a search flies at most, in rollouts, and each of a further round; see `Work`."""
-    trials, sloped = problem.trials.size, SLOPED * problem.trials.size
+    trials = float(problem.trials.size)
+    sloped = SLOPED * trials
     settling = {SPREADING: SPREAD * trials} if exact else {}
     settling[REFINING] = GENERATIONS * WIDELY[0] * trials
     first = {CHOOSING: starts * CANDIDATES * trials, SEARCHING: starts * (steps + 1) * sloped}
