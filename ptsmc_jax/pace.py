@@ -141,7 +141,7 @@ def _nutation(scenario: Scenario, parts: Parts) -> dict[str, float]:
 
 def _impulse(scenario: Scenario) -> float:
     """What constant and sinusoidal disturbances add up to at most until t_end [N m s]."""
-    end, found = scenario.loop.t_end, 0.0
+    end, found = float(scenario.loop.t_end or 0.0), 0.0
     for term in checks.terms(scenario):
         swing, frequency, bias = (np.abs(getattr(term, key, (0.0,))) for key in ("amplitude", "frequency", "bias"))
         lasting = np.minimum(end, 2.0 / np.maximum(frequency, 1e-12))

@@ -23,7 +23,9 @@ def test_probability_is_the_verdicts_over_shares_that_the_count_allows(requireme
     """The share integrated out by brute force: Bayes with a uniform prior on a grid, then the verdict's binomial."""
     share = (np.arange(20_000) + 0.5) / 20_000
     weight = binom.pmf(beyond, 4096, share)
-    most = 1000 - least_within(1000, requirement.quantile, requirement.confidence)
+    least = least_within(1000, requirement.quantile, requirement.confidence)
+    assert least is not None
+    most = 1000 - least
     expected = np.sum(weight * binom.cdf(most, 1000, share)) / np.sum(weight)
     # the grid's step of 5e-5 beside a share that is known to 2e-4: the midpoint rule leaves some 1e-3 of that
     np.testing.assert_allclose(confirm.probability(requirement, 1000, 4096, beyond), expected, rtol=2e-3)

@@ -164,7 +164,7 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
         for q, w, h in zip(log.x.q, log.x.w, log.wheels[0], strict=True)
     ]
     # RK4's own: (0.025 rad)^5 / 120 a step at most, of the part of the momentum that turns
-    np.testing.assert_allclose(total, np.tile(total[0], (len(total), 1)), atol=1e-10 * np.linalg.norm(total[0]))
+    np.testing.assert_allclose(total, np.tile(total[0], (len(total), 1)), atol=1e-10 * float(np.linalg.norm(total[0])))
     q, h = wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals := 80)
     off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
     assert off.magnitude() < 1e-9

@@ -314,7 +314,9 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
 
 def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
     scenario = from_tables(tomllib.loads(SAMPLED + "loop.period = 0.5\ncontroller = { t_f = 6e4, delta = 1.0 }"))
-    reach = Reach(6e4, 12e4, delta=1.0, smallest_delta=1.0, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3)
+    reach = Reach(
+        6e4, 12e4, delta=1.0, smallest_delta=1.0, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3, surface_rate=1.0
+    )
     assert 120_020 <= pace.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
     with pytest.raises(ScenarioError) as caught:
         study(scenario, reach=reach)

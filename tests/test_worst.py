@@ -9,7 +9,7 @@ import pytest
 
 from ptsmc_jax import clock, dispersions, signals
 from ptsmc_jax.requirements import Requirement
-from tests.helpers import parts, vector
+from tests.helpers import parts, small_search, vector
 from tuning import objective, optimise, worst
 from tuning.bounds import Bounds
 from tuning.evaluate import Evaluator
@@ -125,10 +125,11 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
 
-def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin():
+def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     """With a quantile no single trial counts: `robust` finds nothing to do."""
     spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
     problem, wanted = posed(spread, Requirement("peak_torque", 1.9, quantile=0.9))
+    small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 1, 1, 0, robust=True)
     assert found.margin == optimise.MARGIN
@@ -142,7 +143,8 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
     roomy = optimise._with_room(problem)
     assert roomy.trials.size == 8 + optimise.SPARE
-    given = optimise._add(roomy, 0, np.asarray([7]), {name: v.tolist() for name, v in own.items()})
+    drawn = {name: v.tolist() for name, v in own.items()}
+    given = optimise._add(roomy, 0, optimise.Joining(np.asarray([7]), np.array([True]), drawn))
     at = vector([3.2, 0.9])
     measure = jax.jit(objective.measure)
     f, c, _ = measure(more, at)
@@ -158,7 +160,8 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
     joined = 0
     for count in (8, 3, 8, 1):
         new = np.arange(200 + joined, 200 + joined + count)
-        problem, joined = optimise._add(problem, joined, new), joined + count
+        more = optimise.Joining(new, np.array([True]))
+        problem, joined = optimise._add(problem, joined, more), joined + count
         # the last 16 of those screened first and those that joined since, in whatever order
         kept = [*range(100, 108), *range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)
