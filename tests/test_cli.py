@@ -562,7 +562,7 @@ def test_bash_completes_commands_and_options(command, tmp_path):
     (tmp_path / "complete.sh").write_text(script)
     asked = """
 source complete.sh
-for words in "mo" "tune --gl" "convert-attitude --mr" "replay --tr"; do
+for words in "mo" "tune --gl" "convert-attitude --mr" "replay --tri"; do
   COMP_WORDS=(ptsmc $words); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMPREPLY=()
   _ptsmc; echo "${COMPREPLY[@]}"
 done
