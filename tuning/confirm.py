@@ -24,7 +24,7 @@ class Count:
     beyond: int
     allowed: int | None  # of them; None: even with none the verdict would not be sure
     probability: float  # that the verdict on fresh trials is met
-    harder: np.ndarray  # trials beyond the limit, nearest to it first, without the `allowed` farthest
+    harder: np.ndarray  # trials beyond the limit but for the `allowed` farthest, the farthest of these first
 
     @property
     def held(self) -> bool:
