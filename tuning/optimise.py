@@ -109,7 +109,7 @@ def search(
     A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
     screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
     not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
-    on others after each search: where too many break it, the hardest of those not allowed to join, and keep it. own:
+    on others after each search: where more of them break it than may, the hardest of the rest join. own:
     (gains,) the scenario's gains, the first start. exact: what is found goes on under the exact sign, see `Run.settle`.
     judged: say how hard the worst case is. report is called after every step. Interrupted, it returns the best so far
     once there is one.
