@@ -31,17 +31,21 @@ def main() -> None:
     posed = report.pose(loaded, 0)
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
     for seed in range(first, end):
-        started, before = time.monotonic(), evaluate.gradients
+        started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
         one = optimise.search(evaluate, problem, ready.requirements, own, table.starts, table.steps, seed,
-                              exact=posed.exact, robust=table.worst_case, judged=False)  # fmt: skip
-        took, slopes = time.monotonic() - started, evaluate.gradients - before
+                              sloped=posed.sloped, robust=table.worst_case, judged=False)  # fmt: skip
+        took = time.monotonic() - started
+        flown, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
         found.append(one)
+        gained = ", ".join(f"{gain:.4g}" for gain in one.gains)
         print(f"seed {seed:2}: goal {one.value:.5e}, largest metric/limit {one.worst.max(initial=0.0):.5f}, "
-              f"{len(one.history) - 1} steps, {slopes} gradients, {took:.0f} s, gains {np.round(one.gains, 4)}",
+              f"{one.rounds} rounds, {flown} rollouts, {slopes} gradients, {took:.0f} s, gains {gained}",
               flush=True)  # fmt: skip
     best = min(found, key=lambda one: one.value if one.worst.max(initial=0.0) <= 1.0 else np.inf)
     started = time.monotonic()
-    check = evolution.check(evaluate, best, 1)
+    if len(sys.argv) > 3:
+        return
+    check = evolution.check(evaluate, best, 1, sloped=posed.sloped)
     print(f"differential evolution: goal {check.value:.5e}, {check.rollouts} rollouts, "
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
     references = {"differential evolution's": check.value, "the better of both": min(check.value, best.value)}
@@ -55,8 +59,10 @@ def main() -> None:
     tuned = report.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]
     peak = [float(np.mean(one.metrics.peak_torque[one.finished])) for one in (paper, tuned)]
-    print(f"on {tuned.status.size} fresh trials: {rms[0] / rms[1]:.2f} times the paper's accuracy at "
-          f"{peak[1] / peak[0]:.3f} of its mean peak torque")  # fmt: skip
+    floor = report.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
+    print(f"on {tuned.status.size} fresh trials: {rms[1]:.4e}, {rms[1] / floor:.3f} times the floor; "
+          f"{rms[0] / rms[1]:.2f} times the paper's accuracy at {peak[1] / peak[0]:.3f} of its mean peak torque, "
+          f"largest {np.max(tuned.metrics.peak_torque[tuned.finished]):.4f} N m")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@
 # # From requirements to gains
 #
 # An engineer says what must hold, here no torque above 0.5 N m in any trial, from attitudes 20 to 140 degrees away, and
-# asks for the smallest error after t_f. The search first differentiates through the flown trials, under a smooth sign;
-# then it goes on without slopes under the exact sign, as the gains are judged (CMA-ES). The proof is on *fresh* trials,
+# asks for the smallest error after t_f. The search differentiates through the flown trials, by every gain of the law: K1
+# and the width of the smooth sign too, so what is differentiated is what flies. The proof is on *fresh* trials,
 # which the search never saw, on the *flight clock*: samples at whole periods, wherever t_f and the hand-over fall.
 
 # %%
@@ -38,9 +38,8 @@ tuned = report.tune(small, seed=0)
 show.tuning(results.summary(tuned), "out/tune-first_flight", "done")
 
 # %% [markdown]
-# Each line is a start of the descent under the smooth sign. Grey is beyond a limit, blue keeps it; the gains below the
-# goal show into which valley each start went. The search goes on from the best of them under the exact sign, which is not
-# drawn: the tuned gains above need not be the end of a line.
+# Each line is a start on its way to the optimum next to it. Grey is beyond a limit, blue keeps it; the gains below the
+# goal show into which valley each start went. From the best end the search goes on to more digits.
 
 # %%
 made = results.figures_of(small, tuned)

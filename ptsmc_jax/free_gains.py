@@ -10,11 +10,13 @@ from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
 FINITE_TIME = law_tables.FiniteTimeObserver | law_tables.EachFiniteTimeObserver
-# what is free of the laws to compare with, if a scenario does not say
-_BASELINES: dict[str, tuple[tables.Free, ...]] = {
-    "pd": ("k_p", "k_d"),
-    "terminal": ("p", "b", "k"),
-    "fixed_time": ("a1", "b1", "a2", "b2"),
+# what is free of a law if a scenario does not say: before the observer's gain, and after it in the sampled loop, since
+# without samples a larger K1 and a narrower sign cost nothing but steps
+_FREE: dict[str, tuple[tuple[tables.Free, ...], tuple[tables.Free, ...]]] = {
+    "prescribed_time": (("eta", "delta"), ("k1", "sign_width")),
+    "pd": (("k_p", "k_d"), ()),
+    "terminal": (("p", "b", "k"), ("sign_width",)),
+    "fixed_time": (("a1", "b1", "a2", "b2", "p", "gamma", "m", "n"), ("sign_width",)),
 }
 _POWERS = {"p": (1.0, 2.0), "m": (1.0, math.inf), "n": (0.0, 1.0)}  # between which they must lie
 MOST_STEPS = 200_000  # of a run
@@ -49,8 +51,10 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     """
     free = tune.free
     if free is None:
-        law = _BASELINES.get(scenario.controller.kind, ("eta", "delta"))
-        free = (*law, "observer_gain") if _has_gain(scenario) else law
+        law, rest = _FREE[scenario.controller.kind]
+        observer: tuple[tables.Free, ...] = ("observer_gain",) if _has_gain(scenario) else ()
+        filtered: tuple[tables.Free, ...] = ("filter_bandwidth",) if _has_bandwidth(scenario) else ()
+        free = (*law, *observer, *(rest if scenario.loop.mode == "sampled" else ()), *filtered)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -82,7 +86,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
         raise ScenarioError(
             f'{said} observer.kind = "none" has no gain; allowed is observer_gain with an observer of another kind'
         )
-    if "filter_bandwidth" in free and not isinstance(scenario.filter, device_tables.SteadyStateFilter):
+    if "filter_bandwidth" in free and not _has_bandwidth(scenario):
         raise ScenarioError(
             f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
         )
@@ -186,8 +190,15 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
     if name == "p" and "gamma" not in free and hasattr(scenario.controller, "gamma"):
         above = _least_p(scenario)
         return above + 0.05 * (2.0 - above), 2.0 - 0.05 * (2.0 - above)
+    sampled = scenario.loop.mode == "sampled"
+    if name == "k1":
+        border = scales.largest_k1(scenario) if sampled else 0.0
+        return 3.5 / t_f, _shown(border) if border > 3.5 / t_f else 350.0 / t_f
+    if name == "sign_width":
+        low, high = scales.widths(scenario) if sampled else scales.QUIET
+        return _shown(low), _shown(high)
     if name == "surface_rate":  # two decades; sampled, the frozen loop is stable for (c + K1/2) h < 2: to half of that
-        high = min(700.0 / t_f, 1.0 / scenario.loop.period) if scenario.loop.mode == "sampled" else 700.0 / t_f
+        high = min(700.0 / t_f, 1.0 / scenario.loop.period) if sampled else 700.0 / t_f
         return 0.01 * high, high
     size = 1.0
     if scenario.spacecraft is not None:  # beside a mean moment of 12 kg m^2
@@ -195,9 +206,7 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
         size = float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
     return {
         "eta": (least + 0.05, least + 6.0),
-        "observer_gain": (0.5 * size, 300.0 * size),
-        "k1": (3.5 / t_f, 350.0 / t_f),
-        "sign_width": (1e-5, 1e-1),
+        "observer_gain": (0.5 * size, _shown(scales.dead_beat_gain(scenario)) if sampled else 300.0 * size),
         **dict.fromkeys(("k_p", "k"), (2.0 / t_f**2, 2000.0 / t_f**2)),
         "k_d": (0.3 / t_f, 100.0 / t_f),
         **dict.fromkeys(("b", "a1", "b1"), (0.01 / t_f, 100.0 / t_f)),
@@ -208,6 +217,33 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
     }[name]
 
 
+def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:
+    """What lies beyond a bound of a gain, "lower" or "upper", in words; None: nothing that is known.
+
+    A bound says something where it is the usual one, or beyond it.
+    """
+    tune = scenario.tune
+    if scenario.loop.mode != "sampled" or tune is None:
+        return None
+    words = {
+        ("delta", "lower"): "one period, the shortest hand-over that there is",
+        ("observer_gain", "upper"): "a dead-beat observer: nothing of its error is left after a period",
+        ("k1", "upper"): "the stability border of the sampled loop",
+        ("sign_width", "lower"): "as narrow as the noise lets a sign be told from the exact one",
+        ("sign_width", "upper"): "so wide that hardly a switching term is left",
+    }
+    if (name, side) not in words or (name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME)):
+        return None
+    low, high = _usual(scenario, tune, name)
+    usual = low if side == "lower" else high
+    reached = bound <= usual * (1 + 1e-9) if side == "lower" else bound >= usual * (1 - 1e-9)
+    return words[name, side] if reached else None
+
+
+def _shown(bound: float) -> float:
+    return float(f"{bound:.4g}")
+
+
 def _least_p(scenario: Scenario) -> float:
     """What p must exceed for gamma - 1/p > 1."""
     return max(1.0, 1.0 / (scenario.controller.gamma - 1.0))
@@ -215,6 +251,10 @@ def _least_p(scenario: Scenario) -> float:
 
 def _has_gain(scenario: Scenario) -> bool:
     return not isinstance(scenario.observer, law_tables.NoObserver)
+
+
+def _has_bandwidth(scenario: Scenario) -> bool:
+    return isinstance(scenario.filter, device_tables.SteadyStateFilter)
 
 
 def _interval(scenario: Scenario) -> float:

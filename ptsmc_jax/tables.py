@@ -86,7 +86,7 @@ class Tune(Table, frozen=True):
     """What `tune`, `pareto` and `compare` search for: the smallest window error that keeps every requirement.
 
     Attributes:
-        free: the gains to find; default: eta, delta and observer_gain, of the other laws theirs
+        free: the gains to find; default: all but surface_rate and t_f, of k1 and sign_width only if sampled
         bounds: two numbers for each gain; by default from law, period, t_f and body: see scenario.toml of a run
         per_axis: observer_gain as one number for each axis
         objective: minimised: RMS window error, the largest one, its CVaR, or t_f, the shortest for the requirements
@@ -94,8 +94,8 @@ class Tune(Table, frozen=True):
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
         trials: trials to tune on; more where a quantile with a confidence takes more to be shown at all
-        starts: points to descend from
-        steps: of the descent
+        starts: points to search from: the scenario's gains, and the most promising of a small sweep
+        steps: points looked at from each start, at most, with slopes
     """
 
     free: FreeGains | None = None
@@ -105,10 +105,10 @@ class Tune(Table, frozen=True):
     level: Quantile | None = None
     torque_weight: NotNegative = 0.0
     worst_case: Truth = False
-    # all trials are flown at once and held in memory; 64 candidates a start are compared, each with each
+    # all trials are flown at once and held in memory
     trials: Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")] = 256
     starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 8
-    steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 150
+    steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
 
 
 class Scenario(Table, frozen=True, kw_only=True):

@@ -178,8 +178,8 @@ def small_search(monkeypatch, fresh=40):
         (worst, "SCREENED", 64),
         (confirm, "FRESH", fresh),
         (confirm, "FEWEST", 64),
-        (starts, "CANDIDATES", 8),
-        (optimise, "SPREAD", 16),
+        (starts, "SWEPT", 16),
+        (optimise, "MANY", 16),
         (refine, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)

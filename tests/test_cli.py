@@ -115,10 +115,10 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     again = montecarlo.run(ready.parts, ready.dispersion, summary["fresh"]["seed"], np.arange(40))
     rms = np.sqrt(np.mean(again.metrics.window_error**2))
     assert rms == pytest.approx(summary["fresh"]["window_error"]["rms"], rel=1e-12)
-    assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 0.0)
+    assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 1e-3)
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
-    assert len(rows) >= 2 * 5
+    assert len(rows) == summary["search"]["steps"] >= 2
     # the gains beat the paper's on the same trials, in this noise too
     assert summary["fresh"]["window_error"]["rms"] < summary["paper"]["window_error"]["rms"]
 
@@ -317,7 +317,7 @@ def stop_at(monkeypatch, call):
 
 @pytest.mark.parametrize("call", [1, 4, 7])
 def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, monkeypatch, call):
-    """At the first evaluation there is nothing yet, at the 4th it descends, at the 7th it polishes."""
+    """At the first evaluation there is nothing yet; later it is in the middle of a descent."""
     small_search(monkeypatch)
     with monkeypatch.context() as patch:
         computed = stop_at(patch, 0)
@@ -360,7 +360,7 @@ def test_a_killed_search_goes_on(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
         "import sys; from tuning import cli, confirm, optimise, refine, starts, worst; "
-        "starts.CANDIDATES = 8; optimise.SPREAD = 16; refine.GENERATIONS = 3; "
+        "starts.SWEPT = 16; optimise.MANY = 16; refine.GENERATIONS = 3; "
         "worst.SCREENED = 64; confirm.FRESH = 40; cli.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
@@ -507,7 +507,7 @@ def test_a_chain_is_tuned(command, tmp_path):
     assert "observer_gain" not in out
     folder = tmp_path / "out" / "tune-c"
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary["gains"]) == {"eta", "delta"}
+    assert set(summary["gains"]) == {"eta", "delta", "k1", "sign_width"}
     assert summary["gains"]["eta"] > 3.0
     assert "peak_momentum" not in summary["fresh"]
     assert summary["shortest_t_f"]["theory"] > 0.0

@@ -37,8 +37,8 @@ def test_every_law_is_asked_for_the_same(monkeypatch):
             assert getattr(other.tune, key) == getattr(base.tune, key)
     free = {kind: tuned(other).free for kind, other in posed.items()}
     assert free["pd"] == ("k_p", "k_d", "observer_gain")
-    assert free["terminal"] == ("p", "b", "k", "observer_gain")
-    assert free["fixed_time"] == ("a1", "b1", "a2", "b2", "observer_gain")
+    assert free["terminal"] == ("p", "b", "k", "observer_gain", "sign_width")
+    assert free["fixed_time"] == ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "observer_gain", "sign_width")
 
 
 def test_a_baselines_own_scenario_keeps_its_own_bounds():
@@ -47,7 +47,7 @@ def test_a_baselines_own_scenario_keeps_its_own_bounds():
     posed = compare.contenders(own)
     assert posed["pd"] is own
     assert posed["prescribed_time"].controller.kind == "prescribed_time"
-    assert tuned(posed["prescribed_time"]).free == ("eta", "delta", "observer_gain")
+    assert tuned(posed["prescribed_time"]).free == ("eta", "delta", "observer_gain", "k1", "sign_width")
     assert gains.papers(own).controller.eta == 3.0
     assert gains.papers(own).controller.t_f == 5.0
 
@@ -136,7 +136,8 @@ def test_for_the_shortest_t_f_every_law_may_move_its_gains():
         "free": ["eta", "delta", "t_f"], "objective": "t_f", "bounds": {"t_f": [4.0, 8.0]}})  # fmt: skip
     free = {kind: tuned(other) for kind, other in compare.contenders(base).items()}
     assert free["pd"].free == ("k_p", "k_d", "observer_gain", "t_f")
-    assert free["fixed_time"].free == ("a1", "b1", "a2", "b2", "observer_gain", "t_f")
+    fixed = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "observer_gain", "sign_width", "t_f")
+    assert free["fixed_time"].free == fixed
     assert all(tune.bounds["t_f"] == (4.0, 8.0) for tune in free.values())
 
 
@@ -149,7 +150,7 @@ def eight():
 def contender(trials, **changes):
     base = scenario.from_tables(TABLES)
     verdicts = report.verdicts_of(scenario.study(base).requirements, trials)
-    return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts))
+    return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts), None)
 
 
 def changed(trials, status, **metrics):
@@ -183,6 +184,7 @@ def rivals(monkeypatch, eight, interrupt=None):
         law = posed.controller.kind
         asked.append(("tune", law, seed))
         return SimpleNamespace(tuned=posed, gains={}, at_bound={}, fresh={"tuned": eight}, verdicts=[],
+                               floors={"tuned": None},
                                search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
 
     def judge(flown, seed, requirements):

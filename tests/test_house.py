@@ -57,7 +57,7 @@ FLOORS = {
         bounds design journal
         objective
         evaluate
-        worst trust polish starts confirm
+        worst trust descent starts confirm
         refine work
         optimise
         evolution

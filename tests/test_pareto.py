@@ -174,7 +174,7 @@ def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch):
     run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
     whole = command(*run, "whole")[0]
 
-    for k, stage in enumerate(["least torque: polishing", "ladder"]):
+    for k, stage in enumerate(["least torque: searching", "ladder"]):
         cut = f"cut-{k}"
 
         def stop(self, what, *numbers, stage=stage):

@@ -8,9 +8,8 @@ from tests.helpers import parts
 from tests.test_trust import SPREAD
 from tuning import objective, refine
 from tuning.bounds import Bounds
+from tuning.descent import Best
 from tuning.evaluate import Evaluator, Measured
-from tuning.polish import Best
-from tuning.starts import logit, share_of
 
 
 class Valley(Evaluator):
@@ -21,22 +20,23 @@ class Valley(Evaluator):
         self.matrix, self.along, self.least, self.wall = matrix, along, least, wall
         self.seen = []
 
-    def fly(self, problem, z):
-        x = share_of(z) - 0.5
+    def fly(self, problem, share):
+        x = share - 0.5
         self.seen.append(x)
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))
-        over = np.zeros(len(z)) - 1.0 if self.along is None else self.least - x @ self.along
-        return Measured(f, over[:, None, None], f)
+        over = np.zeros(len(share)) - 1.0 if self.along is None else self.least - x @ self.along
+        return Measured(share, f, over[:, None, None], f)
 
 
 def refined(valley, start, seed=3):
     names = valley.bounds.names
     some = objective.problem(parts(20.0, 3.0, 1.0), SPREAD, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
-    z = logit(0.5 + np.asarray([start]))
-    best, told = Best(z, 1, 0.0), []
-    seen = valley.fly(some, z)
-    best.offer(z, seen, np.isfinite(seen.f))
-    refine.refine(valley, some, best, 0, seed, lambda *at: told.append(at))
+    share = 0.5 + np.asarray(start)
+    best, told = Best(share, 1, 0.0), []
+    best.offer(share[None], valley.fly(some, share[None]))
+    path = []
+    refine.refine(valley, some, best, share, seed, lambda *at: told.append(at), path.append)
+    assert len(path) == len(told)
     return best, told
 
 
@@ -50,8 +50,8 @@ def narrow(count):
 def test_the_bottom_of_a_narrow_turned_valley_with_a_wall_is_found(seed):
     best, told = refined(Valley(narrow(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
     # it ends where twelve generations have gained less than GAINED: some times that is left
-    assert best.f[0] < 5.0 * refine.GAINED
-    assert np.isfinite(best.f[0])
+    assert best.f < 5.0 * refine.GAINED
+    assert np.isfinite(best.f)
     assert [done for done, _ in told] == list(range(len(told)))
 
 
@@ -61,14 +61,14 @@ def test_a_limit_is_followed_to_the_optimum_on_it(seed):
     inverse = along @ np.linalg.solve(matrix, along)
     optimum = least**2 / inverse  # at x = A^-1 a b / (a' A^-1 a)
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
-    assert best.over[0] == 0.0
-    assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f[0]  # SLACK beyond the limit is allowed
-    assert best.f[0] <= optimum + 5.0 * refine.GAINED
+    assert best.over == 0.0
+    assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # SLACK beyond the limit is allowed
+    assert best.f <= optimum + 5.0 * refine.GAINED
 
 
 def test_a_single_gain_is_refined_too():
     best, _ = refined(Valley(np.array([[4.0]])), [0.4])
-    assert best.f[0] < 1e-6
+    assert best.f < 1e-6
 
 
 def test_it_ends_early_where_nothing_is_gained():
@@ -88,10 +88,10 @@ def test_it_looks_around_the_start():
 def test_where_nothing_keeps_the_limit_it_goes_on_toward_it():
     best, told = refined(Valley(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
     assert len(told) == refine.GENERATIONS
-    assert best.over[0] < 2.01  # x is 0.5 at most
+    assert best.over < 2.01  # x is 0.5 at most
 
 
 def test_nothing_but_failures_keeps_the_start():
     best, _ = refined(Valley(np.eye(2), wall=-1.0), [0.1, 0.2])
-    assert not np.isfinite(best.f[0])
-    np.testing.assert_allclose(share_of(best.z[0]), [0.6, 0.7])
+    assert not np.isfinite(best.f)
+    np.testing.assert_allclose(best.share, [0.6, 0.7])

@@ -84,7 +84,7 @@ TUNE_DEFAULTS = {
     "worst_case": False,
     "trials": 256,
     "starts": 8,
-    "steps": 150,
+    "steps": 40,
 }
 
 ATTITUDES = [

@@ -11,8 +11,8 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, confirm, gains, objective, optimise, polish, refine, report, results, starts, told, worst
-from tuning.evaluate import Evaluator
+from tuning import bounds, confirm, descent, gains, objective, optimise, refine, report, results, starts, told, worst
+from tuning.evaluate import Evaluator, Sloped
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 
@@ -77,18 +77,25 @@ def test_forward_and_reverse_mode_agree():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(value))(at), jax.jit(jax.grad(value))(at), rtol=1e-9)
 
 
-def test_bounds_map_reals_into_the_interval_and_back():
+def test_bounds_map_shares_into_the_interval_and_back():
     some = bounds.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.logarithmic) == [False, True, True]
     rng = np.random.default_rng(0)
-    for z in rng.normal(size=(20, 3)) * 3:
-        gains = np.asarray(some.gains(jnp.asarray(z)))
-        assert np.all((gains > some.lower) & (gains < some.upper))
-        np.testing.assert_allclose(some.free(gains, edge=1e-9), z, rtol=1e-6)
-    for extreme in (-1e3, 1e3):
-        gains = np.asarray(some.gains(jnp.full(3, extreme)))
-        assert np.all((gains >= np.array(some.lower) * (1 - 1e-12)) & (gains <= np.array(some.upper) * (1 + 1e-12)))
+    for share in rng.random((20, 3)):
+        gains = np.asarray(some.gains(jnp.asarray(share)))
+        np.testing.assert_allclose(gains, [2.05 + 5.95 * share[0], 0.05 * 100 ** share[1], 0.5 * 600 ** share[2]])
+        np.testing.assert_allclose(some.share(gains), share, rtol=1e-12)
+    np.testing.assert_allclose(some.gains(jnp.zeros(3)), some.lower, rtol=1e-14)
+    np.testing.assert_allclose(some.gains(jnp.ones(3)), some.upper, rtol=1e-14)
+    np.testing.assert_array_equal(some.share(np.array([1.0, 9.0, 0.0])), [0.0, 1.0, 0.0])
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
+
+
+def test_gains_handed_over_are_rounded_inside_their_bounds():
+    some = bounds.Bounds(("delta", "k1"), (0.123456789, 0.1), (5.0, 1.23456789))
+    found = some.rounded(np.array([0.123456789, 1.23456789]), 6)
+    assert found == {"delta": 0.123457, "k1": 1.23456789}
+    assert some.rounded(np.array([0.5012345678, 0.1]), 6) == {"delta": 0.501235, "k1": 0.1}
 
 
 measure = jax.jit(objective.measure)
@@ -196,20 +203,20 @@ def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail)
     lost = (0.9 * drawn).at[5, 2].set(1.0)  # by 180 degrees, the others by less than 165
     left = np.delete(np.arange(8), 5)
     others = replace(eight, trials=eight.trials[left], coordinates={name: lost[left]}, averaged=7, tail=tail)
-    z = np.array([[0.3, -0.4], [-0.8, 0.2]])
+    share = np.array([[0.6, 0.4], [0.3, 0.55]])
     evaluate = Evaluator(bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
-    with_it, without = (evaluate.slopes(one, z) for one in (replace(eight, coordinates={name: lost}), others))
+    with_it, without = (evaluate.slopes(one, share) for one in (replace(eight, coordinates={name: lost}), others))
     np.testing.assert_allclose(with_it.f, without.f + np.log(objective.FAILED), rtol=1e-14)
     np.testing.assert_allclose(with_it.value, without.value, rtol=1e-13)
     np.testing.assert_allclose(with_it.f_slope, without.f_slope, rtol=1e-10)
     np.testing.assert_array_equal(with_it.beyond, without.beyond)
     assert without.c.max() < objective.FAILED / 2
     np.testing.assert_allclose(np.diff(starts.merit(with_it)), np.diff(starts.merit(without)), rtol=1e-12)
-    best, known = (polish.Best(z, 1, 0.0) for _ in range(2))
+    best, known = (descent.Best(np.zeros(2), 1, 0.0) for _ in range(2))
     for kept, seen in ((best, with_it), (known, without)):
-        kept.offer(z, seen, np.full(2, True))
-    np.testing.assert_allclose(best.over, known.over + polish.BROKEN, rtol=1e-14)
-    np.testing.assert_array_equal(best.order(), known.order())
+        kept.offer(share, seen)
+    np.testing.assert_allclose(best.over, known.over + descent.BROKEN, rtol=1e-14)
+    np.testing.assert_array_equal(best.share, known.share)
     np.testing.assert_array_equal(best.worst, known.worst)
 
 
@@ -217,8 +224,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     """Against a brute-force scan of the same problem, screening for harder trials left out."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
-    monkeypatch.setattr(starts, "CANDIDATES", 32)
-    monkeypatch.setattr(refine, "GENERATIONS", 15)
+    monkeypatch.setattr(starts, "SWEPT", 64)
     some = problem(peak_torque=0.9)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)
@@ -227,9 +233,13 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     found = optimise.search(
         evaluate, some, wanted, np.array([3.0, 0.5]), 3, 40, 1, report=lambda *told: seen.append(told)
     )
-    assert found.dropped == []
     assert found.worst[0] <= 1.0
-    assert sum(told[0] == "searching" or "harder" in told[0] for told in seen) == len(found.history)
+    assert [step.start for step in found.history] == sorted(step.start for step in found.history)
+    assert {step.start for step in found.history} == {0, 1, 2}
+    assert sum(told[0] == "searching" for told in seen) == 3
+    # 64 points are swept and 16 trials screened twice
+    assert evaluate.rollouts == 64 * found.problem.trials.size + 2 * 16
+    assert evaluate.gradients <= 4 * 40 * found.problem.trials.size
     final = found.problem
 
     @jax.jit
@@ -247,16 +257,63 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
 
 def test_starts_begin_with_the_scenarios_own_gains_and_differ():
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-    z = starts.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
-    assert z.shape == (4, 2)
-    np.testing.assert_allclose(limits.gains(jnp.asarray(z[0])), [3.0, 0.5], rtol=1e-9)
-    assert len(np.unique(z, axis=0)) == 4
+    share = starts.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
+    assert share.shape == (4, 2)
+    np.testing.assert_allclose(limits.gains(jnp.asarray(share[0])), [3.0, 0.5], rtol=1e-9)
+    assert len(np.unique(share, axis=0)) == 4
 
 
-def test_as_flown_judges_on_the_flight_clock_with_the_exact_sign():
-    flown = report.as_flown(scenario.read(FIRST_FLIGHT))
+def test_judged_is_the_very_law_on_the_flight_clock():
+    own = scenario.read(FIRST_FLIGHT)
+    flown = report.as_flown(own)
     assert flown.loop.clock == "flight"
-    assert flown.controller.sign_width == 0.0
+    assert flown.controller == own.controller
+    assert report.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+
+
+@pytest.mark.parametrize(("width", "free", "sloped"), [
+    (0.0, ["eta", "delta"], False), (1e-3, ["eta", "delta"], True), (0.0, ["eta", "sign_width"], True),
+])  # fmt: skip
+def test_only_gains_flown_with_the_exact_sign_are_looked_for_without_slopes(width, free, sloped):
+    tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
+    posed = report.pose(scenario.from_tables(tables), 0)
+    assert posed.sloped == sloped
+    assert float(posed.problem.parts.controller.sign_width) == width
+
+
+def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
+    """The goal of a search with them, for a law that has both: what differs is how it is found."""
+    helpers.small_search(monkeypatch)
+    monkeypatch.setattr(optimise, "MANY", 64)
+    monkeypatch.setattr(refine, "GENERATIONS", 25)
+    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
+    for sloped, evaluate in evaluates.items():
+        found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), 3, 40, 1, sloped=sloped)
+    assert evaluates[False].gradients == 0
+    np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
+
+
+def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_without_sense():
+    """F = ln(1 + |x - a|^2) with slopes of 1e30 in one place, and with a number that is none in another."""
+
+    class Bowl(Evaluator):
+        def slopes(self, problem, share):
+            self.gradients += 1
+            off = share[0] - np.array([0.3, 0.8])
+            f = np.log1p(off @ off)
+            slope = 2 * off / (1 + off @ off) * (1e30 if self.gradients == 1 else 1.0)
+            slope = np.where(self.gradients == 3, np.nan, slope)
+            c = np.full((1, 0, 8), -1.0)
+            return Sloped(share, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2)))
+
+    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    for steps, near in ((3, 1.0), (40, 1e-4)):
+        evaluate, best, path = Bowl(limits), descent.Best(np.array([0.9, 0.1]), 0, 0.0), []
+        descent.descend(evaluate, problem(), best, np.array([0.9, 0.1]), steps, path.append, close=1e-12)
+        assert evaluate.gradients <= steps
+        assert best.f < near
+        assert len(path) <= evaluate.gradients
 
 
 def test_statistics_count_failures_and_average_the_rest():
@@ -318,6 +375,6 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
 )
 def test_what_breaks_a_limit_in_training_is_said(ratio, said):
     """Infinite in a result, absent from the file it is read from."""
-    found = {"dropped_starts": [], "largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
+    found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
     (line,) = told.search({"search": found})
     assert said in line

@@ -141,7 +141,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     problem, _ = posed(spread)
     more = objective.with_trials(problem, np.asarray([40]))
     own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
-    roomy = optimise._with_room(problem)
+    roomy = optimise._with_room(problem, optimise.SPARE)
     assert roomy.trials.size == 8 + optimise.SPARE
     drawn = {name: v.tolist() for name, v in own.items()}
     given = optimise._add(roomy, 0, optimise.Joining(np.asarray([7]), np.array([True]), drawn))
@@ -156,14 +156,13 @@ def test_coordinates_given_are_flown_as_drawn_ones():
 
 def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
     problem, _ = posed(dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0))))
-    problem = optimise._with_room(objective.with_trials(problem, np.arange(100, 108)))
-    joined = 0
-    for count in (8, 3, 8, 1):
+    problem, joined = optimise._with_room(problem, 16), 0
+    for count in (8, 8, 3, 8, 1):
         new = np.arange(200 + joined, 200 + joined + count)
         more = optimise.Joining(new, np.array([True]))
         problem, joined = optimise._add(problem, joined, more), joined + count
-        # the last 16 of those screened first and those that joined since, in whatever order
-        kept = [*range(100, 108), *range(200, 200 + joined)][-16:]
+        # the last 16 of those that joined, in whatever order, and the first trial where there is room
+        kept = [0] * max(0, 16 - joined) + [*range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)
         np.testing.assert_array_equal(problem.trials[:8], np.arange(8))
     own = objective.coordinates_of(problem.dispersion, 5, np.asarray(problem.trials))

@@ -1,8 +1,7 @@
-"""Intervals of the free gains; free reals <-> gains inside the bounds."""
+"""Intervals of the free gains; shares of them, from 0 to 1, <-> gains."""
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,26 +28,30 @@ class Bounds:
         log = self.logarithmic
         return np.where(log, np.log(lower), lower), np.where(log, np.log(upper), upper)
 
-    def gains(self, z: Float[Array, " gains"]) -> Float[Array, " gains"]:
-        """Gains of free reals: the logistic function between the bounds, so every z gives admissible gains."""
+    def gains(self, share: Float[Array, " gains"]) -> Float[Array, " gains"]:
+        """Gains of shares of the intervals: 0 is the lower bound, 1 the upper one."""
         low, high = self._scaled()
-        inner = low + (high - low) * jax.nn.sigmoid(z)
+        inner = low + (high - low) * share
         return jnp.where(self.logarithmic, jnp.exp(inner), inner)
 
-    def free(self, gains: np.ndarray, edge: float = 0.02) -> np.ndarray:
-        """Free reals of gains, (gains,); those nearer to a bound than `edge` of the interval are moved inside."""
+    def share(self, gains: np.ndarray) -> np.ndarray:
+        """Shares of gains, (gains,); of those beyond a bound the bound's."""
         low, high = self._scaled()
         inner = np.where(self.logarithmic, np.log(np.maximum(gains, 1e-300)), gains)
-        share = np.clip((inner - low) / (high - low), edge, 1.0 - edge)
-        return np.log(share / (1.0 - share))
+        return np.clip((inner - low) / (high - low), 0.0, 1.0)
 
-    def at_bound(self, gains: np.ndarray, share: float = 0.01) -> dict[str, str]:
-        """Gains that ended within `share` of the interval from a bound: name to "lower" or "upper"."""
-        low, high = self._scaled()
-        inner = (np.where(self.logarithmic, np.log(gains), gains) - low) / (high - low)
-        sides = {name: "lower" if u < share else "upper" for name, u in zip(self.names, inner, strict=True)
-                 if not share <= u <= 1.0 - share}  # fmt: skip
+    def at_bound(self, gains: np.ndarray, near: float = 0.01) -> dict[str, str]:
+        """Gains that ended within this share of the interval from a bound: name to "lower" or "upper"."""
+        sides = {name: "lower" if share < near else "upper"
+                 for name, share in zip(self.names, self.share(gains), strict=True)
+                 if not near <= share <= 1.0 - near}  # fmt: skip
         return sides
+
+    def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
+        """Gains by name with so many digits, none of them beyond its bounds."""
+        kept = (float(f"{gain:.{digits}g}") for gain in gains)
+        within = zip(self.names, kept, self.lower, self.upper, strict=True)
+        return {name: min(max(gain, low), high) for name, gain, low, high in within}
 
 
 def of_scenario(scenario: Scenario) -> Bounds:

@@ -34,6 +34,7 @@ class Contender:
     at_bound: dict[str, str]
     trials: Trials
     verdicts: list[Verdict]
+    floor: float | None  # RMS window error that no controller can beat
 
     @property
     def met(self) -> bool:
@@ -117,7 +118,8 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
             tell(f"{law}: {what}", *others)
 
         tuned = report.tune(posed, seed, told, journal, trusted=False)
-        made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, tuned.fresh["tuned"], tuned.verdicts)
+        fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
+        made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
         stopped = tuned.search.interrupted
         if stopped:
             break
@@ -127,7 +129,8 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
     ready = study(flown)
     trials = report.judge(flown, fresh_seed, ready.requirements)
-    return Contender(flown, gains.gains_of(ready.parts), {}, trials, report.verdicts_of(ready.requirements, trials))
+    verdicts, floor = report.verdicts_of(ready.requirements, trials), report.floor_of(flown, fresh_seed)
+    return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
 
 
 def figures_of(one: Contender) -> dict[str, Any]:
@@ -146,6 +149,7 @@ def figures_of(one: Contender) -> dict[str, Any]:
         "met": one.met,
         "counts": trials.counts(),
         "window_error": float(trust.rms(errors)) if done.any() else None,
+        "floor": one.floor,
         "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
         **mean,
         "largest_peak_torque": float(np.max(trials.metrics.peak_torque[done])) if done.any() else None,

@@ -18,6 +18,7 @@ FLOWN = 16  # points without slopes in one call of the compiled program
 class Measured:
     """F, constraints and the goal's logarithm at many points, see `objective.measure`; arrays over the points first."""
 
+    gains: np.ndarray  # (points, gains)
     f: np.ndarray  # (points,)
     c: np.ndarray  # (points, requirements, trials)
     value: np.ndarray  # (points,)
@@ -30,14 +31,13 @@ class Measured:
     def at(self, point: int) -> "Measured":
         """One of the points."""
         one = slice(point, point + 1)
-        return Measured(self.f[one], self.c[one], self.value[one])
+        return Measured(self.gains[one], self.f[one], self.c[one], self.value[one])
 
 
 @dataclass(frozen=True)
 class Sloped(Measured):
-    """The same with derivatives by the free reals."""
+    """The same with derivatives by the shares of the bounds' intervals."""
 
-    gains: np.ndarray  # (points, gains)
     f_slope: np.ndarray  # (points, gains)
     c_slope: np.ndarray  # (points, requirements, trials, gains)
 
@@ -49,61 +49,63 @@ class Sloped(Measured):
 
 
 class Evaluator:
-    """Flies a problem's trials at free reals z, (points, gains), and counts them."""
+    """Flies a problem's trials at shares of the bounds' intervals, (points, gains), and counts them."""
 
     def __init__(self, bounds: Bounds, journal: Journal | None = None):
         self.bounds, self._journal = bounds, journal or Journal()
         self.rollouts, self.gradients = 0, 0  # trials flown without and with slopes
 
-    def fly(self, problem: Problem, z: np.ndarray) -> Measured:
+    def fly(self, problem: Problem, share: np.ndarray) -> Measured:
         """Without slopes."""
-        self.rollouts += len(z) * problem.trials.size
-        found = self._journal.get(_question(b"fly", problem, z), lambda: self._in_calls(_fly, problem, z, FLOWN))
-        return Measured(**found)
+        self.rollouts += len(share) * problem.trials.size
+        asked = _question(b"fly", problem, share)
+        return Measured(**self._journal.get(asked, lambda: self._in_calls(_fly, problem, share, FLOWN)))
 
-    def slopes(self, problem: Problem, z: np.ndarray) -> Sloped:
+    def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
         """With slopes."""
-        self.gradients += len(z) * problem.trials.size
-        # one point for each device a call: the program that flies many starts also polishes a single one
+        self.gradients += len(share) * problem.trials.size
+        # one point for each device a call
         most = len(jax.local_devices())
-        found = self._journal.get(_question(b"slopes", problem, z), lambda: self._in_calls(_slopes, problem, z, most))
-        return Sloped(**found)
+        asked = _question(b"slopes", problem, share)
+        return Sloped(**self._journal.get(asked, lambda: self._in_calls(_slopes, problem, share, most)))
 
-    def _in_calls(self, compiled, problem: Problem, z: np.ndarray, size: int) -> dict[str, np.ndarray]:
+    def _in_calls(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
         devices = max(d for d in range(1, len(jax.local_devices()) + 1) if size % d == 0)
-        padded = np.resize(z, (-(-len(z) // size) * size, z.shape[1]))
+        padded = np.resize(share, (-(-len(share) // size) * size, share.shape[1]))
         # plain arrays in and out: what came back spread over the devices would be compiled for anew
         calls = [
             {name: np.asarray(v) for name, v in compiled(problem, self.bounds, padded[k : k + size], devices).items()}
             for k in range(0, len(padded), size)
         ]
-        return {name: np.concatenate([call[name] for call in calls])[: len(z)] for name in calls[0]}
+        return {name: np.concatenate([call[name] for call in calls])[: len(share)] for name in calls[0]}
 
 
-def _question(kind: bytes, problem: Problem, z: np.ndarray) -> bytes:
+def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
-    return b"|".join([kind, z.tobytes(), str(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    return b"|".join([kind, share.tobytes(), str(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
-def _fly(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> dict[str, jax.Array]:
-    def one(z: jax.Array) -> dict[str, jax.Array]:
-        f, c, value = measure(problem, bounds.gains(z))
-        return {"f": f, "c": c, "value": value}
+def _fly(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
+    def one(share: jax.Array) -> dict[str, jax.Array]:
+        gains = bounds.gains(share)
+        f, c, value = measure(problem, gains)
+        return {"gains": gains, "f": f, "c": c, "value": value}
 
-    return montecarlo.spread(lambda z: jax.lax.map(one, z), z, devices)
+    return montecarlo.spread(lambda share: jax.lax.map(one, share), share, devices)
 
 
 @partial(jax.jit, static_argnames=("bounds", "devices"))
-def _slopes(problem: Problem, bounds: Bounds, z: jax.Array, devices: int) -> dict[str, jax.Array]:
+def _slopes(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
     """Tangents forward, as one more batch axis; point after point, so that a branch on the time stays a branch."""
 
-    def one(z: jax.Array) -> dict[str, jax.Array]:
-        def twice(z: jax.Array) -> tuple:
-            f, c, value = measure(problem, bounds.gains(z))
-            return (f, c), {"f": f, "c": c, "value": value}
+    def one(share: jax.Array) -> dict[str, jax.Array]:
+        def twice(share: jax.Array) -> tuple:
+            gains = bounds.gains(share)
+            f, c, value = measure(problem, gains)
+            return (f, c), {"gains": gains, "f": f, "c": c, "value": value}
 
-        (f_slope, c_slope), measured = jax.jacfwd(twice, has_aux=True)(z)
-        return {**measured, "gains": bounds.gains(z), "f_slope": f_slope, "c_slope": c_slope}
+        (f_slope, c_slope), measured = jax.jacfwd(twice, has_aux=True)(share)
+        return {**measured, "f_slope": f_slope, "c_slope": c_slope}
 
-    return montecarlo.spread(lambda z: jax.lax.map(one, z), z, devices)
+    return montecarlo.spread(lambda share: jax.lax.map(one, share), share, devices)

@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import differential_evolution
 
+from tuning.descent import CAREFUL, CLOSE, SLACK, Best, descend
 from tuning.evaluate import Evaluator
-from tuning.optimise import Search
-from tuning.polish import SLACK, Best, polish
-from tuning.starts import EDGE, Report, logit
+from tuning.optimise import FINISH, Search
+from tuning.starts import Report
 
 POPULATION = 40  # points for each gain
 GENERATIONS = 80
+STEPS = 100  # of the descent from what it found
 SPREAD = 1e-4  # of F in the population, at which it ends
 FORBIDDEN = 100.0  # beside F, for a point that breaks a limit: beyond every F
 
@@ -28,16 +28,18 @@ class Check:
     rollouts: int  # trials flown for it
 
 
-def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *told: None) -> Check:
+def check(
+    evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *told: None, *, sloped: bool = True
+) -> Check:
     """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
 
-    Then the same polish as in the search: what is compared is the valley that each of them found.
+    Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
     """
     problem = replace(found.problem, limits=found.problem.limits * (1.0 - found.margin))
     before, generation = evaluate.rollouts, 0
 
     def merit(share: np.ndarray) -> np.ndarray:
-        flown = evaluate.fly(problem, logit(share.T))
+        flown = evaluate.fly(problem, share.T)
         bad = FORBIDDEN * np.where(np.isfinite(flown.f), 1.0, 2.0) + np.log1p(np.maximum(flown.beyond, 0.0))
         return np.where((flown.beyond <= SLACK) & np.isfinite(flown.f), flown.f, bad)
 
@@ -49,7 +51,7 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
 
     result = differential_evolution(
         merit,
-        [(EDGE, 1.0 - EDGE)] * len(problem.names),
+        [(0.0, 1.0)] * len(problem.names),
         popsize=POPULATION,
         maxiter=GENERATIONS,
         tol=0.0,
@@ -62,15 +64,15 @@ def check(evaluate: Evaluator, found: Search, seed: int, report: Report = lambda
         callback=tell,
     )
     # near a limit evolution goes slowly: from where it ends, along it
-    best = Best(logit(result.x[None]), len(problem.metrics), found.margin)
-    polish(evaluate, replace(found.smooth, limits=problem.limits), best, 0)
-    z = np.concatenate([logit(result.x[None]), best.z])
-    seen, own = evaluate.fly(problem, z), evaluate.fly(problem, found.z[None])
-    first = int(np.lexsort((seen.f, seen.beyond > SLACK))[0])
+    best = Best(result.x, len(problem.metrics), found.margin)
+    best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
+    if sloped:
+        descend(evaluate, problem, best, result.x, STEPS, lambda seen: None, close=FINISH * CLOSE, scale=CAREFUL)
+    own, seen = evaluate.fly(problem, found.share[None]), evaluate.fly(problem, best.share[None])
     return Check(
-        gains=dict(zip(problem.names, np.asarray(evaluate.bounds.gains(jnp.asarray(z[first]))).tolist(), strict=True)),
-        value=float(np.exp(seen.value[first])),
-        distance=float(own.f[0] - seen.f[first]),
-        kept=bool(seen.c[first].max(initial=-1.0) <= SLACK),
+        gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),
+        value=best.value,
+        distance=float(own.f[0]) - best.f,
+        kept=bool(seen.c[0].max(initial=-1.0) <= SLACK),
         rollouts=evaluate.rollouts - before,
     )

@@ -149,13 +149,13 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
 
 
 def of_paper(scenario: Scenario) -> dict[str, float]:
-    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2.
+    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; a smooth sign 1e-3 wide.
 
     delta is a period or more, and half of t_f or less where a period is.
     """
     shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
     delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
-    gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "surface_rate": 1.0}
+    gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
     if isinstance(scenario.plant, plant_tables.ChainPlant):
         gains["eta"] = scenario.plant.order + 1.0
     papers = isinstance(scenario.observer, law_tables.NonlinearObserver | law_tables.EachNonlinearObserver)

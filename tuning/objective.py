@@ -32,13 +32,11 @@ class Problem:
     coordinates: Coordinates  # of what is drawn, arrays over the trials first
     limits: Leaf  # (requirements,) in the metrics' units
     counted: Leaf  # (requirements, trials) bool: whether a trial beyond the averaged ones must keep a limit
-    # the smooth sign is at least so many times K2 wide, the observer's bound: narrower ones chatter, without slopes
-    widened: Leaf
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
     # of the averaged trials, how many must keep each limit; None: every trial must
-    least: tuple[int | None, ...] = field(default=(), metadata={"static": True})
+    least: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
     torque_weight: float = field(default=0.0, metadata={"static": True})
@@ -62,10 +60,10 @@ def problem(
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=jnp.asarray([r.limit for r in requirements], dtype=float),
         counted=jnp.zeros((len(requirements), 0), dtype=bool),
-        widened=jnp.zeros(()),
         averaged=len(trials),
         names=names,
         metrics=tuple(r.metric for r in requirements),
+        least=(None,) * len(requirements),
     )
     return replace(with_trials(made, trials), **others)
 
@@ -101,19 +99,7 @@ def with_trials(
 
 def whole_rows(problem: Problem) -> np.ndarray:
     """(requirements,) bool: limits that every trial must keep."""
-    return np.asarray([least is None for least in problem.least or (None,) * len(problem.metrics)], dtype=bool)
-
-
-def with_sign(problem: Problem, width: float, widened: float = 0.0) -> Problem:
-    """The problem flown with another width of the smooth sign, if its law has one; 0 is the exact one."""
-    if not hasattr(problem.parts.controller, "sign_width"):
-        return problem
-    parts = _signed(problem.parts, jnp.asarray(float(width)))
-    return replace(problem, parts=parts, widened=jnp.asarray(float(widened)))
-
-
-def _signed(parts: Parts, width: Array) -> Parts:
-    return replace(parts, controller=replace(parts.controller, sign_width=width))
+    return np.asarray([least is None for least in problem.least], dtype=bool)
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
@@ -127,9 +113,6 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     """
     named = dict(zip(problem.names, gains, strict=True))
     parts = with_gains(problem.parts, named)
-    if hasattr(parts.controller, "sign_width"):
-        bound = problem.widened * parts.observer.error_bound().largest
-        parts = _signed(parts, jnp.maximum(parts.controller.sign_width, bound))
 
     def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
         trial, coordinates = case
@@ -152,9 +135,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
         weighted = weighted + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
     rows = [
         _asked(row, least, problem.averaged, counted[problem.averaged :])
-        for row, least, counted in zip(
-            over.T, problem.least or (None,) * len(problem.metrics), problem.counted, strict=True
-        )
+        for row, least, counted in zip(over.T, problem.least, problem.counted, strict=True)
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
     return weighted, constraints, value

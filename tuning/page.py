@@ -213,10 +213,7 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "history.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     goal = list(rows[0])[2]
-    caption = (
-        "The descent of every start under the smooth sign; hollow: beyond a limit. What it found was then polished, "
-        "and refined as it is judged."
-    )
+    caption = "The way of every start to the optimum next to it, by the slopes of what flies; hollow: beyond a limit."
     sections = [
         *_limits(summary["verdicts"]),
         Section("Gains", [_table(told.tuning(summary), told.tuning_heading(summary).capitalize() + ".")]),
@@ -265,7 +262,7 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    lines = [f"each law tuned alike, judged on {summary['trials']} fresh trials, flight clock, exact sign"]
+    lines = [f"each law tuned alike, all of its gains free, judged on {summary['trials']} fresh trials, flight clock"]
     best = min(summary["laws"], key=lambda law: _error(summary["laws"][law]))
     lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
     meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}

@@ -21,10 +21,10 @@ from ptsmc_jax.scenario import study
 from ptsmc_jax.schema import wrong
 from ptsmc_jax.tables import Limit, Scenario
 from tuning import gains, report, trust
-from tuning.evaluate import Evaluator
 from tuning.journal import Journal
-from tuning.objective import T_F, Problem, with_sign
+from tuning.objective import T_F, Problem
 from tuning.optimise import MARGIN, Run, Search, search
+from tuning.refine import NEARBY
 from tuning.starts import Report
 
 TORQUE = "peak_torque"
@@ -32,11 +32,12 @@ OFF = 1e9  # a limit that holds nothing back
 HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that nothing keeps
 FEWER = 4  # starts of the search for the least torque
 WARM = 3  # of the gains known so far, from which each step of the ladder starts
-APART = 1e-3  # free reals of two points, at least
+STEPS = 40  # points looked at from each of them, at most
+APART = 1e-3  # of the bounds' intervals between two points, at least
 RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
 
 
-Found = tuple[float, float, np.ndarray]  # F, goal, free reals
+Found = tuple[float, float, np.ndarray]  # F, goal, shares of the bounds' intervals
 
 
 @dataclass(frozen=True)
@@ -102,11 +103,11 @@ def trace(
     def told(what: str) -> Report:
         return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
 
-    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "exact": posed.exact}
+    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in ready.requirements]
     free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
     _unless_interrupted(free)
-    problem = replace(free.smooth, limits=problem.limits)
+    problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
     tight = HARDLY * highest
     least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
@@ -115,7 +116,7 @@ def trace(
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
-    climbed = _climb([under(limit) for limit in ladder], evaluate, [free.z, least.z], posed.exact, tell)
+    climbed = _climb([under(limit) for limit in ladder], [free.share, least.share], posed, tell)
     climbed = {float(ladder[k]): found for k, found in climbed.items()}
     fresh_seed = report.seed_of_judge(seed)
     judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
@@ -154,9 +155,7 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _climb(
-    ladder: Sequence[Problem], evaluate: Evaluator, known: list[np.ndarray], exact: bool, tell: Report
-) -> dict[int, Found]:
+def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: report.Posed, tell: Report) -> dict[int, Found]:
     """What is found on each rung, down the ladder and up again, each from what is known by then.
 
     One rung of those that a limit does not hold back, and whose gains are the same.
@@ -165,7 +164,7 @@ def _climb(
     rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
     for done, k in enumerate(rungs):
         tell("ladder", done, len(rungs), np.nan, 0.0)
-        found = _step(evaluate, ladder[k], np.unique(np.asarray(known), axis=0), exact)
+        found = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
         if found is not None and (k not in best or found[0] < best[k][0]):
             best[k] = found
             known.append(found[2])
@@ -176,22 +175,24 @@ def _climb(
     return apart
 
 
-def _step(evaluate: Evaluator, problem: Problem, known: np.ndarray, exact: bool) -> Found | None:
-    """F, goal and free reals of the best gains that keep these limits, from the most promising known ones."""
-    flown = evaluate.fly(with_sign(problem, 0.0) if exact else problem, known)
-    chosen = np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]
-    run = Run(evaluate, MARGIN, exact, lambda *told: None)
-    run.step(problem, known[chosen], np.random.default_rng(0))
+def _step(posed: report.Posed, problem: Problem, known: np.ndarray) -> Found | None:
+    """F, goal and shares of the best gains that keep these limits, from the most promising known ones."""
+    flown = posed.evaluate.fly(problem, known)
+    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]]
+    run = Run(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0), lambda *told: None)
+    if posed.sloped:
+        run.descend(problem, chosen)
+    else:
+        run.evolve(problem, chosen[0], NEARBY)
     value, over_limit = run.best_so_far
     return None if over_limit > 0.0 or not np.isfinite(value) else run.best_point
 
 
 def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[float, tuple[Point, Trials]]:
     judged = {}
-    for k, (limit, (_, value, z)) in enumerate(found.items()):
+    for k, (limit, (_, value, share)) in enumerate(found.items()):
         tell("judging on fresh trials", k, len(found), np.nan, 0.0)
-        values = np.asarray(evaluate.bounds.gains(jnp.asarray(z)))
-        named = {name: report.rounded(v) for name, v in zip(evaluate.bounds.names, values, strict=True)}
+        named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(share))), report.DIGITS)
         trials = report.judge(gains.in_scenario(scenario, named), fresh_seed, requirements)
         judged[limit] = _point(limit, named, value, trials, requirements), trials
     return judged

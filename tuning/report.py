@@ -3,16 +3,14 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import draws, montecarlo, runs, tables, theory
+from ptsmc_jax import draws, montecarlo, runs, tables
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
 from ptsmc_jax.requirements import Requirement, Verdict, least_within
-from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
@@ -27,7 +25,6 @@ from tuning.optimise import Search, search
 from tuning.starts import Report
 from tuning.trust import Profile
 
-SMOOTH = 1e-3  # width of the sign that is descended by where the scenario flies the exact one
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
@@ -37,7 +34,7 @@ SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering"
 class Trust:
     """What makes the result believable, see `tuning.trust`."""
 
-    slope_error: tuple[float, float]  # at the first start and at the end
+    slope_error: tuple[float, float] | None  # at the first start and at the end; None: flown with the exact sign
     profiles: dict[str, Profile]
     sensitivities: dict[str, dict[str, float]]
 
@@ -61,7 +58,6 @@ class Tuning:
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
     check: Check | None  # of a global search, if it was asked for
-    smooth_value: float | None  # the goal under the smooth sign that the descent went by; None: it is the judge's too
     rollouts: int  # trials flown in the search without slopes
     gradients: int  # and with
     seconds: float  # of the search
@@ -106,15 +102,17 @@ def tune(
         table.starts,
         table.steps,
         seed,
-        exact=posed.exact,
+        sloped=posed.sloped,
         robust=table.worst_case,
         report=report,
     )
     seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
-    check = evolution.check(evaluate, found, seed, report) if globally and not found.interrupted else None
+    check = None
+    if globally and not found.interrupted:
+        check = evolution.check(evaluate, found, seed, report, sloped=posed.sloped)
 
     report("judging on fresh trials", 0, 0, found.value, 0.0)
-    named = {name: rounded(value) for name, value in zip(problem.names, found.gains, strict=True)}
+    named = evaluate.bounds.rounded(found.gains, DIGITS)
     tuned = as_flown(gains.in_scenario(scenario, named))
     trained = gains.with_gains(found.problem.parts, named)
     training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
@@ -129,17 +127,17 @@ def tune(
     shortest = None
     if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
         shortest = shortest_time(tuned, limit, fresh_seed, fresh["tuned"].trial)
-    believed = smooth_value = None
+    believed = None
     if trusted and not found.interrupted:
-        if posed.exact:
-            smooth_value = float(np.exp(evaluate.fly(found.smooth, found.z[None]).value[0]))
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
         believed = Trust(
             slope_error=(
-                trust.slope_error(evaluate, found.smooth, evaluate.bounds.free(own)),
-                trust.slope_error(evaluate, found.smooth, found.z),
-            ),
-            profiles=trust.profiles(evaluate, found.problem, found.z),
+                trust.slope_error(evaluate, found.problem, evaluate.bounds.share(own)),
+                trust.slope_error(evaluate, found.problem, found.share),
+            )
+            if posed.sloped
+            else None,
+            profiles=trust.profiles(evaluate, found.problem, found.share),
             sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, wanted),
         )
     return Tuning(
@@ -158,7 +156,6 @@ def tune(
         shortest=shortest,
         trust=believed,
         check=check,
-        smooth_value=smooth_value,
         rollouts=rollouts,
         gradients=gradients,
         seconds=seconds,
@@ -173,7 +170,7 @@ class Posed:
     problem: Problem
     evaluate: Evaluator
     own: np.ndarray  # (gains,) of the scenario
-    exact: bool  # gains are judged with the exact sign
+    sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
 
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
@@ -196,20 +193,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
         torque_weight=table.torque_weight,
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
-    smooth = hasattr(scenario.controller, "sign_width") and "sign_width" not in bounds.names
-    exact = smooth and scenario.loop.mode == "sampled"  # as `as_flown` judges
-    if exact:
-        own_width = float(ready.parts.controller.sign_width) or SMOOTH
-        problem = objective.with_sign(problem, own_width, _widened(ready.parts, scenario.loop.period))
-    return Posed(ready, problem, Evaluator(bounds, journal), own, exact)
-
-
-def _widened(parts: Parts, period: float) -> float:
-    """Width of the narrowest smooth sign that does not chatter, over the observer's bound, with which it grows."""
-    bound = float(parts.observer.error_bound().largest)
-    if not isinstance(parts.controller, Prescribed) or bound == 0.0:
-        return 0.0
-    return theory.narrowest_sign(parts, period) / bound
+    exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
+    return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact)
 
 
 def seed_of_judge(seed: int) -> int:
@@ -251,15 +236,8 @@ def verdicts_of(requirements: Sequence[Requirement], trials: Trials) -> list[Ver
 
 
 def as_flown(scenario: Scenario) -> Scenario:
-    """The scenario on the flight clock with the exact sign; a continuous loop, or a tuned sign width, as it is."""
-    if scenario.loop.mode != "sampled":
-        return scenario
-    changes: dict[str, Any] = {"loop__clock": "flight"}
-    if hasattr(scenario.controller, "sign_width") and (
-        scenario.tune is None or "sign_width" not in gains.named(scenario)
-    ):
-        changes["controller__sign_width"] = 0.0
-    return replace(scenario, **changes)
+    """The scenario on the flight clock; a continuous loop as it is."""
+    return replace(scenario, loop__clock="flight") if scenario.loop.mode == "sampled" else scenario
 
 
 def judged_on(flown: Scenario) -> str:
@@ -311,8 +289,3 @@ def _tail(table: tables.Tune, trials: int) -> int | None:
         return None
     assert table.level is not None or table.objective == "worst"
     return 1 if table.level is None else max(1, round((1.0 - table.level) * trials))
-
-
-def rounded(value: float) -> float:
-    """A gain as it is handed over."""
-    return float(f"{value:.{DIGITS}g}")

@@ -1,6 +1,7 @@
 """The files of a tuning run: summary, history, tuned scenario, figures."""
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import drawing, metrics, schema, store, study_plots, systems
+from ptsmc_jax import drawing, free_gains, metrics, schema, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.tables import Scenario
 from tuning import gains as gain_names
 from tuning import trust
+from tuning.optimise import Step
 from tuning.report import GOALS, Trust, Tuning, judged_on
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
@@ -68,10 +70,9 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "search": {
             "objective": tuning.tuned.tune.objective,
             "goal": found.value,
-            "starts": int(found.history[0].value.size),
-            "steps": len(found.history) - 1,
+            "starts": len({step.start for step in found.history}),
+            "steps": len(found.history),
             "rounds_with_harder_trials": found.rounds,
-            "dropped_starts": found.dropped,
             "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
@@ -85,7 +86,6 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
             "seconds_by_step": found.seconds,
-            "goal_under_the_smooth_sign": tuning.smooth_value,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": checked,
@@ -106,6 +106,7 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
 
 def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
     loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
+    assert tuning.tuned.tune is not None
     influence = {}
     for name, profile in believed.profiles.items():
         if profile.flat:
@@ -115,9 +116,12 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
         elif loop.mode == "continuous" and not sensed and gain_names.base(name) in ("delta", "observer_gain"):
             influence[name] = "no trade-off: without sampling and noise more of it only helps"
         else:
-            influence[name] = "better beyond its bound"
+            gain, side = gain_names.base(name), tuning.at_bound[name]
+            bound = tuning.tuned.tune.bounds[gain][side == "upper"]
+            influence[name] = free_gains.border(tuning.tuned, gain, side, bound) or "better beyond its bound"
+    slopes = believed.slope_error
     return {
-        "slopes_off_central_differences": dict(zip(("start", "end"), believed.slope_error, strict=True)),
+        "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
         "sensitivities": believed.sensitivities,
         "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
@@ -135,13 +139,18 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     goal = objective if objective == "t_f" else f"{objective}_window_error"
     over = [f"{m}_over_limit" for m in scenario.requirements]
     rows = [
-        [step, start, row.value[start], *row.gains[start], *row.worst[start]]
-        for step, row in enumerate(tuning.search.history)
-        for start in range(row.value.size)
+        [step, row.start, row.value, *row.gains, *row.worst]
+        for path in _paths(tuning.search.history)
+        for step, row in enumerate(path)
     ]
     store.write_csv(folder / "history.csv", ["step", "start", goal, *gain_names.named(scenario), *over], rows)
     if figures:
         drawing.save(figures_of(scenario, tuning), folder / "figures")
+
+
+def _paths(history: Sequence[Step]) -> list[list[Step]]:
+    """The points that each start went through, start by start."""
+    return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
 def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
@@ -155,17 +164,18 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     assert scenario.tune is not None
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]
-    first = tuning.search.history[0].value.size
-    history = [step for step in tuning.search.history if step.value.size == first]
+    paths = _paths(tuning.search.history)
+    # starts that end earlier stay where they are
+    history = [[path[min(k, len(path) - 1)] for path in paths] for k in range(max(map(len, paths)))]
     limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
     unit = "s" if scenario.tune.objective == "t_f" else metrics.CATALOGUES[kind]["window_error"][0]
     goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
-    moved = np.stack([step.gains for step in history])
+    moved = np.asarray([[step.gains for step in steps] for steps in history])
     found = {
         "history": study_plots.tuning_history(
             {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
-            np.stack([step.value for step in history]),
-            np.stack([np.all(step.worst <= 1.0, axis=1) for step in history]),
+            np.asarray([[step.value for step in steps] for steps in history]),
+            np.asarray([[np.all(step.worst <= 1.0) for step in steps] for steps in history]),
             goal,
         ),
         "tradeoff": study_plots.tradeoff(

@@ -127,6 +127,11 @@ def floor(error: float | None, least: float | None) -> str:
     return f", {error / least:.3g} times the floor {least:.2e}" if error and least else ""
 
 
+def _over_floor(found: Summary) -> float | None:
+    known = found["window_error"] and found.get("floor")
+    return found["window_error"] / found["floor"] if known else None
+
+
 def _times(group: Summary) -> str:
     known = group["window_error"] and group.get("floor")
     return f"{group['window_error']['rms'] / group['floor']:.3g}" if known else "-"
@@ -145,8 +150,6 @@ def _between(interval: Sequence[float] | None, digits: str) -> str:
 def search(summary: Summary) -> Iterator[str]:
     """How the search went."""
     found = summary["search"]
-    if found["dropped_starts"]:
-        yield f"starts dropped, since they met a number that is not finite: {found['dropped_starts']}"
     for metric, ratio in found.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
             lost = ratio is None or math.isinf(ratio)
@@ -179,11 +182,6 @@ def search(summary: Summary) -> Iterator[str]:
                 f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
             )
         )
-    smooth = found.get("goal_under_the_smooth_sign")
-    if smooth is not None:
-        off = 100 * (smooth / found["goal"] - 1)
-        shown = f"{off:+.0f}" if abs(off) >= 10.0 else f"{off:+.2g}"
-        yield f"descended under the smooth sign, settled under the exact one: their goals differ by {shown} % here"
     checked = summary.get("differential_evolution")
     if checked is not None:
         kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
@@ -201,11 +199,16 @@ def trust(summary: Summary) -> Iterator[str]:
     believed = summary.get("trust")
     influence = {} if believed is None else believed["influence"]
     for gain, side in summary["at_bound"].items():
+        if influence.get(gain) == "none":
+            continue
         yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
     for gain, how in influence.items():
         if how == "none":
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
     if believed is None:
+        return
+    if believed["slopes_off_central_differences"] is None:
+        yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
         return
     off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
     shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
@@ -237,6 +240,8 @@ def comparison(summary: Summary) -> Table:
         rows.append((label, *("-" if cell is None else f"{cell:{digits}}" for cell in cells), unit))
 
     row("RMS window error", "-", lambda found: found["window_error"], ".2e")
+    if any(found.get("floor") for found in laws.values()):
+        row("times the floor", "", _over_floor)
     row("mean peak torque", "N m", lambda found: found["peak_torque"])
     row("largest", "N m", lambda found: found["largest_peak_torque"])
     row("mean effort", "N m s", lambda found: found["effort"])

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -15,7 +13,7 @@ from tuning.evaluate import Evaluator
 from tuning.gains import with_gains
 from tuning.objective import Problem
 
-DIFFERENCE = 1e-3  # of the free reals, for slopes by differences
+DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
 STEP = 1e-2  # of the gains, relative, for sensitivities
 SMALLEST = 1e-6  # slopes of ln F below this are none
 ACROSS = 15  # gains looked at between the bounds of each, besides the one found
@@ -24,16 +22,16 @@ CONFIDENCE = 0.95  # of intervals
 RESAMPLED = 2000  # times, for an interval
 
 
-def slope_error(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> float:
-    """Largest difference of F's slopes, by automatic differentiation, from central differences, at z (gains,).
+def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> float:
+    """Largest difference of F's slopes, by automatic differentiation, from central differences, at shares (gains,).
 
-    Over the largest slope, in the free reals; differences of order 4 over +-`DIFFERENCE`.
+    Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it.
     """
-    count = z.size
+    count, inside = share.size, np.clip(share, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
-    f = evaluate.fly(problem, z + offsets).f.reshape(4, count)
+    f = evaluate.fly(problem, inside + offsets).f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
-    exact = evaluate.slopes(problem, z[None]).f_slope[0]
+    exact = evaluate.slopes(problem, inside[None]).f_slope[0]
     return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
 
 
@@ -53,17 +51,15 @@ class Profile:
         return bool(steady and self.over.max() <= (1.0 + FLAT) * self.over.min())
 
 
-def profiles(evaluate: Evaluator, problem: Problem, z: np.ndarray) -> dict[str, Profile]:
-    """How the goal goes with each gain, by its name; z: (gains,) free reals of what was found."""
-    share = np.linspace(0.01, 0.99, ACROSS)
-    points = np.repeat(z[None], (ACROSS + 1) * z.size, axis=0).reshape(z.size, ACROSS + 1, z.size)
-    for k in range(z.size):
-        points[k, :, k] = np.sort(np.append(np.log(share / (1.0 - share)), z[k]))
-    flown = evaluate.fly(problem, points.reshape(-1, z.size))
-    gains = np.asarray(jax.vmap(evaluate.bounds.gains)(jnp.asarray(points.reshape(-1, z.size))))
-    over = flown.beyond + 1.0
-    shape = (z.size, ACROSS + 1)
-    gains, value, over, f = (v.reshape(*shape, -1) for v in (gains, np.exp(flown.value), over, flown.f))
+def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
+    """How the goal goes with each gain, by its name; share: (gains,) of the bounds' intervals, of what was found."""
+    count = share.size
+    points = np.tile(share, (count, ACROSS + 1, 1))
+    for k in range(count):
+        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
+    flown = evaluate.fly(problem, points.reshape(-1, count))
+    found = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
+    gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in found)
     return {
         name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0]) for k, name in enumerate(problem.names)
     }

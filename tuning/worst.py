@@ -47,7 +47,10 @@ class Hardest:
         return not self.ratio <= 1.0 + NEAR
 
 
-def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+Screened = tuple[np.ndarray, np.ndarray]  # trials, (trials,) metric / limit
+
+
+def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Screened:
     """Trials that no search has averaged, and how near each comes to its limits, (trials,) metric / limit."""
     parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
@@ -56,13 +59,15 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
     return trials, np.max(np.where(flown.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
 
-def hardest(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Hardest:
+def hardest(
+    problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, screened: Screened | None = None
+) -> Hardest:
     """The worst trial for these gains inside the dispersions' support, by gradient ascent from the hardest drawn.
 
     Moved are initial attitude or state, initial rate and disturbance phase; true inertia and noise stay as drawn. A
-    normal dispersion, which has no bounds, is searched where `HELD` of it lies.
+    normal dispersion, which has no bounds, is searched where `HELD` of it lies. screened: what `screen` found for them.
     """
-    trials, ratio = screen(problem, requirements, gains)
+    trials, ratio = screened or screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
     names, limits = tuple(r.metric for r in requirements), jnp.asarray([r.limit for r in requirements])
     coordinates = coordinates_of(problem.dispersion, int(problem.seed), chosen)
