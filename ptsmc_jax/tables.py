@@ -94,7 +94,7 @@ class Tune(Table, frozen=True):
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
         trials: trials to tune on; more where a quantile with a confidence takes more to be shown at all
-        starts: points to search from: the scenario's gains, and the most promising of a small sweep
+        starts: points to search from, twice as many with a few steps each: the scenario's, and the best of a sweep
         steps: points looked at from each start, at most, with slopes
     """
 

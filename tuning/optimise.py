@@ -18,7 +18,7 @@ from tuning.descent import BOLD, BROKEN, CAREFUL, CLOSE, Best, descend, largest
 from tuning.evaluate import Evaluator, Measured
 from tuning.objective import FAILED, Problem, coordinates_of, failures, whole_rows, with_trials
 from tuning.refine import GENERATIONS, NEARBY, WIDELY, refine
-from tuning.starts import CHOOSING, SWEPT, Report, promising, spread, starting_points
+from tuning.starts import APART, CHOOSING, STEEP, SWEPT, Report, charged, promising, spread, starting_points
 from tuning.work import ROUND, SLOPED, Work
 from tuning.worst import Hardest
 
@@ -28,10 +28,12 @@ HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
 ROUNDS = 6  # searches again with hardest trials added, at most
 AGAIN = 3  # starts, from whose best points they go on
+# many starts, each with one in `SHORT` of the steps, then one in `FOLLOWED` of them with all: few lead to the optimum
+MORE, SHORT, FOLLOWED = 2, 4, 4
 FINISH = 1e-2  # of `CLOSE`: how near to the optimum the best start is taken in the end
 MANY = 512  # points swept where there are no slopes
 
-SEARCHING, FINISHING, EVOLVING = "searching", "finishing", "evolving"
+SEARCHING, FOLLOWING, FINISHING, EVOLVING = "searching", "following the best", "finishing", "evolving"
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ def search(
 
     try:
         if sloped:
-            first = starting_points(evaluate, run.tightened(problem), own, starts, seed, report)
+            first = starting_points(
+                evaluate, run.tightened(problem), own, MORE * starts if starts > 1 else 1, seed, report
+            )
         else:
             first = run.swept(problem, own)
         joined = 0
@@ -179,7 +183,12 @@ def _planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tupl
         return {CHOOSING: MANY * trials, **evolving}, {ROUND: 0.0, **evolving}
     one = SLOPED * steps * trials
     return (
-        {CHOOSING: max(SWEPT, starts) * trials if starts > 1 else 0.0, SEARCHING: starts * one, FINISHING: one},
+        {
+            CHOOSING: SWEPT * trials if starts > 1 else 0.0,
+            SEARCHING: MORE * starts * one / SHORT,
+            FOLLOWING: max(1.0, MORE * starts / FOLLOWED) * one,
+            FINISHING: one,
+        },
         {ROUND: AGAIN * one, FINISHING: one},
     )
 
@@ -253,18 +262,34 @@ class Run:
         return np.asarray(self._evaluate.bounds.gains(jnp.asarray(self.share)))
 
     def descend(self, problem: Problem, starts: np.ndarray) -> None:
-        """From each of these starts, (starts, gains), and on from the best of what is found."""
+        """From each of these starts, (starts, gains), a few steps, and from the most promising ends all of the way."""
+        few, followed = max(2, self._steps // SHORT), max(1, len(starts) // FOLLOWED)
         for k, start in enumerate(starts):
             self._report(SEARCHING, k, len(starts), *self.best_so_far)
-            self._descend(problem, start, k, scale=BOLD if k % 2 else CAREFUL)
+            self._descend(problem, start, k, few, scale=BOLD if k % 2 else CAREFUL)
+        for rank, k in enumerate(self._best_of_each_valley(followed)):
+            self._report(FOLLOWING, rank, followed, *self.best_so_far)
+            self._descend(problem, self._ends[k].share, k, self._steps, scale=CAREFUL)
         self._finish(problem)
+
+    def _best_of_each_valley(self, count: int) -> list[int]:
+        """So many starts, by what they found; of those that ended beside each other one first."""
+        ends = self._ends
+        order = sorted(ends, key=lambda k: charged(ends[k].f, ends[k].over, STEEP))
+        chosen: list[int] = []
+        for distance in (APART, 0.0):
+            for k in order:
+                apart = all(np.abs(ends[k].share - ends[other].share).max() >= distance for other in chosen)
+                if len(chosen) < count and k not in chosen and apart:
+                    chosen.append(k)
+        return chosen
 
     def again(self, problem: Problem) -> None:
         """On from where the best starts ended, with what has joined the problem."""
         ranked = sorted(self._ends.items(), key=lambda item: item[1].rank)
         afresh = True
         for start, end in ranked[:AGAIN]:
-            self._descend(problem, end.share, start, scale=CAREFUL, afresh=afresh)
+            self._descend(problem, end.share, start, self._steps, scale=CAREFUL, afresh=afresh)
             afresh = False
         self._finish(problem)
 
@@ -287,13 +312,14 @@ class Run:
 
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.best_so_far)
-        self._descend(problem, self.share, self._from, scale=CAREFUL, close=FINISH * CLOSE)
+        self._descend(problem, self.share, self._from, self._steps, scale=CAREFUL, close=FINISH * CLOSE)
 
     def _descend(
         self,
         problem: Problem,
         share: np.ndarray,
         start: int,
+        steps: int,
         *,
         scale: float,
         close: float = CLOSE,
@@ -302,7 +328,7 @@ class Run:
         best, tightened = Best(share, len(problem.metrics), self._margin), self.tightened(problem)
         keep = partial(self._keep, start)
         try:
-            descend(self._evaluate, tightened, best, share, self._steps, keep, close=close, scale=scale)
+            descend(self._evaluate, tightened, best, share, steps, keep, close=close, scale=scale)
         finally:  # interrupted too
             self._take(best, tightened, start, afresh=afresh)
 

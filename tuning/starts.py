@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -70,4 +71,9 @@ def _valleys_first(merits: np.ndarray, apart: np.ndarray) -> list[int]:
 
 def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
     """(points,) F, with what the trials that end are beyond a limit charged, so many times as hard."""
-    return flown.f + CHARGE * np.log1p(times * np.maximum(flown.beyond, 0.0))
+    return charged(flown.f, flown.beyond, times)
+
+
+def charged(f: Any, beyond: Any, times: float) -> Any:
+    """F with a breach of a limit charged, so many times as hard."""
+    return f + CHARGE * np.log1p(times * np.maximum(beyond, 0.0))
