@@ -92,10 +92,12 @@ def test_bounds_map_shares_into_the_interval_and_back():
 
 
 def test_gains_handed_over_are_rounded_inside_their_bounds():
-    some = bounds.Bounds(("delta", "k1"), (0.123456789, 0.1), (5.0, 1.23456789))
-    found = some.rounded(np.array([0.123456789, 1.23456789]), 6)
-    assert found == {"delta": 0.123457, "k1": 1.23456789}
-    assert some.rounded(np.array([0.5012345678, 0.1]), 6) == {"delta": 0.501235, "k1": 0.1}
+    some = bounds.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
+    found = some.rounded(np.array([2.123456789, 1.23456789]), 6)
+    assert found == {"eta": 2.12346, "k1": 1.23456789}
+    assert some.rounded(np.array([2.5012345678, 0.1]), 6) == {"eta": 2.50123, "k1": 0.1}
+    times = bounds.Bounds(("delta",), (0.1,), (5.0,))  # on its sample, however long the period
+    assert times.rounded(np.array([7 * 0.123456789]), 6)["delta"] == pytest.approx(7 * 0.123456789, rel=1e-11)
 
 
 measure = jax.jit(objective.measure)
@@ -239,15 +241,17 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert sum(told[0] == "searching" for told in seen) == 6
     # 64 points are swept and 16 trials screened twice
     assert evaluate.rollouts == 64 * found.problem.trials.size + 2 * 16
-    # a quarter of the steps from each, all of them from a quarter of the ends, and from the best
-    assert evaluate.gradients <= (6 * 10 + 40 + 40) * found.problem.trials.size
+    # a quarter of the steps from each, all of them from a quarter of the ends, from the best, and on two samples
+    assert evaluate.gradients <= (6 * 10 + 4 * 40) * found.problem.trials.size
+    np.testing.assert_allclose(found.gains[1] / 0.2, np.round(found.gains[1] / 0.2), rtol=1e-9)
     final = found.problem
 
     @jax.jit
     def scan(points):
         return jax.lax.map(lambda at: objective.measure(final, at)[:2], points)
 
-    grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 25), np.geomspace(0.2, 5.0, 41)), axis=-1).reshape(-1, 2)
+    # hand-overs on samples, as they are flown
+    grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 49), 0.2 * np.arange(1, 26)), axis=-1).reshape(-1, 2)
     f, c = scan(jnp.asarray(grid))
     best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= 0.0].min())
     assert found.value <= best * 1.01

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 from ptsmc_jax.tables import Scenario
 from tuning import gains as gain_names
 
+TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may fall behind its sample
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -48,10 +50,10 @@ class Bounds:
         return sides
 
     def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
-        """Gains by name with so many digits, none of them beyond its bounds."""
-        kept = (float(f"{gain:.{digits}g}") for gain in gains)
-        within = zip(self.names, kept, self.lower, self.upper, strict=True)
-        return {name: min(max(gain, low), high) for name, gain, low, high in within}
+        """Gains by name with so many digits, none of them beyond its bounds; times stay on their samples."""
+        within = zip(self.names, gains, self.lower, self.upper, strict=True)
+        shown = {name: TIME_DIGITS if name in TIMES else digits for name in self.names}
+        return {name: min(max(float(f"{gain:.{shown[name]}g}"), low), high) for name, gain, low, high in within}
 
 
 def of_scenario(scenario: Scenario) -> Bounds:

@@ -1,7 +1,7 @@
 """From one start to the optimum next to it, along the active limits, by sequential quadratic programming."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import minimize
@@ -63,12 +63,13 @@ def descend(
     *,
     close: float = CLOSE,
     scale: float = BOLD,
+    fixed: Sequence[int] = (),
 ) -> None:
     """From these shares, (gains,), downhill inside the bounds; what is best is kept in `best`.
 
     At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
-    slope over scale^2. keep is called with what was measured at each point that the descent goes through, without those
-    that it only tries.
+    slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the
+    descent goes through, without those that it only tries.
     """
     seen: dict[bytes, Sloped] = {}
 
@@ -101,7 +102,7 @@ def descend(
             first.copy(),
             jac=lambda scaled: _usable(at(scaled).f_slope)[0] / scale,
             method="SLSQP",
-            bounds=[(0.0, scale)] * share.size,
+            bounds=[(at, at) if k in fixed else (0.0, scale) for k, at in enumerate(first)],
             constraints=[limits] if problem.metrics else [],
             callback=passed,
             options={"maxiter": steps, "ftol": close},

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from tuning.descent import CAREFUL, CLOSE, SLACK, Best, descend
+from tuning.descent import SLACK, Best
 from tuning.evaluate import Evaluator
-from tuning.optimise import FINISH, Search
+from tuning.optimise import Run, Search
 from tuning.starts import Report
 
 POPULATION = 40  # points for each gain
@@ -63,11 +63,12 @@ def check(
         init="sobol",
         callback=tell,
     )
-    # near a limit evolution goes slowly: from where it ends, along it
     best = Best(result.x, len(problem.metrics), found.margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
-    if sloped:
-        descend(evaluate, problem, best, result.x, STEPS, lambda seen: None, close=FINISH * CLOSE, scale=CAREFUL)
+    if sloped:  # near a limit evolution goes slowly: from where it ends, along it
+        run = Run(evaluate, found.margin, STEPS, np.random.default_rng(seed), lambda *told: None)
+        run.descend(found.problem, result.x[None])
+        best.f, best.value, best.share = run.best_point
     own, seen = evaluate.fly(problem, found.share[None]), evaluate.fly(problem, best.share[None])
     return Check(
         gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),

@@ -4,6 +4,7 @@ A small sweep chooses the starts, and sequential quadratic programming on the sl
 on from each of them. Gains flown with the exact sign have no slopes: they are looked for by evolution instead.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,9 +12,11 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.clock import Anchored
 from ptsmc_jax.requirements import Requirement
 from tuning import confirm
 from tuning import worst as worst_case
+from tuning.bounds import TIMES
 from tuning.descent import BOLD, BROKEN, CAREFUL, CLOSE, Best, descend, largest
 from tuning.evaluate import Evaluator, Measured
 from tuning.objective import FAILED, Problem, coordinates_of, failures, whole_rows, with_trials
@@ -313,6 +316,33 @@ class Run:
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.best_so_far)
         self._descend(problem, self.share, self._from, self._steps, scale=CAREFUL, close=FINISH * CLOSE)
+        on_samples = self._with_the_hand_over_on_a_sample(problem)
+        afresh = True
+        for share in on_samples:
+            times = [k for k, name in enumerate(problem.names) if name in TIMES]
+            self._descend(problem, share, self._from, self._steps, scale=CAREFUL, fixed=times, afresh=afresh)
+            afresh = False
+
+    def _with_the_hand_over_on_a_sample(self, problem: Problem) -> list[np.ndarray]:
+        """The best gains with the nearest hand-overs that are flown as they are trained; none where all are.
+
+        A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
+        """
+        clock, bounds = problem.parts.clock, self._evaluate.bounds
+        if "delta" not in problem.names or not isinstance(clock, Anchored):
+            return []
+        named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
+        t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)
+        samples = (t_f - named["delta"]) / period
+        found = []
+        for sample in sorted({math.floor(samples + 1e-9), math.ceil(samples - 1e-9)}):
+            if bounds.lower[at] * (1 - 1e-9) <= t_f - sample * period <= bounds.upper[at]:
+                gains = self.gains.copy()
+                gains[at] = t_f - sample * period
+                share = self.share.copy()
+                share[at] = bounds.share(gains)[at]
+                found.append(share)
+        return found
 
     def _descend(
         self,
@@ -323,12 +353,13 @@ class Run:
         *,
         scale: float,
         close: float = CLOSE,
+        fixed: Sequence[int] = (),
         afresh: bool = False,
     ) -> None:
         best, tightened = Best(share, len(problem.metrics), self._margin), self.tightened(problem)
         keep = partial(self._keep, start)
         try:
-            descend(self._evaluate, tightened, best, share, steps, keep, close=close, scale=scale)
+            descend(self._evaluate, tightened, best, share, steps, keep, close=close, scale=scale, fixed=fixed)
         finally:  # interrupted too
             self._take(best, tightened, start, afresh=afresh)
 
