@@ -47,14 +47,14 @@ Figures({"history": made["history"]})
 
 # %% [markdown]
 # What each gain does: by how many percent a metric changes for one percent of the gain. One percent of η costs two
-# percent of torque and buys some of the error: nothing but the limit on the torque stops it. δ and l are different, their
+# percent of torque and buys some of the error: nothing but the limit on the torque stops it. The others are different, their
 # best values lie inside the bounds: one percent of them changes the error by less than a percent.
 
 # %%
 Figures({"sensitivities": made["sensitivities"]})
 
 # %% [markdown]
-# Every fresh trial is a point. With the paper's gains many trials ask for more than the limit, 0.60 N m in the mean, and
+# Every fresh trial is a point. With the paper's gains many trials ask for more than the limit, 0.58 N m in the mean, and
 # their errors are the large ones; with the tuned gains all of them stay below it.
 
 # %%
