@@ -176,7 +176,7 @@ def _usual(scenario: Scenario, tune: tables.Tune, name: str) -> tuple[float, flo
         return max(0.5 * t_f, 1.05 * shortest, 1.05 * _t_o(scenario)), 2.0 * t_f
     if name == "delta":  # below every t_f
         t_f = tune.bounds.get("t_f", (t_f,))[0]
-        lower = max(_shortest_delta(scenario), min(0.05, t_f / 4))
+        lower = _shortest_delta(scenario) or min(0.05, t_f / 4)
         return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
     if name == "filter_bandwidth":
         width = filter_bandwidth(scenario)

@@ -94,8 +94,8 @@ class Tune(Table, frozen=True):
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
         trials: trials to tune on; more where a quantile with a confidence takes more to be shown at all
-        starts: points to search from, twice as many with a few steps each: the scenario's, and the best of a sweep
-        steps: points looked at from each start, at most, with slopes
+        starts: points to search from, most of them a few steps: the scenario's, and the best of a sweep
+        steps: points looked at from a start, at most, with slopes
     """
 
     free: FreeGains | None = None
@@ -107,7 +107,7 @@ class Tune(Table, frozen=True):
     worst_case: Truth = False
     # all trials are flown at once and held in memory
     trials: Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")] = 256
-    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 8
+    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 32
     steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
 
 

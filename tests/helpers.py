@@ -172,14 +172,14 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning import confirm, optimise, refine, starts, worst
+    from tuning import confirm, descents, refine, starts, worst
 
     for module, name, value in (
         (worst, "SCREENED", 64),
         (confirm, "FRESH", fresh),
         (confirm, "FEWEST", 64),
         (starts, "SWEPT", 16),
-        (optimise, "MANY", 16),
+        (descents, "MANY", 16),
         (refine, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import linear, montecarlo, pace, rollout, scenario, sensors
+from ptsmc_jax import free_gains, linear, montecarlo, pace, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, vector
@@ -199,10 +199,13 @@ def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
     assert low < value < high
 
 
-def test_default_bounds_hold_a_delta_of_one_period_which_is_the_least():
-    made = from_tables({"controller": {"delta": 0.02}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})
+@pytest.mark.parametrize("delta", [0.02, 0.05])
+def test_delta_is_looked_for_from_one_period_on_and_that_is_said_where_it_ends_there(delta):
+    made = from_tables({"controller": {"delta": delta}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})
     assert made.tune is not None
     assert made.tune.bounds["delta"] == (0.02, 5.0)
+    assert "one period" in str(free_gains.border(made, "delta", "lower", 0.02))
+    assert free_gains.border(made, "delta", "lower", 0.05) is None
 
 
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():

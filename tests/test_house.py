@@ -59,6 +59,7 @@ FLOORS = {
         evaluate
         worst trust descent starts confirm
         refine work
+        descents
         optimise
         evolution
         report single reproduction mapping

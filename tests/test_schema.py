@@ -83,7 +83,7 @@ TUNE_DEFAULTS = {
     "torque_weight": 0.0,
     "worst_case": False,
     "trials": 256,
-    "starts": 8,
+    "starts": 32,
     "steps": 40,
 }
 

@@ -418,5 +418,4 @@ def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypa
 
     monkeypatch.setattr(theory, "visited", spied)
     report.pose(scenario.from_tables(tables), 0)
-    # and at its own t_f, for the sign that the descent goes by
-    assert looked_at == [(0.5, 10.5), (3.0, 13.0)]
+    assert looked_at == [(0.5, 10.5)]

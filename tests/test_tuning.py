@@ -11,7 +11,21 @@ from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, 
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import bounds, confirm, descent, gains, objective, optimise, refine, report, results, starts, told, worst
+from tuning import (
+    bounds,
+    confirm,
+    descent,
+    descents,
+    gains,
+    objective,
+    optimise,
+    refine,
+    report,
+    results,
+    starts,
+    told,
+    worst,
+)
 from tuning.evaluate import Evaluator, Sloped
 
 SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -237,12 +251,13 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     )
     assert found.worst[0] <= 1.0
     assert [step.start for step in found.history] == sorted(step.start for step in found.history)
-    assert {step.start for step in found.history} == set(range(6))  # twice as many as asked for, a few steps each
-    assert sum(told[0] == "searching" for told in seen) == 6
-    # 64 points are swept and 16 trials screened twice
+    assert {step.start for step in found.history} == set(range(3))
+    assert sum(told[0] == "searching" for told in seen) == 2 * 3  # three starts on two rungs
+    # 64 points are swept, and 16 trials screened twice
     assert evaluate.rollouts == 64 * found.problem.trials.size + 2 * 16
-    # a quarter of the steps from each, all of them from a quarter of the ends, from the best, and on two samples
-    assert evaluate.gradients <= (6 * 10 + 4 * 40) * found.problem.trials.size
+    # twice half of the steps from the scenario's gains, and the limits there; twice half of them from each start, all
+    # of them from the most promising one, from its end and on two samples; eta put back
+    assert evaluate.gradients <= (2 * 20 + 1 + 2 * 3 * 20 + 20 + 3 * 40 + 2) * found.problem.trials.size
     np.testing.assert_allclose(found.gains[1] / 0.2, np.round(found.gains[1] / 0.2), rtol=1e-9)
     final = found.problem
 
@@ -260,12 +275,43 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert np.asarray(c).max() <= 0.0
 
 
-def test_starts_begin_with_the_scenarios_own_gains_and_differ():
+def test_starts_begin_with_the_first_one_and_differ():
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-    share = starts.starting_points(Evaluator(limits), problem(), np.array([3.0, 0.5]), 4, 7, lambda *told: None)
+    share = starts.starting_points(Evaluator(limits), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)
     assert share.shape == (4, 2)
-    np.testing.assert_allclose(limits.gains(jnp.asarray(share[0])), [3.0, 0.5], rtol=1e-9)
+    np.testing.assert_array_equal(share[0], [0.2, 0.3])
     assert len(np.unique(share, axis=0)) == 4
+
+
+@pytest.mark.parametrize(
+    ("rows", "held"),
+    [
+        ([(0.0, [3.0, -9.0, 1.0, 2.0])], [1]),
+        ([(0.3, [3.0, -9.0, 1.0, 2.0])], [1]),  # broken
+        ([(-0.1, [3.0, -9.0, 1.0, 2.0])], []),  # not nearly reached
+        ([(-0.01, [3.0, -9.0, 1.0, 2.0]), (0.0, [1.0, -7.0, 5.0, 0.0])], [1, 0]),  # the nearest first
+        ([(0.0, [0.0, 0.0, 0.0, 0.0])], []),
+        ([(0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [1.0, 1.0, 1.0, 9.0])], [0, 1]),
+    ],
+)
+def test_gains_that_active_limits_hang_on_are_held_but_for_two(rows, held):
+    c = np.array([[[over - 0.5, over] for over, _ in rows]])  # of two trials the second one is nearer
+    slope = np.array([[[np.full(4, 1e3), np.asarray(by)] for _, by in rows]])
+    seen = Sloped(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
+    assert starts.held_by_limits(seen) == held
+
+
+def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
+    some = replace(problem(peak_torque=0.7, effort=5.0), least=(6, None), tail=2)
+    some = objective.with_trials(some, np.arange(8, 11))
+    fewer = objective.fewer_trials(some, 4)
+    assert np.asarray(fewer.trials).tolist() == [0, 1, 2, 3, 8, 9, 10]
+    assert (fewer.averaged, fewer.least, fewer.tail) == (4, (3, None), 1)
+    _, c, _ = measure(fewer, vector([3.0, 0.7]))
+    flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.r_[:4, 8:11])
+    np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
+    np.testing.assert_allclose(c[0].max(), np.sort(flown.metrics.peak_torque[:4])[2] / 0.7 - 1, rtol=1e-10)
+    assert objective.fewer_trials(some, 8) is some
 
 
 def test_judged_is_the_very_law_on_the_flight_clock():
@@ -274,6 +320,15 @@ def test_judged_is_the_very_law_on_the_flight_clock():
     assert flown.loop.clock == "flight"
     assert flown.controller == own.controller
     assert report.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+
+
+@pytest.mark.parametrize(("law", "words"), [
+    ({"sign_width": 0.01}, "flight clock, sign 0.01 wide"),
+    ({"sign_width": 0.0}, "flight clock, exact sign"),
+    ({"kind": "pd"}, "flight clock"),
+])  # fmt: skip
+def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
+    assert report.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
 
 
 @pytest.mark.parametrize(("width", "free", "sloped"), [
@@ -289,7 +344,7 @@ def test_only_gains_flown_with_the_exact_sign_are_looked_for_without_slopes(widt
 def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     """The goal of a search with them, for a law that has both: what differs is how it is found."""
     helpers.small_search(monkeypatch)
-    monkeypatch.setattr(optimise, "MANY", 64)
+    monkeypatch.setattr(descents, "MANY", 64)
     monkeypatch.setattr(refine, "GENERATIONS", 25)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
@@ -297,6 +352,56 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
         found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), 3, 40, 1, sloped=sloped)
     assert evaluates[False].gradients == 0
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
+
+
+class Valley(Evaluator):
+    """F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 and x2 of no account, without limits; what is asked for is counted."""
+
+    def slopes(self, problem, share):
+        self.gradients += len(share)
+        x0, x1, _ = share.T
+        f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(share), 0, 8), -1.0)
+        slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
+        return Sloped(share, f, c, f, slope, np.zeros((*c.shape, 3)))
+
+
+THREE = bounds.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
+
+
+def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
+    ends, counts = [], []
+    for parts_of_it in ((7, 30), (30,)):
+        evaluate, seen, kept = Valley(THREE), {}, []
+        for steps in parts_of_it:
+            best = descent.Best(np.array([0.9, 0.1, 0.5]), 0, 0.0)
+            kept.clear()
+            descent.descend(evaluate, problem(), best, best.share, steps, kept.append, seen=seen)
+        ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
+        counts.append(evaluate.gradients)
+    assert ends[0] == ends[1]
+    assert counts[0] == counts[1] > 7
+    assert ends[0][0] < 1e-3
+
+
+def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
+    some = replace(problem(), names=THREE.names)
+    own = np.array([3.0, 5.0, 2e-3])
+    for kept in (True, False):
+        run = descents.Descents(Valley(THREE), 0.0, 40, np.random.default_rng(0))
+        if kept:
+            run.set_out(some, own)
+        run.descend(some, {0: np.array([0.9, 0.1, 0.1])})
+        np.testing.assert_allclose(run.share[:2], [0.2, 0.04], atol=0.02)
+        np.testing.assert_allclose(run.gains[2], 2e-3 if kept else 1e-5 * 1e4**0.1)
+
+
+def test_starts_are_the_best_that_lie_far_apart_and_then_nearer_ones():
+    share = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
+    apart = starts.distances(share)
+    np.testing.assert_allclose(apart[0], [0.0, 0.05, 0.8, 0.35, 0.0], atol=1e-12)
+    assert [starts.far_apart([1, 0, 2, 3], apart, count) for count in (1, 2, 3, 4)] == [
+        [1], [1, 2], [1, 2, 3], [1, 2, 3, 0],
+    ]  # fmt: skip
 
 
 def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_without_sense():

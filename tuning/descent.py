@@ -64,24 +64,25 @@ def descend(
     close: float = CLOSE,
     scale: float = BOLD,
     fixed: Sequence[int] = (),
+    seen: dict[bytes, Sloped] | None = None,
 ) -> None:
     """From these shares, (gains,), downhill inside the bounds; what is best is kept in `best`.
 
     At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
     slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the
-    descent goes through, without those that it only tries.
+    descent goes through, without those that it only tries. seen: the points that a shorter descent from here looked at,
+    which are not flown again: a longer one goes on where it stopped.
     """
-    seen: dict[bytes, Sloped] = {}
+    seen = {} if seen is None else seen
 
     def at(scaled: np.ndarray) -> Sloped:
-        key = scaled.tobytes()
+        key, point = scaled.tobytes(), np.clip(scaled / scale, 0.0, 1.0)[None]
         if key not in seen:
             if len(seen) == steps:
                 raise _EnoughError
-            point = np.clip(scaled / scale, 0.0, 1.0)[None]
             seen[key] = evaluate.slopes(problem, point)
-            if seen[key].finite[0]:
-                best.offer(point, seen[key])
+        if seen[key].finite[0]:
+            best.offer(point, seen[key])
         return seen[key]
 
     limits = {

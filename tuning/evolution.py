@@ -6,8 +6,9 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from tuning.descent import SLACK, Best
+from tuning.descents import Descents
 from tuning.evaluate import Evaluator
-from tuning.optimise import Run, Search
+from tuning.optimise import Search
 from tuning.starts import Report
 
 POPULATION = 40  # points for each gain
@@ -66,9 +67,9 @@ def check(
     best = Best(result.x, len(problem.metrics), found.margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
     if sloped:  # near a limit evolution goes slowly: from where it ends, along it
-        run = Run(evaluate, found.margin, STEPS, np.random.default_rng(seed), lambda *told: None)
-        run.descend(found.problem, result.x[None])
-        best.f, best.value, best.share = run.best_point
+        run = Descents(evaluate, found.margin, STEPS, np.random.default_rng(seed))
+        run.descend(found.problem, {0: result.x})
+        best = run.best
     own, seen = evaluate.fly(problem, found.share[None]), evaluate.fly(problem, best.share[None])
     return Check(
         gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),

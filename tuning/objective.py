@@ -97,6 +97,26 @@ def with_trials(
     )
 
 
+def fewer_trials(problem: Problem, averaged: int) -> Problem:
+    """The problem averaged over the first so many trials only, with those that were added; shares of them as before."""
+    if averaged >= problem.averaged:
+        return problem
+    kept = np.r_[:averaged, problem.averaged : problem.trials.size]
+
+    def share(count: int | None) -> int | None:
+        return None if count is None else max(1, math.ceil(count * averaged / problem.averaged))
+
+    return replace(
+        problem,
+        trials=problem.trials[kept],
+        counted=problem.counted[:, kept],
+        coordinates={name: v[kept] for name, v in problem.coordinates.items()},
+        averaged=averaged,
+        least=tuple(share(count) for count in problem.least),
+        tail=share(problem.tail),
+    )
+
+
 def whole_rows(problem: Problem) -> np.ndarray:
     """(requirements,) bool: limits that every trial must keep."""
     return np.asarray([least is None for least in problem.least], dtype=bool)

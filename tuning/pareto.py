@@ -21,9 +21,11 @@ from ptsmc_jax.scenario import study
 from ptsmc_jax.schema import wrong
 from ptsmc_jax.tables import Limit, Scenario
 from tuning import gains, report, trust
+from tuning.descent import Best
+from tuning.descents import Descents
 from tuning.journal import Journal
 from tuning.objective import T_F, Problem
-from tuning.optimise import MARGIN, Run, Search, search
+from tuning.optimise import MARGIN, Search, search
 from tuning.refine import NEARBY
 from tuning.starts import Report
 
@@ -35,9 +37,6 @@ WARM = 3  # of the gains known so far, from which each step of the ladder starts
 STEPS = 40  # points looked at from each of them, at most
 APART = 1e-3  # of the bounds' intervals between two points, at least
 RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
-
-
-Found = tuple[float, float, np.ndarray]  # F, goal, shares of the bounds' intervals
 
 
 @dataclass(frozen=True)
@@ -155,46 +154,45 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: report.Posed, tell: Report) -> dict[int, Found]:
+def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: report.Posed, tell: Report) -> dict[int, Best]:
     """What is found on each rung, down the ladder and up again, each from what is known by then.
 
     One rung of those that a limit does not hold back, and whose gains are the same.
     """
-    best: dict[int, Found] = {}
+    best: dict[int, Best] = {}
     rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
     for done, k in enumerate(rungs):
         tell("ladder", done, len(rungs), np.nan, 0.0)
         found = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
-        if found is not None and (k not in best or found[0] < best[k][0]):
+        if found is not None and (k not in best or found.f < best[k].f):
             best[k] = found
-            known.append(found[2])
-    apart: dict[int, Found] = {}
+            known.append(found.share)
+    apart: dict[int, Best] = {}
     for k in sorted(best):
-        if all(np.abs(best[k][2] - other[2]).max() >= APART for other in apart.values()):
+        if all(np.abs(best[k].share - other.share).max() >= APART for other in apart.values()):
             apart[k] = best[k]
     return apart
 
 
-def _step(posed: report.Posed, problem: Problem, known: np.ndarray) -> Found | None:
-    """F, goal and shares of the best gains that keep these limits, from the most promising known ones."""
+def _step(posed: report.Posed, problem: Problem, known: np.ndarray) -> Best | None:
+    """The best gains that keep these limits, from the most promising known ones."""
     flown = posed.evaluate.fly(problem, known)
     chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]]
-    run = Run(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0), lambda *told: None)
+    run = Descents(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
     if posed.sloped:
-        run.descend(problem, chosen)
+        run.descend(problem, dict(enumerate(chosen)))
     else:
         run.evolve(problem, chosen[0], NEARBY)
-    value, over_limit = run.best_so_far
-    return None if over_limit > 0.0 or not np.isfinite(value) else run.best_point
+    return run.best if run.started and run.best.over == 0.0 else None
 
 
 def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[float, tuple[Point, Trials]]:
     judged = {}
-    for k, (limit, (_, value, share)) in enumerate(found.items()):
+    for k, (limit, best) in enumerate(found.items()):
         tell("judging on fresh trials", k, len(found), np.nan, 0.0)
-        named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(share))), report.DIGITS)
+        named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(best.share))), report.DIGITS)
         trials = report.judge(gains.in_scenario(scenario, named), fresh_seed, requirements)
-        judged[limit] = _point(limit, named, value, trials, requirements), trials
+        judged[limit] = _point(limit, named, best.value, trials, requirements), trials
     return judged
 
 

@@ -244,7 +244,9 @@ def judged_on(flown: Scenario) -> str:
     """What a scenario was flown on to be judged, in words."""
     if flown.loop.mode != "sampled":
         return "the continuous loop"
-    width = getattr(flown.controller, "sign_width", 0.0)
+    width = getattr(flown.controller, "sign_width", None)
+    if width is None:
+        return "flight clock"
     return "flight clock, " + (f"sign {width:g} wide" if width else "exact sign")
 
 

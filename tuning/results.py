@@ -14,7 +14,7 @@ from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.tables import Scenario
 from tuning import gains as gain_names
 from tuning import trust
-from tuning.optimise import Step
+from tuning.descents import Step
 from tuning.report import GOALS, Trust, Tuning, judged_on
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval

@@ -102,7 +102,7 @@ def tuning(summary: Summary) -> Table:
 
 def tuning_heading(summary: Summary) -> str:
     """On what the gains were judged."""
-    judged = summary.get("judged_on", "flight clock, exact sign")
+    judged = summary.get("judged_on", "flight clock")
     return f"judged on {summary['fresh']['trials']} fresh trials, {judged}"
 
 
@@ -124,17 +124,18 @@ def accuracy(summary: Summary) -> Iterator[str]:
 
 def floor(error: float | None, least: float | None) -> str:
     """How many times the error is what no controller can beat; nothing where there is no such floor."""
-    return f", {error / least:.3g} times the floor {least:.2e}" if error and least else ""
+    times = over_floor(error, least)
+    return "" if times is None else f", {times:.3g} times the floor {least:.2e}"
 
 
-def _over_floor(found: Summary) -> float | None:
-    known = found["window_error"] and found.get("floor")
-    return found["window_error"] / found["floor"] if known else None
+def over_floor(error: float | None, least: float | None) -> float | None:
+    """How many times the error is what no controller can beat; None where there is no such floor."""
+    return error / least if error and least else None
 
 
 def _times(group: Summary) -> str:
-    known = group["window_error"] and group.get("floor")
-    return f"{group['window_error']['rms'] / group['floor']:.3g}" if known else "-"
+    times = over_floor(group["window_error"] and group["window_error"]["rms"], group.get("floor"))
+    return "-" if times is None else f"{times:.3g}"
 
 
 def paper_refused(summary: Summary) -> Iterator[str]:
@@ -241,7 +242,7 @@ def comparison(summary: Summary) -> Table:
 
     row("RMS window error", "-", lambda found: found["window_error"], ".2e")
     if any(found.get("floor") for found in laws.values()):
-        row("times the floor", "", _over_floor)
+        row("times the floor", "", lambda found: over_floor(found["window_error"], found.get("floor")))
     row("mean peak torque", "N m", lambda found: found["peak_torque"])
     row("largest", "N m", lambda found: found["largest_peak_torque"])
     row("mean effort", "N m s", lambda found: found["effort"])
