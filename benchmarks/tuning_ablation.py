@@ -1,0 +1,157 @@
+"""Is every stage of the search needed? Each one left out, or changed, on five problems and many seeds.
+
+    python benchmarks/tuning_ablation.py [SEEDS [PROBLEM ...]]
+
+A line a search, kept in out/tuning_ablation.jsonl: what is there already is not searched again. In the end a table: for
+each problem and variant the largest and the median distance from the best goal that any of them found, the seeds within
+1 % of it, and the flights spent. `evolution.py`'s differential evolution is one of the variants, on the first seed.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ptsmc_jax.configure import configure
+
+KEPT = Path("out/tuning_ablation.jsonl")
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
+FILES = {"first": "first_flight", "filtered": "filtered_flight", "hard": "hard_flight", "arm": "two_link_arm"}
+CHAIN = {
+    "plant": {"kind": "chain", "order": 4, "x0": [1.0, -0.5, 0.3, 0.0]},
+    "controller": {"t_f": 10.0, "eta": 5.0, "delta": 0.5},
+    "loop": {"mode": "sampled", "period": 0.02, "t_end": 12.0},
+    "hardware": {"state_noise": [1e-5, 1e-5, 1e-5, 1e-5]},
+    "dispersion": {"x0": {"kind": "uniform", "half_width": [0.5, 0.5, 0.3, 0.2]}},
+    "tune": {"trials": 64},
+}
+
+
+@contextmanager
+def changed(module: object, **values: object) -> Iterator[None]:
+    """A module with other values."""
+    before = {name: getattr(module, name) for name in values}
+    for name, value in values.items():
+        setattr(module, name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
+
+
+def variants() -> dict[str, Callable]:
+    """What is left out or changed, by name: a context to search in."""
+    from tuning import descents, optimise, starts
+
+    everything = descents.Descents
+
+    class AllTheWay(everything):
+        """No race: every start goes half of the way."""
+
+        def explore(self, problem, starts):
+            half = max(2, self._steps // 2)
+            racing = dict(enumerate(starts))
+            ranked = self._race(problem, racing, ((len(racing), half),), "searching", scales=(descents.BOLD,))
+            return {k: self._ends[k].share for k in ranked[: descents.FOLLOWED]}
+
+    class OffSamples(everything):
+        """The hand-over stays where the descent left it."""
+
+        def _with_the_hand_over_on_a_sample(self, problem):
+            return []
+
+    class Evolved(everything):
+        """Evolution (CMA-ES) after the descents."""
+
+        def descend(self, problem, starts):
+            super().descend(problem, starts)
+            self.evolve(problem, self.share, descents.NEARBY)
+
+    def searching(kind: type) -> Callable:
+        return lambda: changed(optimise, Descents=kind)
+
+    return {
+        "as it is": lambda: changed(descents),
+        "all trials from the start": lambda: changed_both(descents, optimise, EXPLORED=10**6),
+        "without a race": searching(AllTheWay),
+        "starts drawn, not chosen": lambda: changed(starts, promising=lambda _, __, share, count, ___: share[:count]),
+        "chosen by merit alone": lambda: changed(starts, APART=(0.0,)),
+        "nothing held in the sweep": lambda: changed(starts, held_by_limits=lambda _: []),
+        "careful steps only": lambda: changed(descents, BOLD=descents.CAREFUL),
+        "bold steps only": lambda: changed(descents, CAREFUL=descents.BOLD),
+        "off samples": searching(OffSamples),
+        "evolution added": searching(Evolved),
+    }
+
+
+@contextmanager
+def changed_both(one: object, other: object, **values: object) -> Iterator[None]:
+    """Two modules that share a constant."""
+    with changed(one, **values), changed(other, **values):
+        yield
+
+
+def main() -> None:
+    """Print a line a search, and the table."""
+    configure()
+    from ptsmc_jax import scenario
+    from tuning import evolution, optimise, report
+
+    seeds, wanted = int(sys.argv[1]) if len(sys.argv) > 1 else 20, sys.argv[2:] or [*FILES, "chain"]
+    KEPT.parent.mkdir(exist_ok=True)
+    rows = [json.loads(line) for line in KEPT.read_text().splitlines()] if KEPT.exists() else []
+    done = {(row["problem"], row["variant"], row["seed"]) for row in rows}
+
+    def keep(problem: str, variant: str, seed: int, **found: object) -> None:
+        rows.append({"problem": problem, "variant": variant, "seed": seed, **found})
+        with KEPT.open("a") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+        print(rows[-1], flush=True)
+
+    for name in wanted:
+        loaded = scenario.from_tables(CHAIN) if name == "chain" else scenario.read(SCENARIOS / f"{FILES[name]}.toml")
+        table = loaded.tune
+        assert table is not None
+        posed = report.pose(loaded, 0)
+        evaluate = posed.evaluate
+        for seed in range(seeds):
+            for variant, inside in variants().items():
+                if (name, variant, seed) in done:
+                    continue
+                started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
+                with inside():
+                    found = optimise.search(evaluate, posed.problem, posed.ready.requirements, posed.own, table.starts,
+                                            table.steps, seed, sloped=posed.sloped, judged=False)  # fmt: skip
+                keep(name, variant, seed, goal=found.value, kept=bool(found.worst.max(initial=0.0) <= 1.0),
+                     rollouts=evaluate.rollouts - before[0], gradients=evaluate.gradients - before[1],
+                     seconds=round(time.monotonic() - started, 1), gains=found.gains.tolist())  # fmt: skip
+                if seed == 0 and variant == "as it is" and (name, "differential evolution", 0) not in done:
+                    started = time.monotonic()
+                    check = evolution.check(evaluate, found, 1)
+                    keep(name, "differential evolution", 0, goal=check.value, kept=check.kept,
+                         rollouts=check.rollouts, gradients=0, seconds=round(time.monotonic() - started, 1),
+                         gains=list(check.gains.values()))  # fmt: skip
+    _table([row for row in rows if row["problem"] in wanted])
+
+
+def _table(rows: list[dict]) -> None:
+    print("\n| problem | variant | seeds | within 1 % | median, largest distance | rollouts | with slopes |")
+    print("|---|---|---|---|---|---|---|")
+    for problem in dict.fromkeys(row["problem"] for row in rows):
+        of_it = [row for row in rows if row["problem"] == problem]
+        best = min(row["goal"] for row in of_it if row["kept"] and row["variant"] != "off samples")
+        for variant in dict.fromkeys(row["variant"] for row in of_it):
+            some = [row for row in of_it if row["variant"] == variant]
+            far = np.asarray([row["goal"] / best - 1.0 if row["kept"] else np.inf for row in some])
+            flown = [np.median([row[kind] for row in some]) for kind in ("rollouts", "gradients")]
+            print(f"| {problem} | {variant} | {len(some)} | {np.sum(far <= 0.01)} | {100 * np.median(far):.2f} %, "
+                  f"{100 * far.max():.2f} % | {flown[0]:.0f} | {flown[1]:.0f} |")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
