@@ -46,7 +46,7 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 def variants() -> dict[str, Callable]:
     """What is left out or changed, by name: a context to search in."""
-    from tuning import descents, optimise, starts
+    from tuning import descents, optimise, refine, starts
 
     everything = descents.Descents
 
@@ -70,7 +70,7 @@ def variants() -> dict[str, Callable]:
 
         def descend(self, problem, starts):
             super().descend(problem, starts)
-            self.evolve(problem, self.share, descents.NEARBY)
+            self.evolve(problem, self.share, refine.NEARBY)
 
     def searching(kind: type) -> Callable:
         return lambda: changed(optimise, Descents=kind)

@@ -371,11 +371,11 @@ THREE = bounds.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0
 def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
     ends, counts = [], []
     for parts_of_it in ((7, 30), (30,)):
-        evaluate, seen, kept = Valley(THREE), {}, []
+        evaluate, seen, first = Valley(THREE), {}, np.array([0.9, 0.1, 0.5])
+        best, kept = descent.Best(first, 0, 0.0), []
         for steps in parts_of_it:
-            best = descent.Best(np.array([0.9, 0.1, 0.5]), 0, 0.0)
             kept.clear()
-            descent.descend(evaluate, problem(), best, best.share, steps, kept.append, seen=seen)
+            descent.descend(evaluate, problem(), best, first, steps, kept.append, seen=seen)
         ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
         counts.append(evaluate.gradients)
     assert ends[0] == ends[1]
