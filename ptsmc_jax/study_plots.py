@@ -25,8 +25,8 @@ def tuning_history(
 ) -> Figure:
     """Search of all starts: the goal and the gains over the steps.
 
-    gains: name -> (unit, (steps, starts)); values (steps, starts) of the goal; admissible (steps, starts) bool: every
-    requirement met; goal: what the values are, with their unit.
+    gains: name -> (unit, (steps, starts)); values (steps, starts) of the goal, NaN from where a start was left behind;
+    admissible (steps, starts) bool: every requirement met; goal: what the values are, with their unit.
     """
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=(8.0, 2.2 * (len(gains) + 1)), layout="constrained")

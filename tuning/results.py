@@ -1,7 +1,7 @@
 """The files of a tuning run: summary, history, tuned scenario, figures."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -165,17 +165,21 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]
     paths = _paths(tuning.search.history)
-    # starts that end earlier stay where they are
-    history = [[path[min(k, len(path) - 1)] for path in paths] for k in range(max(map(len, paths)))]
+    longest = max(map(len, paths))
+
+    def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # (steps, starts, ...)
+        beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
+        return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
+
     limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
     unit = "s" if scenario.tune.objective == "t_f" else metrics.CATALOGUES[kind]["window_error"][0]
     goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
-    moved = np.asarray([[step.gains for step in steps] for steps in history])
+    moved = over_steps(lambda step: step.gains)
     found = {
         "history": study_plots.tuning_history(
             {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
-            np.asarray([[step.value for step in steps] for steps in history]),
-            np.asarray([[np.all(step.worst <= 1.0) for step in steps] for steps in history]),
+            over_steps(lambda step: step.value),
+            over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
             goal,
         ),
         "tradeoff": study_plots.tradeoff(
