@@ -53,11 +53,9 @@ def variants() -> dict[str, Callable]:
     class AllTheWay(everything):
         """No race: every start goes half of the way."""
 
-        def explore(self, problem, starts):
-            half = max(2, self._steps // 2)
-            racing = dict(enumerate(starts))
-            ranked = self._race(problem, racing, ((len(racing), half),), "searching", scales=(descents.BOLD,))
-            return {k: self._ends[k].share for k in ranked[: descents.FOLLOWED]}
+        def _race(self, problem, starts, rungs, what, **others):
+            rungs = ((len(starts), max(2, self._steps // 2)),) if what == descents.SEARCHING else rungs
+            return super()._race(problem, starts, rungs, what, **others)
 
     class OffSamples(everything):
         """The hand-over stays where the descent left it."""
@@ -77,7 +75,7 @@ def variants() -> dict[str, Callable]:
 
     return {
         "as it is": lambda: changed(descents),
-        "all trials from the start": lambda: changed_both(descents, optimise, EXPLORED=10**6),
+        "all trials from the start": lambda: changed(descents, EXPLORED=10**6),
         "without a race": searching(AllTheWay),
         "starts drawn, not chosen": lambda: changed(starts, promising=lambda _, __, share, count, ___: share[:count]),
         "chosen by merit alone": lambda: changed(starts, APART=(0.0,)),
@@ -87,13 +85,6 @@ def variants() -> dict[str, Callable]:
         "off samples": searching(OffSamples),
         "evolution added": searching(Evolved),
     }
-
-
-@contextmanager
-def changed_both(one: object, other: object, **values: object) -> Iterator[None]:
-    """Two modules that share a constant."""
-    with changed(one, **values), changed(other, **values):
-        yield
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from tuning.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.evaluate import Evaluator, Measured, Sloped
 from tuning.objective import FAILED, Problem, failures, fewer_trials
 from tuning.refine import GENERATIONS, WIDELY, refine
-from tuning.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, spread
+from tuning.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, spread, starting_points
 from tuning.work import ROUND, SLOPED
 
 AGAIN = 3  # starts, from whose best points they go on
@@ -117,22 +117,24 @@ class Descents:
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
-        """From the scenario's own gains, (gains,)."""
+        """From the scenario's own gains, (gains,), on a few trials."""
         self._own = self._evaluate.bounds.share(own)
         self._report(SETTING_OUT, 0, 2, *self.best_so_far)
-        self._descend(problem, self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
+        self._descend(fewer_trials(problem, EXPLORED), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
 
-    def go_on(self, problem: Problem) -> None:
-        """From the best point, with what has joined the problem."""
+    def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
+        """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
+
+        The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
+        """
+        problem, few, more = fewer_trials(problem, EXPLORED), max(2, self._steps // 4), max(2, self._steps // 2)
         self._report(SETTING_OUT, 1, 2, *self.best_so_far)
-        self._descend(problem, self.share, 0, max(2, self._steps // 2), scale=CAREFUL, afresh=True)
-
-    def explore(self, problem: Problem, starts: np.ndarray) -> dict[int, np.ndarray]:
-        """A few steps from each of these starts, (starts, gains); the shares where the most promising ones end."""
-        racing = dict(enumerate(starts))
-        few, more, half = max(2, self._steps // 4), max(2, self._steps // 2), max(FOLLOWED, len(racing) // 2)
-        ranked = self._race(problem, racing, ((len(racing), few), (half, more)), SEARCHING, scales=(CAREFUL, BOLD))
-        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {0: starts[0]}
+        self._descend(problem, self.share, 0, more, scale=CAREFUL, afresh=True)
+        first = starting_points(self._evaluate, self.tightened(problem), self.share, starts, seed, self._report)
+        racing = dict(enumerate(first))
+        rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
+        ranked = self._race(problem, racing, rungs, SEARCHING, scales=(CAREFUL, BOLD))
+        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {0: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
         """From each of these shares part of the way, and from the most promising one to the optimum next to it."""

@@ -14,11 +14,11 @@ from ptsmc_jax.requirements import Requirement
 from tuning import confirm
 from tuning import worst as worst_case
 from tuning.descent import BROKEN
-from tuning.descents import EXPLORED, Descents, Step, planned
+from tuning.descents import Descents, Step, planned
 from tuning.evaluate import Evaluator
-from tuning.objective import Problem, coordinates_of, fewer_trials, whole_rows, with_trials
+from tuning.objective import Problem, coordinates_of, whole_rows, with_trials
 from tuning.refine import NEARBY
-from tuning.starts import Report, starting_points
+from tuning.starts import Report
 from tuning.work import ROUND, Work
 from tuning.worst import Hardest
 
@@ -99,22 +99,17 @@ def search(
 
     try:
         if sloped:
-            run.set_out(fewer_trials(problem, EXPLORED), own)
+            run.set_out(problem, own)
         else:
             run.sweep(problem, own)
         joined = 0
         if sure:  # what is hardest for gains that are about right
             harder = _hardest(problem, *screened(run.gains))
             problem, joined = _add(problem, joined, Joining(harder, whole_rows(problem))), harder.size
-        few = fewer_trials(problem, EXPLORED)
-        if not sloped:
-            run.evolve(problem, run.share)
-        elif starts == 1:
-            run.descend(problem, {0: run.share})
+        if sloped:
+            run.descend(problem, run.explore(problem, starts, seed) if starts > 1 else {0: run.share})
         else:
-            run.go_on(few)
-            some = starting_points(evaluate, run.tightened(few), run.share, starts, seed, report)
-            run.descend(problem, run.explore(few, some))
+            run.evolve(problem, run.share)
         while sure or shares:
             found, joining = run.gains, list[Joining]()
             if shares:  # each time on other trials, which those screened are not among
