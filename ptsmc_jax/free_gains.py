@@ -229,15 +229,20 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
         ("delta", "lower"): "one period, the shortest hand-over that there is",
         ("observer_gain", "upper"): "a dead-beat observer: nothing of its error is left after a period",
         ("k1", "upper"): "the stability border of the sampled loop",
-        ("sign_width", "lower"): "as narrow as the noise lets a sign be told from the exact one",
+        ("sign_width", "lower"): "a narrower one is lost in the noise, or hops from side to side",
         ("sign_width", "upper"): "so wide that hardly a switching term is left",
     }
     if (name, side) not in words or (name == "observer_gain" and isinstance(scenario.observer, FINITE_TIME)):
         return None
-    low, high = _usual(scenario, tune, name)
-    usual = low if side == "lower" else high
-    reached = bound <= usual * (1 + 1e-9) if side == "lower" else bound >= usual * (1 - 1e-9)
+    low, high = usual(scenario, name)
+    reached = bound <= low * (1 + 1e-9) if side == "lower" else bound >= high * (1 - 1e-9)
     return words[name, side] if reached else None
+
+
+def usual(scenario: Scenario, name: str) -> tuple[float, float]:
+    """The default bounds of a free gain, before they reach out to the scenario's own."""
+    assert scenario.tune is not None
+    return _usual(scenario, scenario.tune, name)
 
 
 def _shown(bound: float) -> float:

@@ -117,7 +117,7 @@ class NoObserver(Observer):
 
 
 @dataclass(frozen=True)
-class _Linear(Observer):
+class Linear(Observer):
     """What observers with a constant part l = diag(gain) of their gain share."""
 
     gain: Leaf  # (m,) diagonal of l [N m s, so that l J^-1 is in 1/s]
@@ -150,7 +150,7 @@ class _Linear(Observer):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class NonlinearObserver(_Linear):
+class NonlinearObserver(Linear):
     """Nonlinear disturbance observer (53) with constant l(w) = diag(gain), so lambda(w) = gain w.
 
     The paper's z is d_hat - l w. Its error obeys (54): e' = -l M^-1 e - d', with M the inertia J of a spacecraft.
@@ -209,7 +209,7 @@ class PrescribedTimeBound(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PrescribedTimeObserver(_Linear):
+class PrescribedTimeObserver(Linear):
     """The nonlinear observer with l = diag(gain) + mu M/(T_o - t) until T_o - delta_o: its error is gone by T_o.
 
     e' = -(l M^-1 + mu/(T_o - t)) e - d', so |e| falls like (T_o - t)^mu; from T_o - delta_o on it is the nonlinear one,

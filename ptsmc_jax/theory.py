@@ -245,10 +245,11 @@ def narrowest_sign(parts: Parts, period: float) -> float:
 
     s' = -c tanh(s / width), c = tau^(n-1) times `switching_rate`, held for a period h, reaches s = 0 in one period from
     inside the boundary layer at width = c h; below c h / 2 it hops from side to side, and slopes grow from hop to hop.
-    Of the largest c before the hand-over, at t = 0.
+    Of the largest c before the hand-over, at t = 0, under the K2 that is left when the observer has settled.
     """
-    law = parts.controller
-    return float(law.t_f) ** (law.order - 1) * switching_rate(parts) * period
+    law, seen = parts.controller, visited(parts) if isinstance(parts.plant, System) else None
+    rate = law.switching_rate(parts.observer.error_bound()(parts.t_end), seen)
+    return float(law.t_f) ** (law.order - 1) * float(rate) * period
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:

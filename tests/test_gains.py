@@ -80,7 +80,7 @@ def test_names_and_bounds_axis_by_axis():
     names = gains.named(scenario)
     assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
     assert gains.own(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
-    some = bounds.of_scenario(scenario)
+    some = bounds.of_scenario(scenario, ready.parts)
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
@@ -217,7 +217,7 @@ def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
         )
         free = {"free": ["p", "b1"]} if more else {}
         base = scenario.replace(base, tune=free)
-        box = bounds.of_scenario(base)
+        box = bounds.of_scenario(base, scenario.study(base).parts)
         for corner in (box.lower, box.upper):
             scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
     with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):

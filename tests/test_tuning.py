@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, signals
+from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, signals, theory
 from ptsmc_jax.requirements import Requirement
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
@@ -103,6 +103,25 @@ def test_bounds_map_shares_into_the_interval_and_back():
     np.testing.assert_allclose(some.gains(jnp.ones(3)), some.upper, rtol=1e-14)
     np.testing.assert_array_equal(some.share(np.array([1.0, 9.0, 0.0])), [0.0, 1.0, 0.0])
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
+
+
+def test_the_narrowest_sign_follows_the_observer():
+    """K2 is inverse to the observer's gain, and at half of what K2 moves s by in a period the sampled sign hops."""
+    table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": {}}
+    made = scenario.from_tables(table)
+    ready = scenario.study(made)
+    some = bounds.of_scenario(made, ready.parts)
+    for l_gain in (10.0, 100.0):
+        moved = gains.with_gains(ready.parts, {"observer_gain": l_gain})
+        share = some.share(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
+        assert share[4] == 0.0
+        width = some.gains(jnp.asarray(share))[4]
+        np.testing.assert_allclose(width, theory.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
+        inside = np.append(share[:4], 0.3)
+        np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
+    # bounds that are the user's stay as they are
+    given = scenario.replace(made, tune={"bounds": {"sign_width": [1e-7, 1e-2]}})
+    assert bounds.of_scenario(given, ready.parts).hop == 0.0
 
 
 def test_gains_handed_over_are_rounded_inside_their_bounds():

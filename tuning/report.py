@@ -177,8 +177,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     """The tuning problem of a scenario."""
     table = scenario.tune
     assert table is not None
-    bounds = gain_bounds.of_scenario(scenario)
     ready = study(scenario, reach=_reach(scenario, table))
+    bounds = gain_bounds.of_scenario(scenario, ready.parts)
     trained = trials_of(ready, confirm.training_trials(ready.requirements, table.trials))
     problem = objective.problem(
         ready.parts,
