@@ -75,7 +75,7 @@ def variants() -> dict[str, Callable]:
 
     return {
         "as it is": lambda: changed(descents),
-        "all trials from the start": lambda: changed(descents, EXPLORED=10**6),
+        "all trials from the start": lambda: changed(descents, AVERAGED=10**6),
         "without a race": searching(AllTheWay),
         "starts drawn, not chosen": lambda: changed(starts, promising=lambda _, __, share, count, ___: share[:count]),
         "chosen by merit alone": lambda: changed(starts, APART=(0.0,)),

@@ -149,7 +149,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     start = np.diag(np.concatenate([unknown, said.own, np.zeros(m)]))
     if said.start is not None:
         rows, covariance = said.start
-        start = _corrected(start, wide(rows) @ start, _root(covariance))
+        start = _corrected(start, wide(rows) @ start, root(covariance))
     walk = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
     drift = np.diag(np.concatenate([np.zeros(n), said.own_drift, walk]))[:, n:]
     move = np.tile(np.eye(size), (periods, 1, 1))
@@ -166,7 +166,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     )
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
+def root(covariance: np.ndarray) -> np.ndarray:
     """A factor (n, n) of a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -1,197 +1,327 @@
-"""The sampled loop linearised, an axis at a time: stability, margins, and what sensor noise does to accuracy.
+"""The sampled loop linearised by the code that flies it, and opened: at the plant's input and at the sensors.
 
-Near the reference each component of the attitude error obeys eps'' = a + d / (2 J), with the law's
-a = -kp eps - kd eps' - d_hat / (2 J) computed from samples and held (zero-order hold), whole periods late where there
-is a delay. The gains are (57)'s and (60)'s with the smooth sign's slope; raw samples, no filter, no actuator but delay.
+A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of `computer.decide` and
+`rollout.over_period`): the true state x, the state of the actuators, and what the flight computer keeps, its own model
+of the actuators among it. Closed are
+
+    z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
+
+with x_seen = x, the state that the sensors see; u_new, u_old = u, `delay` periods ago, which acts from `late` on, and a
+period before that, until then; d a torque on the plant. The flight computer is told what its own model of the actuators
+makes of u: a gain or a delay at the plant's input is one that it does not know. About the nominal run: no noise and no
+disturbance; of a star tracker that is slower than the loop the mean over its interval.
 """
 
-import typing
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
 
-from ptsmc_jax.rollout import Parts
+from ptsmc_jax import rollout
+from ptsmc_jax.assembly import Parts
+from ptsmc_jax.clock import Graded
+from ptsmc_jax.computer import Computer, Decision, Period, boot, decide, schedule, told
+from ptsmc_jax.hardware import Actuators, ActuatorState
+from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.sensors import Sensors, StateSensor
 
+Scalar = Float[Array, ""]
 
-def gains(
-    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gains kp [1/s^2] and kd [1/s], (times,), at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
-
-    eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; c k and c + k after it, with
-    k = (K1 + slope)/2 and c the surface_rate [1/s].
-    """
-    tau = t_f - np.asarray(t, dtype=float)
-    hold = tau <= delta * (1 + 1e-9)
-    safe = np.where(hold, 1.0, tau)
-    after = (k1 + slope) / 2
-    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + slope * eta / 2)
-    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + slope * safe / 2)
-    return kp, kd
+NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
+_WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # of Lagrange's polynomials
 
 
-def _closed(kp: float, kd: float, h: float, late: float) -> np.ndarray:
-    """Matrix of a period of the frozen loop; late: delay in periods, any number of at least 0."""
-    whole = int(np.floor(late))
-    part = late - whole  # the command of `whole` periods ago acts from here on, the one before until then
-    n = 2 + whole + (part > 0)
-    move = np.eye(n)
-    move[0, 1] = h
+class Carry(NamedTuple):
+    """What the loop carries from sample to sample."""
 
-    def push(share_from: float, share_to: float) -> tuple[float, float]:
-        """Effect on eps and eps' of a unit acceleration between two shares of the period."""
-        a, b = share_from * h, share_to * h
-        return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
-
-    late_push, early_push = push(part, 1.0), push(0.0, part)
-    feedback = np.array([-kp, -kd])
-    columns = list(range(2, n))  # commands waiting, the newest first
-    if whole == 0:
-        move[:2, :2] += np.outer(late_push, feedback)
-    else:
-        move[:2, columns[whole - 1]] += late_push
-    if part > 0:
-        move[:2, columns[whole]] += early_push
-    for k in reversed(range(len(columns))):
-        move[columns[k], :] = 0.0
-        if k == 0:
-            move[columns[k], :2] = feedback
-        else:
-            move[columns[k], columns[k - 1]] = 1.0
-    return move
+    x: Any  # true state of the plant
+    acting: ActuatorState  # true state of the actuators, without commands on their way
+    computer: Computer
+    model: ActuatorState  # the flight computer's own of its actuators, with them
 
 
-def radius(kp: float, kd: float, h: float, late: float = 0.0) -> float:
-    """Largest modulus of the frozen loop's poles: below 1 it is stable. h: period [s]; late: delay in periods."""
-    return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, late))).max())
-
-
-def _last(stable, low: float, high: float) -> float:
-    """Largest number at which `stable` still holds, by bisection; inf where it holds at `high`."""
-    if stable(high):
-        return float("inf")
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
-
-
-def largest_index(eta: float, late: float = 0.0) -> float:
-    """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay."""
-
-    def stable(index: float) -> bool:
-        tau = (2 * eta - 1) / index
-        return radius((eta / tau) ** 2, (2 * eta - 1) / tau, 1.0, late) < 1.0
-
-    return _last(stable, 1e-6, 4.0)
-
-
-def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True) -> float:
-    """Smallest delta [s] for which the last sample before the hand-over is stable.
-
-    On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
-    may lie at the hand-over itself: (eta - 1/2) h.
-    """
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - float(anchored)) * h)
-
-
-def largest_reaching(surface: float, late: float = 0.0) -> float:
-    """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
-
-    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. late: delay in periods.
-    The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
-    a period whatever the loop does, as long as it knows the torque that acts.
-    """
-
-    def stable(reaching: float) -> bool:
-        return radius(surface * reaching, surface + reaching, 1.0, late) < 1.0
-
-    return _last(stable, 1e-6, 4.0) if stable(1e-6) else 0.0
-
-
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Margins:
-    """Of the frozen loop at one instant."""
+class Loop:
+    """A period of the loop, opened, see above: z (n,), of which the first k are x; u (m,)."""
 
-    index: float  # (2 eta - 1) h / tau, kd h in hold
-    radius: float  # largest modulus of the poles
-    gain: float  # factor on the gains up to which it is stable
-    delay: float  # further delay up to which it is stable [s]
+    a: Leaf  # (n, n) A
+    seen: Leaf  # (n, k) B
+    new: Leaf  # (nodes, n, m) N, for `late` at NODES of a period
+    old: Leaf  # (nodes, n, m) O
+    command: Leaf  # (m, n) C
+    direct: Leaf  # (m, k) D
+    disturbed: Leaf  # (n, m) E
+    period: Leaf  # h [s]
+    delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
 
-
-def margins(parts: Parts) -> dict[str, Margins]:
-    """Stability margins of a sampled run's law: at the last sample before the hand-over and in hold."""
-    law, clock = parts.controller, typing.cast(Any, parts.clock)
-    h, late = float(clock.period), float(0 if parts.actuators is None else parts.actuators.delay)
-    t_f, eta, delta, k1, rate = (float(v) for v in (law.t_f, law.eta, law.delta, law.k1, law.surface_rate))
-    found = {}
-    for name, tau in (("hand_over", delta + h), ("hold", 0.0)):
-        kp, kd = (float(v) for v in gains(np.asarray(t_f - tau), t_f, eta, delta, k1, 0.0, rate))
-        gain = _last(lambda g, kp=kp, kd=kd: radius(g * kp, g * kd, h, late) < 1.0, 1e-6, 1e6)
-        delay = _last(lambda d, kp=kp, kd=kd: radius(kp, kd, h, late + d) < 1.0, 0.0, 200.0) * h
-        if not np.isfinite(delay):  # beyond 200 periods the loop is as good as continuous: its phase margin
-            square = (kd**2 + np.sqrt(kd**4 + 4 * kp**2)) / 2
-            delay = float(np.arctan2(kd * np.sqrt(square), kp) / np.sqrt(square) - h / 2 - late * h)
-        stable = radius(kp, kd, h, late)
-        found[name] = Margins(kd * h, stable, gain, delay if stable < 1.0 else 0.0)
-    return found
+    def closed_at_sensors(self) -> tuple[Float[Array, "n n"], Float[Array, "m n"]]:
+        """A (n, n) and C (m, n) with x_seen = x, in the units of the coordinates: rad, rad/s, [N m]."""
+        k = self.seen.shape[1]
+        return self.a.at[:, :k].add(self.seen), self.command.at[:, :k].add(self.direct)
 
 
-@dataclass(frozen=True)
-class Noise:
-    """What sensor noise alone does, 1 sigma."""
+class Nominal(NamedTuple):
+    """The nominal run: arrays over the control periods first, of what `rollout.schedule` lists and of `Carry`."""
 
-    window_error: float  # RMS over the window of the error vector's 2-norm [-]
-    torque: float  # largest over time and axes [N m]
+    listed: tuple
+    carry: Carry  # before the period
+    after: Carry
+    command: Array  # u that arrives in it
 
 
-def noise(parts: Parts) -> Noise:
-    """Linear covariance of a sampled run with raw samples: accuracy and torque that its noise costs.
+def quiet(parts: Parts) -> Parts:
+    """The parts without noise and disturbance."""
+    sensors: Any = parts.sensors
+    if isinstance(sensors, Sensors):
+        known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)
+        none = jnp.zeros_like(jnp.asarray(sensors.attitude_noise))
+        sensors = replace(sensors, attitude_noise=none, rate_noise=none, rate_bias=None, bias_rate=None, filter=known)
+    elif isinstance(sensors, StateSensor):
+        sensors = replace(sensors, sigma=0.0 * sensors.sigma)
+    nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
+    return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
 
-    The covariance of (eps, eps', estimate, last measured rate, commands on their way) is carried from sample to
-    sample, once per axis of a diagonal inertia (of a full one: its diagonal).
+
+def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
+    return zero
+
+
+def nominal(parts: Parts) -> Nominal:
+    """The nominal run of sampled parts."""
+    assert not isinstance(parts.clock, Graded)
+    parts = quiet(parts)
+    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    listed, about, started = schedule(parts, ticks)
+    k2, actuators = parts.observer.error_bound(), _actuators(parts)
+    x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    model = actuators.begin(parts.plant.inputs)
+    computer = boot(parts, np.uint32(0), np.uint32(0), x0, started)
+
+    def step(carry: Carry, tick: tuple) -> tuple[Carry, tuple[Carry, Carry, Array]]:
+        period = about(tick)
+        decision, computer, model = _computed(parts, k2, period, carry, carry.x)
+        wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
+        x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
+        after = Carry(x, acting, computer, model)
+        return after, (carry, after, wanted)
+
+    first = Carry(x0, model._replace(queue=None), computer, model)
+    _, found = jax.lax.scan(step, first, listed)
+    return Nominal(listed, *found)
+
+
+nominal_jit = jax.jit(nominal)
+
+
+def _actuators(parts: Parts) -> Actuators:
+    return Actuators() if parts.actuators is None else parts.actuators
+
+
+def _computed(
+    parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
+) -> tuple[Decision, Computer, ActuatorState]:
+    """The flight computer's part of a period; seen: the state as the sensors see it."""
+    actuators, dt = _actuators(parts), period.length
+    decision, computer = decide(parts, k2, period, carry.computer, seen)
+    drive, queue = actuators.command(carry.model, decision.u, decision.w, dt, period.now.noise_weight)
+    computer = computer._replace(told=told(actuators, drive, dt))
+    return decision, computer, actuators.end(carry.model, drive, queue, dt)
+
+
+def _acted(
+    parts: Parts,
+    period: Period,
+    carry: Carry,
+    w: Array,
+    commands: Sequence[tuple[Array, Scalar, Scalar]],
+    pushed: Array | None = None,
+) -> tuple[Any, ActuatorState]:
+    """What actuators and plant make of commands that arrive, each with its time and how long it acts [s].
+
+    pushed: a torque on the plant besides, (m,).
     """
-    law, clock, sensors = parts.controller, typing.cast(Any, parts.clock), parts.sensors
-    h, late = float(clock.period), 0 if parts.actuators is None else int(parts.actuators.delay)
-    t_f, eta, delta, k1, width = (float(v) for v in (law.t_f, law.eta, law.delta, law.k1, law.sign_width))
-    rate = float(law.surface_rate)
-    bound = parts.observer.error_bound()
-    k2 = float(bound.floor)
-    push = float(np.linalg.norm(np.asarray(law.model.inertia_inverse)))
-    slope = push * k2 / width if width > 0.0 else 0.0
-    t = np.arange(int(np.ceil((t_f + float(parts.window)) / h)) + 1) * h
-    kp, kd = gains(t, t_f, eta, delta, k1, slope, rate)
-    inertia = np.diag(np.asarray(law.model.inertia))
-    gain = np.asarray(getattr(parts.observer, "gain", np.zeros(3)))
-    variance, torque = np.zeros(len(t)), 0.0
-    drive = np.diag([(float(sensors.attitude_noise) / 2) ** 2, (float(sensors.rate_noise) / 2) ** 2])
-    for axis in range(3):
-        keep = float(np.exp(-gain[axis] / inertia[axis] * h))
-        n = 5 + late  # eps, eps', estimate, last measured eps', command that acts, commands waiting (newest last)
-        p = np.zeros((n, n))
-        for k in range(len(t)):
-            variance[k] += p[0, 0]
-            sample, enter = np.eye(n), np.zeros((n, 2))
-            # the estimate from the period just ended
-            sample[2] = 0.0
-            sample[2, 2], sample[2, 1], sample[2, 3], sample[2, 4] = keep, (1 - keep) / h, -(1 - keep) / h, -(1 - keep)
-            enter[2, 1] = (1 - keep) / h
-            sample[3] = 0.0
-            sample[3, 1], enter[3, 1] = 1.0, 1.0
-            command = -sample[2] - kp[k] * np.eye(n)[0] - kd[k] * np.eye(n)[1]
-            noisy = -enter[2] - np.array([kp[k], kd[k]])
-            if late == 0:
-                sample[4], enter[4] = command, noisy
-            else:
-                sample[4] = np.eye(n)[5]
-                for j in range(5, n - 1):
-                    sample[j] = np.eye(n)[j + 1]
-                sample[n - 1], enter[n - 1] = command, noisy
-            spread = command @ p @ command + noisy @ drive @ noisy
-            torque = max(torque, 2 * inertia[axis] * float(np.sqrt(spread)))
-            fly = np.eye(n)
-            fly[0, 1], fly[0, 4], fly[1, 4] = h, h * h / 2, h
-            p = fly @ (sample @ p @ sample.T + enter @ drive @ enter.T) @ fly.T
-    late_on = t >= t_f - 1e-9
-    return Noise(float(np.sqrt(np.mean(variance[late_on]))), torque)
+    prompt, x, acting = replace(_actuators(parts), delay=0), carry.x, carry.acting
+    for command, t, length in commands:
+        drive, _ = prompt.command(acting, command, w, length, period.now.noise_weight)
+        x = rollout.over_period(parts, t, x, drive, pushed, length)
+        acting = prompt.end(acting, drive, None, length)
+    return x, acting
+
+
+class _Local:
+    """Local coordinates of carries about one: x, then the state last seen, the sensors' memory, and all the rest."""
+
+    def __init__(self, parts: Parts, base: Carry):
+        self._plant, self._sensors, self._base = parts.plant, parts.sensors, base
+        self._turned = hasattr(parts.sensors, "moved")
+        start = jnp.zeros_like(parts.plant.apart(base.x, base.x))
+        inside = parts.sensors.apart(base.computer.sensing, base.computer.sensing) if self._turned else jnp.zeros(0)
+        rest, self._unravel = ravel_pytree(self._rest(base))
+        self.sizes = [start.size, start.size, inside.size, rest.size]
+
+    def _rest(self, carry: Carry) -> Any:
+        computer = carry.computer
+        kept = None if self._turned else _numbers(computer.sensing)
+        return carry.acting, computer.memory, computer.told, carry.model, kept
+
+    def moved(self, z: Array) -> Carry:
+        x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
+        base, plant = self._base, self._plant
+        acting, memory, told, model, kept = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
+        inside = base.computer.sensing
+        inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
+        computer = Computer(inside, plant.moved(base.computer.seen, seen), memory, told)
+        return Carry(plant.moved(base.x, x), acting, computer, model)
+
+    def apart(self, other: Carry) -> Array:
+        base, plant = self._base, self._plant
+        seen = plant.apart(base.computer.seen, other.computer.seen)
+        inside = jnp.zeros(0)
+        if self._turned:
+            inside = self._sensors.apart(base.computer.sensing, other.computer.sensing)
+        rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
+        return jnp.concatenate([plant.apart(base.x, other.x), seen, inside, rest])
+
+
+def _numbers(memory: Any) -> list[Array]:
+    """The numbers of a sensor's memory that can change by a little."""
+    return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+
+
+def _with_numbers(memory: Any, numbers: list[Array]) -> Any:
+    leaves, structure = jax.tree.flatten(memory)
+    given = iter(numbers)
+    new = [next(given) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
+    return jax.tree.unflatten(structure, new)
+
+
+class Opened(NamedTuple):
+    """A control period of the nominal run: the loop, and what is asked of it."""
+
+    loop: Loop
+    error: Array  # (m, k) of what the law drives to zero, by x
+    s_command: Array  # (components, n) of s by z
+    s_direct: Array  # (components, k) and by x_seen
+
+
+def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
+    """The loop opened in one control period of the nominal run, by its number; see `Loop`, h in [s]."""
+    parts = quiet(parts)
+    listed, before, after, arriving = jax.tree.map(lambda v: v[index], run)
+    _, about, _ = schedule(parts, run.listed[0])
+    period, k2, plant, law = about(listed), parts.observer.error_bound(), parts.plant, parts.controller
+    here, there, now, dt = _Local(parts, before), _Local(parts, after), period.now, period.length
+    z0, x0, u0 = jnp.zeros(sum(here.sizes)), jnp.zeros(here.sizes[0]), jnp.zeros(plant.inputs)
+    target = parts.reference(now.t)
+
+    def flown(z: Array, seen: Array) -> tuple[Array, Array, Array]:
+        carry = here.moved(z)
+        decision, computer, model = _computed(parts, k2, period, carry, plant.moved(before.x, seen))
+        x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
+        return there.apart(Carry(x, acting, computer, model)), decision.u, decision.s
+
+    def pushed(late: Scalar) -> tuple[Array, Array, Array]:
+        def ended(old: Array, new: Array, d: Array) -> Array:
+            commands = [(arriving + old, now.t, late * dt), (arriving + new, now.t + late * dt, (1.0 - late) * dt)]
+            x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
+            return there.apart(after._replace(x=x, acting=acting))
+
+        return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
+
+    (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, x0)
+    old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
+    loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=_actuators(parts).delay)
+    error = jax.jacfwd(lambda by: law.errors(plant.moved(before.x, by), target)[0])(x0)
+    return Opened(loop, error, s_command, s_direct)
+
+
+# for all periods, and run for a moment: what the compiler saves by optimising is less than what that takes
+@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+def opened_all(parts: Parts, run: Nominal) -> Opened:
+    """The loop opened in every control period of the nominal run: arrays over them first."""
+    return jax.vmap(partial(opened, parts, run))(jnp.arange(run.command.shape[0]))
+
+
+def mean(parts: Parts, loops: Loop, index: Any) -> Loop:
+    """Of the loops opened in every period that in this one; of a slower star tracker the mean over its interval."""
+    several = jnp.maximum(index - jnp.arange(getattr(parts.sensors, "every", 1)), 0)
+    return jax.tree.map(lambda v: jnp.mean(v[several], axis=0), loops)
+
+
+def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
+    """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
+    ticks, period = run.listed[0], parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
+    return np.flatnonzero(whole & (np.asarray(ticks.hold) == hold))
+
+
+def acting(loop: Loop, late: Scalar) -> tuple[Array, Array]:
+    """N and O, (n, m) each, for a command [N m] that is late by a share of a period, by polynomials through NODES."""
+    gap = late - jnp.asarray(NODES)
+    on = jnp.abs(gap) < 1e-14
+    weights = jnp.asarray(_WEIGHTS) / jnp.where(on, 1.0, gap)
+    weights = jnp.where(jnp.any(on), on.astype(float), weights / jnp.sum(weights))
+    return jnp.tensordot(weights, loop.new, 1), jnp.tensordot(weights, loop.old, 1)
+
+
+def at_input(loop: Loop, w: Scalar, late: Any = None, axis: Any = None) -> Complex[Array, "m m"]:
+    """L(e^(i w h)) at the plant's input: what comes back as command, its sign changed, of what acts; w [rad/s].
+
+    late: further delay in periods, any number of at least 0, of this axis. 1 + L = 0 is the border of stability.
+    """
+    a, command = loop.closed_at_sensors()
+    z, sent = jnp.exp(1j * w * loop.period), loop.new[0]
+    if late is not None:
+        whole = jnp.floor(late)
+        new, old = acting(loop, late - whole)
+        delayed = (new + old / z) * z**-whole
+        sent = jnp.where(jnp.arange(sent.shape[1]) == axis, delayed, sent)
+    return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent + 0j))
+
+
+def at_sensors(loop: Loop, w: Scalar) -> Complex[Array, "k k"]:
+    """L(e^(i w h)) at the sensors: the state that follows, its sign changed, of what they see; w [rad/s]."""
+    k, z = loop.seen.shape[1], jnp.exp(1j * w * loop.period)
+    n = loop.a.shape[0]
+    back = z**-loop.delay * loop.new[0]
+    a = loop.a + back @ loop.command
+    return -jnp.linalg.solve(z * jnp.eye(n) - a, loop.seen + back @ loop.direct)[:k]
+
+
+def closed(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> np.ndarray:
+    """Matrix of a period of the closed loop with this gain, a number or a matrix (m, m), and delay in periods.
+
+    Its state is z and the commands on their way, the newest first: (n + delay m, n + delay m), for a command in [N m].
+    """
+    a, command = (np.asarray(v) for v in loop.closed_at_sensors())
+    m, n = command.shape
+    total = loop.delay + late
+    whole = int(np.floor(total + 1e-12))
+    part = max(total - whole, 0.0)
+    new, old = (np.asarray(v) for v in acting(loop, jnp.asarray(part)))
+    kept = whole + (part > 0.0)
+    sent = (gain * np.eye(m) if np.ndim(gain) == 0 else np.asarray(gain)) @ command
+    matrix = np.zeros((n + kept * m,) * 2, dtype=np.result_type(sent, float))
+    matrix[:n, :n] = a
+    for back, push in ((whole, new), (whole + 1, old)):  # the command of so many periods ago
+        if back == 0:
+            matrix[:n, :n] += push @ sent
+        elif back <= kept:
+            at = n + (back - 1) * m
+            matrix[:n, at : at + m] += push
+    if kept:
+        matrix[n : n + m, :n] = sent
+        matrix[n + m :, n:-m] = np.eye((kept - 1) * m)
+    return matrix
+
+
+def radius(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> float:
+    """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1."""
+    return float(np.abs(np.linalg.eigvals(closed(loop, gain, late))).max())

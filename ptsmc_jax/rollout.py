@@ -4,7 +4,6 @@
 inertia or noise is the same compiled program.
 """
 
-from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,13 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import draws, metrics, numerics
-from ptsmc_jax.clock import Anchored, Flight, Graded, Ticks
+from ptsmc_jax.assembly import Parts
+from ptsmc_jax.clock import Graded, Ticks
+from ptsmc_jax.computer import Computer, boot, decide, schedule, told
 from ptsmc_jax.draws import Whole
 from ptsmc_jax.hardware import Actuators, Drive
-from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.observers import Observer
-from ptsmc_jax.plants import Plant
-from ptsmc_jax.sensors import Sensor
 
 Scalar = Float[Array, ""]
 
@@ -37,33 +35,6 @@ SINGULAR_CLEARANCE = 1e-3
 LEFT = 0.05  # share of the initial angle, and SETTLED settling angles, beyond which a run has missed t_f
 SETTLED = 10.0
 DISTURBANCE_WALK = "disturbance_walk"
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Parts:
-    """Everything a run is made of. `plant` is the truth; controller and observer hold their own, nominal model."""
-
-    plant: Plant
-    disturbance: Any  # callable: t [s], true state -> (m,) [N m]
-    reference: Any  # callable: t [s] -> what the law is to reach, a Target for spacecraft
-    controller: Any  # laws.Law
-    observer: Any  # observers.Observer
-    sensors: Any  # sensors.Sensor, or None: the law sees the true state
-    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
-    initial: Any  # state of the plant
-    t_end: Leaf  # [s]
-    window: Leaf  # after t_f, for window_error [s]
-    settling_angle: Leaf  # [rad]
-    actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
-    walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
-    substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
-
-    def with_t_f(self, t_f: Leaf) -> "Parts":
-        """The parts with another prescribed time [s]; the time after it is kept."""
-        t_end = t_f + (self.t_end - self.controller.t_f)
-        law, timing = replace(self.controller, t_f=t_f), replace(self.clock, t_end=t_end)
-        return replace(self, controller=law, clock=timing, t_end=t_end)
 
 
 class Log(NamedTuple):
@@ -93,7 +64,6 @@ class Result(NamedTuple):
 
 class _State(NamedTuple):
     x: Any
-    memory: Array  # of the observer
     u: Array  # delivered at the end of the last interval
     sight: metrics.Sight
     running: metrics.Running
@@ -111,13 +81,10 @@ class _Course(NamedTuple):
     whole: Array  # what clearances from the law's singularity are counted in
 
 
-class _Flight(NamedTuple):
+class _World(NamedTuple):
     """What the sampled loop carries besides."""
 
-    sensing: Any  # memory of the sensors
-    seen: Any  # state as the law saw it at the last sample
-    # what the observer is told of the last period: mean torque, and momentum of the wheels in it; None: torque held
-    applied: tuple[Array, Array | None] | None
+    computer: Computer
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
 
@@ -143,49 +110,30 @@ simulate_jit = jax.jit(simulate, static_argnames="record")
 
 def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
     """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
-    controller = parts.controller
     observer: Observer = parts.observer
-    model = observer.model
-    sensors: Sensor | None = parts.sensors
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = observer.error_bound()
-    lengths = ticks.t_next - ticks.t
-    length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
-    partial_before = jnp.concatenate([jnp.zeros(1), ticks.noise_weight[:-1]]) < 1.0
-    # the observer's matrix for a whole period and for the partial first one, outside the loop
-    matrix = observer.update_matrix(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
-    first_length = jnp.sum(jnp.where(ticks.noise_weight < 1.0, lengths, 0.0))
-    first_matrix = observer.update_matrix(first_length)
+    listed, about, started = schedule(parts, ticks)
     walk = draws.stream(seed, trial, DISTURBANCE_WALK)
 
     def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
         return over_period(parts, t, x, drive, pushed, dt)
 
-    def period(carry: tuple[_State, _Flight], tick: tuple) -> tuple[tuple[_State, _Flight], Any]:
-        (now, dt_before, partial), (state, flight) = tick, carry
-        dt, target = now.t_next - now.t, parts.reference(now.t)
-        seen, sensing = (state.x, None) if sensors is None else sensors.measure(flight.sensing, state.x, now, dt_before)
-        w = parts.plant.velocity(seen)
-        applied = state.u
-        if flight.applied is not None:
-            applied, stored = flight.applied
-            if stored is not None:
-                applied = applied - jnp.cross((parts.plant.velocity(flight.seen) + w) / 2, stored)
-        impulse = model.unexplained_impulse(now.t, flight.seen, seen, applied, dt_before)
-        memory = observer.update(jnp.where(partial, first_matrix, matrix), state.memory, impulse, now.t, dt_before)
-        memory = jnp.where(dt_before > 0.0, memory, state.memory)
-        d_hat = observer.estimate(memory)
-        u, s = controller.torque(now.t, now.hold, seen, target, d_hat, k2(now.t))
-        drive, queue = actuators.command(flight.acting, u, w, dt, now.noise_weight)
-        pushed = flight.pushed
+    def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
+        (now, *_), (state, world) = tick, carry
+        dt = now.t_next - now.t
+        computer = world.computer._replace(told=(state.u, None)) if actuators.holds else world.computer
+        (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, state.x)
+        drive, queue = actuators.command(world.acting, u, w, dt, now.noise_weight)
+        pushed = world.pushed
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         zero, stored = jnp.zeros_like(dt), None
         delivered = actuators.torque(drive, zero)
         wheels = None if actuators.wheels is None else actuators.wheels_at(drive, zero)
         row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels) if record else None
-        x = fly(state.x, now.t, drive, pushed, dt)
-        acting = actuators.end(flight.acting, drive, queue, dt)
+        start = state.x
+        x = fly(start, now.t, drive, pushed, dt)
         weights, torques = (1.0,), (delivered,)
         if actuators.moves:
             weights = (1 / 6, 4 / 6, 1 / 6)
@@ -193,29 +141,24 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         if wheels is not None:  # in the middle too: a lag may turn the torque around within the period
             stored = jnp.stack([actuators.wheels_at(drive, s)[0] for s in (dt / 2, dt)])
         span = _Torques((u,) * len(torques), torques, weights, drive.limited, stored)
-        start = state.x
 
         def until(t: Scalar) -> Any:
             return fly(start, now.t, drive, pushed, t - now.t)
 
-        state = _advance(parts, course, state, now, target, x, memory, span, until, dt / parts.substeps)
-        told = None
-        if not actuators.holds:
-            push = actuators.over(drive, zero, dt)
-            told = push.mean, push.middle
-        return (state, _Flight(sensing, seen, told, acting, pushed)), row
+        state = _advance(parts, course, state, now, target, x, span, until, dt / parts.substeps)
+        computer = computer._replace(told=None if actuators.holds else told(actuators, drive, dt))
+        return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
 
     acting = actuators.begin(parts.plant.inputs)
-    state, none = _begin(parts, course, acting.h), jnp.zeros(parts.plant.inputs)
+    state = _begin(parts, course, acting.h)
     first = state.sight
-    started = jax.tree.map(lambda v: v[jnp.argmax(lengths > 0.0)], ticks)
-    sensing = None if sensors is None else sensors.begin(seed, trial, course.x0, started)
-    told = (none, None if actuators.wheels is None else none)
-    flight = _Flight(
-        sensing, course.x0, None if actuators.holds else told, acting, None if parts.walk_rate is None else none
-    )
-    (state, flight), rows = jax.lax.scan(period, (state, flight), (ticks, length_before, partial_before))
-    return _finish(parts, course, first, state, k2, rows, flight, held=True)
+    pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+    computer = boot(parts, seed, trial, course.x0, started)
+    if actuators.holds:  # the state has it
+        computer = computer._replace(told=None)
+    world = _World(computer, acting, pushed)
+    (state, world), rows = jax.lax.scan(period, (state, world), listed)
+    return _finish(parts, course, first, state, world.computer.memory, k2, rows, world)
 
 
 def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | None, dt: Scalar) -> Any:
@@ -254,8 +197,8 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
     largest = jnp.max(jax.vmap(lambda a, dt: numerics.row_norm(a) * dt)(slopes, lengths))
     decays = jax.vmap(lambda a, dt: numerics.decay(a, dt, largest))(slopes, lengths)
 
-    def step(state: _State, tick: tuple) -> tuple[_State, Any]:
-        now, linear = tick
+    def step(carry: tuple[_State, Array], tick: tuple) -> tuple[tuple[_State, Array], Any]:
+        (now, linear), (state, before) = tick, carry
         dt, target = now.t_next - now.t, parts.reference(now.t)
 
         def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
@@ -264,19 +207,19 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
             seen = model.unexplained(t, x, x_dot, u)
             return x_dot, observer.forcing(t, (now.t, now.t_next), memory, seen), (u, s)
 
-        x, memory, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, state.memory, dt)
-        d_hat = observer.estimate(state.memory)
+        x, memory, (u, s), (u_middle, _) = numerics.etdrk4(rate, linear, now.t, state.x, before, dt)
+        d_hat = observer.estimate(before)
         row = _row(parts, now.t, state.x, target, d_hat, u, u, s, dt > 0.0) if record else None
         x = parts.plant.normalise(x)
         _, _, (u_end, _) = rate(now.t_next, x, memory)
         torques = (u, u_middle, u_end)
         span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
-        return _advance(parts, course, state, now, target, x, memory, span, lambda t: x, dt), row
+        return (_advance(parts, course, state, now, target, x, span, lambda t: x, dt), memory), row
 
     state = _begin(parts, course)
     first = state.sight
-    state, rows = jax.lax.scan(step, state, (ticks, decays))
-    return _finish(parts, course, first, state, k2, rows, None, held=False)
+    (state, memory), rows = jax.lax.scan(step, (state, observer.begin()), (ticks, decays))
+    return _finish(parts, course, first, state, memory, k2, rows, None)
 
 
 def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State:
@@ -285,7 +228,6 @@ def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State
     sight = _sight(parts, course.first, x0)
     state = _State(
         x=x0,
-        memory=parts.observer.begin(),
         u=none,
         sight=sight,
         running=metrics.begin(sight, judged, parts.plant.inputs, wheels),
@@ -306,7 +248,7 @@ class _Torques(NamedTuple):
     wheel_momentum: Array | None
 
 
-def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torques: _Torques, until, step) -> _State:
+def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step) -> _State:
     """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
     step: longest integration step taken in it [s].
@@ -324,7 +266,6 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torque
     span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
     after = state._replace(
         x=x,
-        memory=memory,
         u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
         sight=sight,
         running=metrics.update(state.running, span, judged),
@@ -333,17 +274,17 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, memory, torque
     return after._replace(status=status, bad_time=bad_time)
 
 
-def _finish(parts: Parts, course, first, state: _State, k2, rows, flight: _Flight | None, *, held: bool) -> Result:
+def _finish(parts: Parts, course, first, state: _State, memory: Array, k2, rows, world: _World | None) -> Result:
     judged = course.judged
     log, angle_at_t_f = None, state.running.late.angle_at_t_f
-    acting = None if flight is None else flight.acting
+    acting = None if world is None else world.acting
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
-        d_hat = parts.observer.estimate(state.memory)
+        d_hat = parts.observer.estimate(memory)
         u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
-        u = state.u if held else u
-        pushed = None if flight is None else flight.pushed
+        u = u if world is None else state.u  # sampled: held
+        pushed = None if world is None else world.pushed
         wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
         last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)

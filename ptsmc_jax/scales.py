@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from ptsmc_jax import device_tables, law_tables, linear, sensors
+from ptsmc_jax import borders, device_tables, law_tables, sensors
 from ptsmc_jax.tables import Scenario
 
 LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
@@ -39,12 +39,12 @@ def dead_beat_gain(scenario: Scenario, left: float = LEFT) -> float:
 def largest_k1(scenario: Scenario) -> float:
     """K1 [1/s] at which the sampled loop after the hand-over ends to be stable, with this delay and `surface_rate`.
 
-    `linear.largest_reaching` = K1 h / 2 for a spacecraft (60), K1 h for what has the K1 of (10) and (29); without delay
+    `borders.largest_reaching` = K1 h / 2 for a spacecraft (60), K1 h for what has the K1 of (10), (29); without delay
     it is 2 - c h. Of an order above 2 that of the slowest pole of its surface: an estimate. 0: there is none.
     """
     h = scenario.loop.period
     late = float(getattr(scenario.hardware, "delay", None) or 0)
-    reaching = linear.largest_reaching(scenario.controller.surface_rate * h, late) / h
+    reaching = borders.largest_reaching(scenario.controller.surface_rate * h, late) / h
     return 2.0 * reaching if scenario.spacecraft is not None else reaching
 
 

@@ -260,6 +260,21 @@ class Sensors:
         seen = AttitudeState(estimate.q, w - estimate.bias)
         return seen, Memory(memory.keys, noise_next, bias, estimate, w)
 
+    def moved(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
+        """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""
+        if memory.estimate is None:
+            return memory
+        turn, bias, rate = by.reshape(3, 3)
+        q = attitude.multiply(memory.estimate.q, attitude.from_rotation_vector(turn))
+        return memory._replace(estimate=Estimate(q, memory.estimate.bias + bias), rate=memory.rate + rate)
+
+    def apart(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
+        """What `moved` takes a memory to another one by, to first order."""
+        if memory.estimate is None:
+            return jnp.zeros(0)
+        turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
+        return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
+
     def reading(self, period: float) -> Reading:
         """Rotation [rad], every so many periods behind a filter, and rate with its bias [rad/s], every period [s]."""
         one, none = np.eye(3), np.zeros((3, 3))

@@ -25,8 +25,8 @@ class RefusedError(ValueError):
     """A folder that must not be written to. Its text is one sentence."""
 
 
-def versions(command: str, seed: int, **others: Any) -> dict[str, Any]:
-    """What made a result: command and seed, versions, machine."""
+def versions(command: str, seed: int | None, **others: Any) -> dict[str, Any]:
+    """What made a result: command and seed (None: nothing is drawn), versions, machine."""
     return {
         "command": command,
         "seed": seed,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import free_gains, linear, montecarlo, pace, rollout, scenario, sensors
+from ptsmc_jax import borders, free_gains, montecarlo, pace, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, vector
@@ -174,8 +174,8 @@ def test_default_bounds_of_the_surfaces_rate_go_with_t_f_and_end_at_half_of_the_
     np.testing.assert_allclose(made.tune.bounds["surface_rate"], expected)
     if period is not None:  # the border itself, without K1 and the switching term
         for c, stable in ((1.999 / period, True), (2.001 / period, False)):
-            kp, kd = linear.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
-            assert (linear.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
+            kp, kd = borders.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
+            assert (borders.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
 
 
 @pytest.mark.parametrize(

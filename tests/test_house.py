@@ -24,13 +24,15 @@ FLOORS = {
         observers laws clock
         controllers
         sensors baselines
-        metrics
+        metrics assembly
+        computer
         rollout
         components
         lanes
         kernel
-        theory linear estimation
-        hold
+        theory estimation borders
+        hold linear
+        margins covariance
         requirements
         dispersions
         values systems
@@ -46,7 +48,7 @@ FLOORS = {
         scenario
         montecarlo runs
         store remark_2 drawing rows statistics
-        plotting study_plots campaign_plots campaign
+        plotting study_plots campaign_plots margin_plots campaign
         cluster animation
         explore
         paper
@@ -62,10 +64,11 @@ FLOORS = {
         descents
         optimise
         evolution
-        report single reproduction mapping
+        report single reproduction mapping stability
         results pareto compare campaign_folder
         campaign_summary
         told options
+        told_margins
         show
         show_campaign page_charts convert new
         page

@@ -111,12 +111,12 @@ def test_a_period_is_mapped_in_the_sampled_loop_only():
 def test_borders_are_drawn_over_period_and_delta_only():
     loaded, x, y, cells = flown("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2", trials=1)
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
-        lines = mapping.borders(scenario.replace(loaded, loop__clock=clock), x, y)
+        lines = mapping.lines(scenario.replace(loaded, loop__clock=clock), x, y)
         delta, period = lines[f"$\\delta = (\\eta - {label}) h$"]
         np.testing.assert_allclose(delta, factor * np.asarray(period))
-    assert not mapping.borders(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
+    assert not mapping.lines(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
-    assert not mapping.borders(third, x, y)  # another law, another border
+    assert not mapping.lines(third, x, y)  # another law, another border
     assert cells
 
 

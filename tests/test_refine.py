@@ -16,7 +16,8 @@ class Valley(Evaluator):
     """F = x'A x, x a share of the bounds less 0.5, with a'x >= b; no numbers beyond `wall` in the first gain."""
 
     def __init__(self, matrix, along=None, least=0.0, wall=1.0):
-        super().__init__(Bounds(("eta", "delta", "observer_gain")[: len(matrix)], *[(1.0,) * len(matrix)] * 2))
+        one = (1.0,) * len(matrix)
+        super().__init__(Bounds(("eta", "delta", "observer_gain")[: len(matrix)], one, one))
         self.matrix, self.along, self.least, self.wall = matrix, along, least, wall
         self.seen = []
 

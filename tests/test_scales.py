@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import attitude, linear, observers, plants, scales, scenario
+from ptsmc_jax import attitude, borders, observers, plants, scales, scenario
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.signals import Target
 from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, parts, vector
@@ -50,11 +50,11 @@ def growth(c, k, late, keep=0.6, period=1.0):
 @pytest.mark.parametrize("surface", [0.02, 0.1, 0.25])
 def test_border_of_the_hold_phase_is_where_a_loop_stepped_by_hand_begins_to_grow(surface, late):
     """With the observer in the loop, which the border leaves out; what a constant disturbance leaves is a constant."""
-    border = linear.largest_reaching(surface, float(late))
+    border = borders.largest_reaching(surface, float(late))
     inside, outside = growth(surface, 0.98 * border, late), growth(surface, 1.02 * border, late)
     assert inside < 1e-6 < 1e-3 < outside
     # the two rates may change places
-    np.testing.assert_allclose(linear.largest_reaching(border, float(late)), surface, rtol=1e-6)
+    np.testing.assert_allclose(borders.largest_reaching(border, float(late)), surface, rtol=1e-6)
     if late == 0:
         np.testing.assert_allclose(border, 2.0 - surface, rtol=1e-9)
 
@@ -62,7 +62,7 @@ def test_border_of_the_hold_phase_is_where_a_loop_stepped_by_hand_begins_to_grow
 def test_largest_k1_is_twice_the_border_for_a_spacecraft_and_none_beyond_it():
     np.testing.assert_allclose(scales.largest_k1(flight()), 2.0 * (2.0 / 0.05 - 1.0), rtol=1e-9)
     late = flight(hardware__delay=1, controller__surface_rate=3.0)
-    np.testing.assert_allclose(scales.largest_k1(late), 2.0 * linear.largest_reaching(0.15, 1.0) / 0.05)
+    np.testing.assert_allclose(scales.largest_k1(late), 2.0 * borders.largest_reaching(0.15, 1.0) / 0.05)
     assert scales.largest_k1(flight(controller__surface_rate=41.0)) == 0.0
     loop = {"mode": "sampled", "period": 0.05}
     for plant in ({"kind": "chain", "order": 2}, ARM["plant"]):

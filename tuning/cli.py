@@ -144,6 +144,35 @@ def map_(
 
 
 @app.command
+def margins(
+    scenario: SampledFile = None,
+    /,
+    *,
+    out: Out = None,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find what gain, phase, delay and sensitivity the loop leaves: in hold, and frozen on the way to the hand-over.
+
+    Exit status: 0 done and stable in hold, 1 done but not stable, 2 bad input.
+    """
+    loaded, folder = prepare(scenario, "margins", out, trust=trust)
+    from ptsmc_jax import store
+
+    store.check(folder, force)
+    from tuning import stability
+
+    ready, course = stability.find(loaded)
+    store.write(folder, lambda making: stability.write(making, ready, course, figures))
+    found = stability.summary(ready, course)
+    if not quiet:
+        show.margins(found, folder)
+    return 0 if found["stable"] else 1
+
+
+@app.command
 def tune(
     scenario: ScenarioFile = None,
     /,

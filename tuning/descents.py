@@ -21,7 +21,7 @@ from tuning.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, sp
 from tuning.work import ROUND, SLOPED
 
 AGAIN = 3  # starts, from whose best points they go on
-EXPLORED = 16  # averaged trials on which most starts are left behind
+EXPLORED, AVERAGED = 32, 16  # trials on which most starts are left behind, those averaged at least among them
 FOLLOWED = 3  # starts that go on with all trials
 SAME = 1e-4  # change of F that makes no difference
 FINISH = 1e-2  # of `CLOSE`: how near to the optimum the best start is taken in the end
@@ -48,7 +48,7 @@ def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple
     if not sloped:
         evolving = {EVOLVING: GENERATIONS * WIDELY[0] * trials}
         return {CHOOSING: MANY * trials, **evolving}, {ROUND: 0.0, **evolving}
-    one, few = SLOPED * steps, fewer_trials(problem, EXPLORED).trials.size
+    one, few = SLOPED * steps, _few_trials(problem).trials.size
     exploring = {SETTING_OUT: one * few, CHOOSING: max(SWEPT, starts) * few, SEARCHING: starts * one * 3 / 8 * few}
     return (
         {
@@ -58,6 +58,11 @@ def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple
         },
         {ROUND: AGAIN * one * trials, FINISHING: one * trials},
     )
+
+
+def _few_trials(problem: Problem) -> Problem:
+    """The problem with few trials."""
+    return fewer_trials(problem, max(AVERAGED, EXPLORED - (problem.trials.size - problem.averaged)))
 
 
 class Descents:
@@ -120,14 +125,14 @@ class Descents:
         """From the scenario's own gains, (gains,), on a few trials."""
         self._own = self._evaluate.bounds.share(own)
         self._report(SETTING_OUT, 0, 2, *self.best_so_far)
-        self._descend(fewer_trials(problem, EXPLORED), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
+        self._descend(_few_trials(problem), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
 
         The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
         """
-        problem, few, more = fewer_trials(problem, EXPLORED), max(2, self._steps // 4), max(2, self._steps // 2)
+        problem, few, more = _few_trials(problem), max(2, self._steps // 4), max(2, self._steps // 2)
         self._report(SETTING_OUT, 1, 2, *self.best_so_far)
         self._descend(problem, self.share, 0, more, scale=CAREFUL, afresh=True)
         first = starting_points(self._evaluate, self.tightened(problem), self.share, starts, seed, self._report)

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import drawing, linear, montecarlo, schema, store, study_plots, systems
+from ptsmc_jax import borders, covariance, drawing, margins, montecarlo, schema, store, study_plots, systems
 from ptsmc_jax.clock import Anchored, Flight
 from ptsmc_jax.laws import Prescribed
-from ptsmc_jax.observers import NonlinearObserver, NoObserver
-from ptsmc_jax.plants import Spacecraft
+from ptsmc_jax.observers import Linear, NoObserver
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.scenario import Study, study
 from ptsmc_jax.scenario import replace as changed
@@ -157,22 +156,25 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "peak_torque": float(np.mean(peaks)),
             "largest_peak_torque": float(peaks.max()),
         }
-    parts = ready.parts
-    papers = isinstance(parts.controller, Prescribed) and isinstance(parts.plant, Spacecraft)
-    if ready.scenario.loop.mode == "sampled" and papers:
-        found = linear.margins(parts)
-        at, hold = found["hand_over"], found["hold"]
-        known |= {"radius": at.radius, "gain_margin": at.gain, "delay_margin": at.delay}
-        known |= {"hold_gain_margin": hold.gain, "hold_delay_margin": hold.delay}
-        linear_observer = isinstance(parts.observer, NoObserver | NonlinearObserver)
-        raw = parts.sensors is not None and parts.sensors.filter is None
-        if raw and linear_observer and at.radius < 1.0:
-            expected = linear.noise(parts)
+    parts = common(ready.parts)
+    if ready.scenario.loop.mode == "sampled" and isinstance(parts.controller, Prescribed):
+        ends = margins.at_ends(parts)
+        (at, radius), (hold, _) = ends["hand_over"], ends["hold"]
+        known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
+        known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
+        read = parts.sensors is not None and hasattr(parts.sensors, "reading")
+        if read and isinstance(parts.observer, NoObserver | Linear) and radius < 1.0:
+            expected = covariance.noise(parts)
             known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **known)
 
 
-def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _factor(found: margins.Margins) -> float:
+    """On the gain of the worst axis, up to which the loop is stable; below 1 where it is not."""
+    return float(10.0 ** (found.gain_up.min() / 20.0))
+
+
+def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
     second_order = getattr(scenario.plant, "order", 2) == 2
     papers = hasattr(scenario.controller, "eta")
@@ -181,12 +183,12 @@ def borders(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray,
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
-    lines = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
+    labels = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
     if delay > 1:
-        lines[f"with {delay} periods of delay"] = float(delay)
+        labels[f"with {delay} periods of delay"] = float(delay)
     found = {}
-    for label, late in lines.items():
-        delta = np.array([linear.smallest_delta(eta, float(period), late, anchored=anchored) for period in h])
+    for label, late in labels.items():
+        delta = np.array([borders.smallest_delta(eta, float(period), late, anchored=anchored) for period in h])
         found[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return found
 
@@ -215,7 +217,7 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
             (y.key, y.values, y.logarithmic),
             grids,
             lost,
-            borders(scenario, x, y),
+            lines(scenario, x, y),
             scenario.plant.kind,
         )
         drawing.save({"map": made}, folder / "figures")

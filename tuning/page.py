@@ -18,7 +18,7 @@ import numpy as np
 
 from ptsmc_jax import schema, store
 from ptsmc_jax.store import RefusedError
-from tuning import page_charts, told
+from tuning import page_charts, told, told_margins
 from tuning.options import UsageError
 
 HERE = Path(__file__).parent
@@ -295,6 +295,16 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
     return Heading("calm", "Accuracy and peak torque over two keys", lines), [Section("Pairs", [_table(table)])]
 
 
+def _margins(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    mood, headline = (
+        ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
+    )
+    return Heading(mood, headline, told_margins.lines(summary)), [
+        Section("Margins", [_table(told_margins.table(summary))])
+    ]
+
+
 def _short(cell: str) -> str:
     try:
         return f"{float(cell):.4g}"
@@ -319,6 +329,7 @@ SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
     "compare": _compare,
     "montecarlo": _montecarlo,
     "map": _map,
+    "margins": _margins,
     "reproduce": _reproduce,
 }
 
@@ -330,6 +341,9 @@ CAPTIONS = {
     "profiles": "The goal along each gain between its bounds, the others as found; what breaks a limit is marked.",
     "front": "The same front as a picture.",
     "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
+    "nichols": "The loop opened at each axis of the plant's input, the others closed.",
+    "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",
+    "margins": "Margins of the frozen loop on the way to the hand-over.",
     "fan": "How the error goes with time: the share of trials inside each band.",
     "distributions": "The share of the trials up to each value; the scale stretches both ends.",
     "inputs": "What was drawn against what came of it.",

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from tuning import told
+from tuning import told, told_margins
 
 
 class Progress:
@@ -73,6 +73,12 @@ def grid(cells: list[Any], folder: Path) -> None:
     print(f"results in {folder}")
 
 
+def margins(summary: dict[str, Any], folder: Path) -> None:
+    """Margins of a loop, as their `summary.json` says."""
+    table(told_margins.table(summary))
+    say(*told_margins.lines(summary), f"results in {folder}")
+
+
 def run(summary: dict[str, Any], kind: str, folder: Path) -> None:
     """Metrics and verdicts of one run, as its `summary.json` says; kind: of its plant."""
     say(*told.run_lines(summary))
@@ -117,10 +123,11 @@ def say(*lines: str) -> None:
 def table(cells: told.Table, **style: Any) -> None:
     """Print a table; style: of rich's `Table`."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(*cells.head, pad_edge=False, **{"box": None, **style})
+    made = Table(*map(escape, cells.head), pad_edge=False, **{"box": None, **style})
     for row in cells.rows:
         made.add_row(*map(Text, row))
     Console(highlight=False).print(made)

@@ -1,0 +1,104 @@
+"""Borders of stability of the sampled double integrator under proportional and derivative feedback, in closed form.
+
+Near the reference each component of the attitude error obeys eps'' = a, with the law's a = -kp eps - kd eps' computed
+from samples and held, periods late where there is a delay: kp and kd are (57)'s and (60)'s with the smooth sign's
+slope. What bounds of gains and the lines of a map are drawn from, before there is a loop to linearise (`linear`).
+"""
+
+import numpy as np
+
+
+def gains(
+    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gains kp [1/s^2] and kd [1/s], (times,), at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
+
+    eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; c k and c + k after it, with
+    k = (K1 + slope)/2 and c the surface_rate [1/s].
+    """
+    tau = t_f - np.asarray(t, dtype=float)
+    hold = tau <= delta * (1 + 1e-9)
+    safe = np.where(hold, 1.0, tau)
+    after = (k1 + slope) / 2
+    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + slope * eta / 2)
+    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + slope * safe / 2)
+    return kp, kd
+
+
+def _closed(kp: float, kd: float, h: float, late: float) -> np.ndarray:
+    """Matrix of a period of the frozen loop; late: delay in periods, any number of at least 0."""
+    whole = int(np.floor(late))
+    part = late - whole  # the command of `whole` periods ago acts from here on, the one before until then
+    n = 2 + whole + (part > 0)
+    move = np.eye(n)
+    move[0, 1] = h
+
+    def push(share_from: float, share_to: float) -> tuple[float, float]:
+        """Effect on eps and eps' of a unit acceleration between two shares of the period."""
+        a, b = share_from * h, share_to * h
+        return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
+
+    late_push, early_push = push(part, 1.0), push(0.0, part)
+    feedback = np.array([-kp, -kd])
+    columns = list(range(2, n))  # commands waiting, the newest first
+    if whole == 0:
+        move[:2, :2] += np.outer(late_push, feedback)
+    else:
+        move[:2, columns[whole - 1]] += late_push
+    if part > 0:
+        move[:2, columns[whole]] += early_push
+    for k in reversed(range(len(columns))):
+        move[columns[k], :] = 0.0
+        if k == 0:
+            move[columns[k], :2] = feedback
+        else:
+            move[columns[k], columns[k - 1]] = 1.0
+    return move
+
+
+def radius(kp: float, kd: float, h: float, late: float = 0.0) -> float:
+    """Largest modulus of the frozen loop's poles: below 1 it is stable. h: period [s]; late: delay in periods."""
+    return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, late))).max())
+
+
+def _last(stable, low: float, high: float) -> float:
+    """Largest number at which `stable` still holds, by bisection; inf where it holds at `high`."""
+    if stable(high):
+        return float("inf")
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+def largest_index(eta: float, late: float = 0.0) -> float:
+    """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay."""
+
+    def stable(index: float) -> bool:
+        tau = (2 * eta - 1) / index
+        return radius((eta / tau) ** 2, (2 * eta - 1) / tau, 1.0, late) < 1.0
+
+    return _last(stable, 1e-6, 4.0)
+
+
+def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True) -> float:
+    """Smallest delta [s] for which the last sample before the hand-over is stable.
+
+    On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
+    may lie at the hand-over itself: (eta - 1/2) h.
+    """
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - float(anchored)) * h)
+
+
+def largest_reaching(surface: float, late: float = 0.0) -> float:
+    """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
+
+    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. late: delay in periods.
+    The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
+    a period whatever the loop does, as long as it knows the torque that acts.
+    """
+
+    def stable(reaching: float) -> bool:
+        return radius(surface * reaching, surface + reaching, 1.0, late) < 1.0
+
+    return _last(stable, 1e-6, 4.0) if stable(1e-6) else 0.0

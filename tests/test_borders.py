@@ -1,0 +1,59 @@
+"""Closed-form borders of the sampled double integrator against brute force and the law itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import borders
+from ptsmc_jax.plants import AttitudeState
+from tests.helpers import parts, vector
+
+
+@pytest.mark.parametrize("t", [3.0, 18.9, 19.6])
+def test_gains_are_the_slopes_of_the_law(t):
+    """Acceleration of eps by eps and eps' at the reference, by automatic differentiation of the closed loop."""
+    run = parts(20.0, 3.4, 1.0, inertia=(10.0,) * 3, k1=1.7, sign_width=0.05, surface_rate=2.3)
+    law, k2 = run.controller, vector(0.02)
+    hold = jnp.asarray(t >= 19.0)
+
+    def acceleration(eps, rate):
+        x = AttitudeState(jnp.append(eps, jnp.sqrt(1 - jnp.dot(eps, eps))), 2 * rate)
+        u, _ = law.torque(vector(t), hold, x, run.reference(vector(t)), jnp.zeros(3), k2)
+        return run.plant.rate(vector(t), x, u, jnp.zeros(3)).w / 2
+
+    by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))
+    slope = np.sqrt(3.0) / 10.0 * 0.02 / 0.05
+    kp, kd = (float(v) for v in borders.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope, 2.3))
+    np.testing.assert_allclose(by_error, -kp * np.eye(3), atol=1e-9 * kp)
+    np.testing.assert_allclose(by_rate, -kd * np.eye(3), atol=1e-9 * kd)
+
+
+def flown_radius(kp, kd, h, late):
+    """Growth per period of a double integrator under sampled feedback that acts late, by stepping it."""
+    fine = 20
+    state, commands = np.array([1.0, 0.3]), [0.0] * 10
+    sizes = []
+    for _ in range(400):
+        commands.append(-kp * state[0] - kd * state[1])
+        for j in range(fine):
+            back = int(np.ceil(late - (j + 0.5) / fine)) if late > 0 else 0
+            a, dt = commands[-1 - max(back, 0)], h / fine
+            state = np.array([state[0] + dt * state[1] + dt * dt / 2 * a, state[1] + dt * a])
+        sizes.append(np.linalg.norm([state[0], h * state[1]]))
+    return np.exp(np.polyfit(np.arange(200), np.log(np.array(sizes[200:]) + 1e-300), 1)[0])
+
+
+@pytest.mark.parametrize("late", [0.0, 1.0, 2.0, 0.25, 1.5])
+def test_poles_are_those_of_the_loop_stepped_by_hand(late):
+    for kp, kd in ((0.2, 0.5), (1.0, 0.9), (0.05, 0.2)):
+        np.testing.assert_allclose(borders.radius(kp, kd, 1.0, late), flown_radius(kp, kd, 1.0, late), rtol=0.03)
+
+
+def test_borders_are_those_of_the_theory_notes():
+    for eta in (2.2, 3.0, 5.0, 8.0):
+        np.testing.assert_allclose(borders.largest_index(eta), 2.0, rtol=1e-9)
+        np.testing.assert_allclose(borders.smallest_delta(eta, 0.05), max(0.0, (eta - 1.5) * 0.05), rtol=1e-8)
+        np.testing.assert_allclose(borders.smallest_delta(eta, 0.05, anchored=False), (eta - 0.5) * 0.05, rtol=1e-8)
+        assert 0.74 < borders.largest_index(eta, 1.0) < 0.85  # "about 0.75"
+        assert borders.largest_index(eta, 2.0) < borders.largest_index(eta, 1.0)

@@ -1,0 +1,214 @@
+"""Margins against closed forms, an independent frequency response, central differences and the flown loop."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import optimize, signal
+
+from ptsmc_jax import borders, linear, margins, plants, scenario
+from ptsmc_jax.computer import schedule
+from tuning.gains import with_gains
+
+CHAIN = {
+    "plant": {"kind": "chain", "order": 2},
+    "controller": {"t_f": 4.0, "delta": 0.5, "sign_width": 1e-2},
+    "observer": {"kind": "none"},
+    "loop": {"mode": "sampled", "period": 0.05, "t_end": 40.0},
+}
+
+
+def chain(**changes):
+    """A chain's parts, its loop in hold, and kp, kd of a = -kp x1 - kd x2."""
+    parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts
+    law = parts.controller
+    reaching = float(law.k1) + float(parts.observer.error_bound().largest) / float(law.sign_width)
+    surface = float(law.surface()[0])
+    return parts, opened(parts), (surface * reaching, surface + reaching)
+
+
+def opened(parts, hold=True):
+    run = linear.nominal_jit(parts)
+    index = linear.whole_periods(parts, run, hold=hold)[-1]
+    return linear.mean(parts, linear.opened_all(parts, run).loop, index)
+
+
+def of(loop):
+    return jax.tree.map(lambda v: np.asarray(v)[0], margins.of_each(jax.tree.map(lambda v: v[None], loop)))
+
+
+GAINS = [(1.0, 0.05, 1.0, 0), (6.0, 0.02, 1.0, 0), (3.0, 0.05, 2.0, 1), (2.0, 0.1, 0.5, 2), (10.0, 0.05, 1.0, 0)]
+
+
+@pytest.mark.parametrize(("k1", "period", "rate", "delay"), GAINS)
+def test_margins_are_those_of_an_independent_transfer_function(k1, period, rate, delay):
+    """kp x + kd x' around SciPy's zero-order hold of 1/s^2, its crossings found by bisection."""
+    changes = {"controller__k1": k1, "loop__period": period, "controller__surface_rate": rate}
+    _, loop, (kp, kd) = chain(**changes, hardware={"delay": delay, "state_noise": [1e-6, 1e-6]})
+    found = of(loop)
+    a, b, rows = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[kp, kd]])
+    plant: Any = signal.cont2discrete((a, b, rows, np.zeros((1, 1))), period)
+    above, below = signal.ss2tf(*plant[:4])
+
+    def respond(w):
+        z = np.exp(1j * w * period)
+        return np.polyval(above[0], z) / np.polyval(below, z) / z**delay
+
+    w = np.geomspace(1e-4, np.pi / period, 20_001)
+    seen = respond(w)
+
+    def crossings(f):
+        values = f(respond(w))
+        at = np.flatnonzero(values[:-1] * values[1:] < 0)
+        return [optimize.brentq(lambda w: f(respond(w)), w[j], w[j + 1], xtol=1e-15) for j in at]
+
+    factors = [-1 / respond(w).real for w in crossings(np.imag) if respond(w).real < 0]
+    factors += [-1 / respond(np.pi / period).real] if respond(np.pi / period).real < 0 else []
+    up = min(20 * np.log10(f) for f in factors if f > 1)
+    phases = [abs(np.angle(-respond(w))) for w in crossings(lambda v: np.log(np.abs(v)))]
+    np.testing.assert_allclose(found.gain_up, up, rtol=1e-8)
+    np.testing.assert_allclose(found.phase, np.rad2deg(min(phases)), rtol=1e-8)
+    j = np.argmax(1 / np.abs(1 + seen))
+    peak = optimize.minimize_scalar(
+        lambda w: np.abs(1 + respond(w)), bounds=(w[j - 1], w[min(j + 1, w.size - 1)]), options={"xatol": 1e-12}
+    )
+    np.testing.assert_allclose(found.modulus, -20 * np.log10(peak.fun), atol=1e-8)
+    assert np.isinf(found.gain_down)  # a double integrator is stable with any small gain
+    late = float(found.delay[0]) / period  # `borders` has the delayed hold by hand
+    for share, stable in ((1 - 1e-7, True), (1 + 1e-7, False)):
+        assert (borders.radius(kp, kd, period, delay + share * late) < 1.0) == stable
+
+
+def test_gain_margin_of_a_sampled_double_integrator():
+    """A pole comes to -1 at k kd h = 2."""
+    _, loop, (_, kd) = chain()
+    np.testing.assert_allclose(10 ** (of(loop).gain_up / 20), 2.0 / (kd * 0.05), rtol=1e-10)
+
+
+def test_slopes_of_margins_are_those_of_central_differences():
+    parts, _, _ = chain(hardware={"delay": 1, "state_noise": [1e-6, 1e-6]})
+    run = linear.nominal_jit(parts)
+    index = jnp.asarray(linear.whole_periods(parts, run, hold=True)[-1])
+
+    @jax.jit
+    def values(at):
+        changed = with_gains(parts, {"k1": at[0], "sign_width": at[1], "surface_rate": at[2]})
+        found = margins.of(linear.opened(changed, linear.nominal(changed), index).loop)
+        return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.modulus[0]])
+
+    at = jnp.asarray([3.0, 2e-2, 1.5])
+    exact = jax.jacfwd(values)(at)
+    for k in range(3):
+        step = 1e-4 * float(at[k]) * jnp.eye(3)[k]
+        numeric = (8 * (values(at + step) - values(at - step)) - values(at + 2 * step) + values(at - 2 * step)) / (
+            12 * step[k]
+        )
+        np.testing.assert_allclose(exact[:, k], numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
+
+
+def flown(parts, run, index, gain, late):
+    """Growth a period of a small deviation from the nominal run, its time frozen: axes with other gains and delays."""
+    sizes = np.asarray(_flown(linear.quiet(parts), run, *map(jnp.asarray, (index, gain, late))))
+    beyond = np.flatnonzero((sizes > np.log(1e-3)) | (sizes < np.log(1e-8)))  # no small one any more, or rounding
+    last = beyond[0] if beyond.size else sizes.size
+    second = sizes[last // 2 : last]
+    return np.polyfit(np.arange(second.size), second, 1)[0]
+
+
+@jax.jit
+def _flown(parts, run, index, gain, late):
+    listed, carry_0, base = jax.tree.map(lambda v: v[index], (run.listed, run.carry, run.command))
+    _, about, _ = schedule(parts, run.listed[0])
+    period, k2 = about(listed), parts.observer.error_bound()
+    actuators = parts.actuators
+    delay = 0 if actuators is None else actuators.delay
+    axes, now, dt = jnp.arange(base.size), period.now, period.length
+    still = jnp.zeros_like(parts.plant.apart(carry_0.x, carry_0.x))
+    begun = carry_0._replace(x=parts.plant.moved(carry_0.x, still.at[: base.size].set(1e-5)))
+
+    def step(state, _):
+        carry, sent = state
+        decision, computer, model = linear._computed(parts, k2, period, carry, carry.x)
+        sent = jnp.concatenate([(gain * decision.u)[None], sent[:-1]])
+        whole = jnp.floor(late).astype(int)
+        part = jnp.max(late - whole)  # one axis is late
+        new = sent[whole + delay, axes]
+        old = jnp.where(late > 0.0, sent[whole + delay + 1, axes], new)
+        spans = [(old, now.t, part * dt), (new, now.t + part * dt, (1.0 - part) * dt)]
+        x, acting = linear._acted(parts, period, carry, decision.w, spans)
+        size = jnp.linalg.norm(parts.plant.apart(carry_0.x, x))
+        return (linear.Carry(x, acting, computer, model), sent), jnp.log(size)
+
+    sent = jnp.broadcast_to(base, (260, base.size))
+    return jax.lax.scan(step, (begun, sent), length=6000)[1]
+
+
+STIFF = np.array([[3.0, 0.5], [0.5, 2.0]])
+COUPLED = {
+    "plant": {
+        "kind": "system",
+        "system": plants.system(
+            2,
+            F=lambda t, x, v: v + 0.1 * x,
+            H=lambda t, x, v: -jnp.asarray(STIFF) @ jnp.sin(x) - 0.2 * v,
+            G=lambda t, x, v: jnp.array([[1.0, 0.3], [0.0, 1.5]]),
+        ),
+        "x0": [0.3, -0.2, 0.0, 0.0],
+    },
+    "loop": {"mode": "sampled", "period": 0.05, "t_end": 40.0},
+}
+RNG = np.random.default_rng(7)
+BODY = {
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 40.0},
+    "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
+}
+KINDS = {
+    "raw": BODY,
+    "filter, delay and lag": {
+        **BODY,
+        "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "delay": 1, "torque_lag": 0.1},
+        "filter": {"kind": "steady_state", "bandwidth": 1.0},
+    },
+    "wheels and lag": {**BODY, "hardware": {"rate_noise": 1e-6, "torque_lag": 0.05}, "wheels": {}},
+    "a system of one's own": COUPLED,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
+    """Five scenarios of each kind: 1 % on either side of a margin in gain, up and down, and in delay, one axis."""
+    checked = 0
+    for _ in range(5):
+        law = {"t_f": 10.0, "delta": 0.5, "k1": float(RNG.uniform(1.0, 8.0)), "sign_width": 0.05}
+        table = {**KINDS[kind], "controller": {**KINDS[kind].get("controller", {}), **law}}
+        if kind != "a system of one's own":
+            moments = RNG.uniform(8.0, 14.0, 3)
+            table["spacecraft"] = {"inertia": moments.tolist()}
+            table["observer"] = {"gain": RNG.uniform(5.0, 60.0, 3).tolist()}
+        parts = scenario.study(scenario.from_tables(table)).parts
+        run = linear.nominal_jit(parts)
+        index = linear.whole_periods(parts, run, hold=True)[-1]
+        loop = linear.mean(parts, linear.opened_all(parts, run).loop, index)
+        found, m = of(loop), loop.command.shape[0]
+        axis = int(RNG.integers(m))
+        only = np.arange(m) == axis
+        assert found.stable.all()
+        for name, way in (("gain_up", 1.0), ("gain_down", -1.0)):
+            border = 10 ** (way * getattr(found, name)[axis] / 20)
+            for share in (0.99, 1.01):
+                if not 0.0 < border < 1e6:
+                    continue
+                gain = np.where(only, share * border, 1.0)
+                expected = np.log(linear.radius(loop, np.diag(gain)))
+                if abs(expected) * 3000 > 1.0:  # slower than that: another kind of flight
+                    growth = flown(parts, run, index, gain, np.zeros(m))
+                    assert (growth > 0.0) == ((share > 1) == (way > 0)), (name, share, growth, expected)
+                    checked += 1
+        for share in (0.99, 1.01):
+            late = np.where(only, share * found.delay[axis] / float(loop.period), 0.0)
+            growth = flown(parts, run, index, np.ones(m), late)
+            assert (growth > 0.0) == (share > 1), ("delay", share, growth)
+            checked += 1
+    assert checked >= 10

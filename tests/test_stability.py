@@ -1,0 +1,65 @@
+"""`ptsmc margins`: what it leaves, what it says, what it refuses."""
+
+import csv
+import json
+
+import numpy as np
+
+from ptsmc_jax import scenario
+from tests.helpers import SHORT
+from tuning import page, stability
+
+
+def tables(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
+    status, out, _ = command("margins", "s.toml")
+    folder = tmp_path / "out" / "margins-s"
+    assert status == 0
+    assert "gain up [dB]" in out
+    assert "the loop in hold is stable" in out
+    assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
+    found = json.loads((folder / "summary.json").read_text())
+    rows = tables(folder / "margins.csv")
+    hold = [row for row in rows if row["t"] == rows[-1]["t"]]
+    assert [row["axis"] for row in hold] == ["x", "y", "z"]
+    for row in hold:
+        said = found["hold"][row["axis"]]
+        for column, name in (("gain_up_dB", "gain_up"), ("phase_deg", "phase"), ("delay_s", "delay")):
+            np.testing.assert_allclose(float(row[column]), said[name], rtol=1e-12)
+    np.testing.assert_allclose(found["worst"]["phase_margin"], min(one["phase"] for one in found["hold"].values()))
+    # one axis alone bears at least as much as all at once
+    assert found["together"]["gain_up"] <= min(one["gain_up"] for one in found["hold"].values()) * (1 + 1e-6)
+    assert len(found["sensors"]) == 6
+    assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
+    made = page.build(folder)
+    assert "ptsmc margins scenario.toml" in made
+    assert "all inputs at once" in made
+
+
+def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
+    (tmp_path / "wild.toml").write_text(SHORT.replace("[controller]", "[controller]\nk1 = 60.0"))
+    loaded = scenario.read(tmp_path / "wild.toml")
+    assert loaded.controller.k1 * loaded.loop.period > 4.0  # K1 h / 2 beyond 2: the border without delay
+    status, out, _ = command("margins", "wild.toml", "--no-figures")
+    assert status == 1
+    assert "NOT stable" in out
+    found = json.loads((tmp_path / "out" / "margins-wild" / "summary.json").read_text())
+    assert not found["stable"]
+    assert found["worst"]["gain_margin"] < 0.0
+
+
+def test_margins_need_the_sampled_loop(command, tmp_path):
+    (tmp_path / "smooth.toml").write_text("[controller]\nt_f = 5.0\n")
+    status, out, err = command("margins", "smooth.toml")
+    assert (status, out) == (2, "")
+    assert 'margins need the sampled loop, but loop.mode is "continuous"' in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_inputs_and_sensors_of_other_plants_have_names():
+    loaded = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
+    assert stability.names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
