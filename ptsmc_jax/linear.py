@@ -77,7 +77,7 @@ class Nominal(NamedTuple):
 
 
 def quiet(parts: Parts) -> Parts:
-    """The parts without noise and disturbance."""
+    """The parts without noise and disturbance; a sensor of one's own keeps its noise, of trial 0."""
     sensors: Any = parts.sensors
     if isinstance(sensors, Sensors):
         known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)

@@ -253,7 +253,8 @@ def _in_hold(parts: Parts, run: linear.Nominal) -> int:
     x, t = jax.tree.map(lambda v: v[after], (run.carry.x, run.listed[0].t))
     off = jax.vmap(lambda x, t: parts.controller.errors(x, parts.reference(t))[0])(x, t)
     size = np.linalg.norm(np.asarray(off), axis=1)
-    return int(after[np.flatnonzero(size <= 2.0 * size[0])[-1]])
+    near = np.flatnonzero(size <= 2.0 * size[0])
+    return int(after[near[-1] if near.size else 0])
 
 
 def _several(parts: Parts, run: linear.Nominal, indices: Any) -> Loop:

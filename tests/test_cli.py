@@ -15,7 +15,7 @@ from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, ROOT, SHORT, small_search, tree
 from tests.pages import checked
 from tests.test_scenario import check_sentence
-from tuning import cli, single
+from tuning import cli, single, stability
 
 
 def test_simulate_leaves_what_the_contract_says(command, tmp_path):
@@ -122,7 +122,10 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     # the gains beat the paper's on the same trials, in this noise too
     assert summary["fresh"]["window_error"]["rms"] < summary["paper"]["window_error"]["rms"]
 
+    assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
+
     read = checked(tmp_path / "t")
+    assert f"margins in hold: gain {summary['trust']['margins']['hold']['gain_margin']:.3g} dB" in read.text
     assert set(read.charts) == {"search"}
     assert f"{summary['fresh']['window_error']['rms'] / summary['fresh']['floor']:.3g} times the floor" in read.text
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
@@ -186,8 +189,8 @@ WHOLE = "a whole number from 0 to 4294967295"
         (("tune", "--trial", "1"), ("--trial",)),
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("t.toml",)),
-        (("simulat",), ("simulat", "simulate, reproduce, map, tune")),
-        (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, tune")),
+        (("simulat",), ("simulat", "simulate, reproduce, map, margins, tune")),
+        (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, margins, tune")),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),

@@ -63,8 +63,8 @@ FLOORS = {
         refine work
         descents
         optimise
-        evolution
-        report single reproduction mapping stability
+        evolution stability
+        report single reproduction mapping
         results pareto compare campaign_folder
         campaign_summary
         told options

@@ -7,7 +7,7 @@ import numpy as np
 
 from ptsmc_jax import scenario
 from tests.helpers import SHORT
-from tuning import page, stability
+from tuning import page, stability, told
 
 
 def tables(path):
@@ -63,3 +63,22 @@ def test_margins_need_the_sampled_loop(command, tmp_path):
 def test_inputs_and_sensors_of_other_plants_have_names():
     loaded = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert stability.names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
+
+
+def test_few_margins_are_warned_of():
+    enough = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "modulus_margin": 5.0}
+    unlimited = {"gain_margin": None, "phase_margin": 61.0, "delay_margin": None, "modulus_margin": 1.0}
+    few = {"gain_margin": 5.9, "phase_margin": 29.0, "delay_margin": 0.1, "modulus_margin": 7.0}
+
+    def said(hold, hand_over):
+        believed = {"influence": {}, "margins": {"hold": hold, "hand_over": hand_over}}
+        summary = {"at_bound": {}, "trust": {**believed, "slopes_off_central_differences": {"start": 0.0, "end": 0.0}}}
+        return list(told.trust(summary))
+
+    assert not [line for line in said(enough, unlimited) if line.startswith("less than")]
+    lines = said(few, enough)
+    assert lines[:2] == [
+        "margins in hold: gain 5.9 dB, phase 29 deg, delay 0.1 s, modulus 7 dB",
+        "less than 6 dB of gain and 30 deg of phase in hold: what the model leaves out may cost the stability",
+    ]
+    assert any(line.startswith("less than 6 dB of gain") and "hand-over" in line for line in said(enough, few))

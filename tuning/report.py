@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
-from tuning import confirm, evolution, gains, objective, trust
+from tuning import confirm, evolution, gains, objective, stability, trust
 from tuning.design import ShortestTime, shortest_time
 from tuning.evaluate import Evaluator
 from tuning.evolution import Check
@@ -37,6 +37,7 @@ class Trust:
     slope_error: tuple[float, float] | None  # at the first start and at the end; None: flown with the exact sign
     profiles: dict[str, Profile]
     sensitivities: dict[str, dict[str, float]]
+    margins: dict[str, dict[str, float | None]] | None  # of the tuned gains, see `stability.worst`
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,7 @@ def tune(
             else None,
             profiles=trust.profiles(evaluate, found.problem, found.share),
             sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, wanted),
+            margins=stability.worst(study(tuned)),
         )
     return Tuning(
         tuned=tuned,

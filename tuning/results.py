@@ -124,6 +124,7 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
         "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
         "sensitivities": believed.sensitivities,
+        "margins": believed.margins,
         "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
     }
 

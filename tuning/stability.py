@@ -13,7 +13,6 @@ from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 
 FIELDS = ("gain_up", "gain_down", "phase", "delay", "modulus")
-LEAST = {"gain_margin": 6.0, "phase_margin": 30.0}  # [dB], [deg]: with less an engineer asks
 _NO_SIGN = "the exact sign has no slope: it counts as if it were not there"
 
 
@@ -23,6 +22,20 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     return ready, margins.along(ready.parts)
+
+
+def worst(ready: Study) -> dict[str, dict[str, float | None]] | None:
+    """Margins of the worst axis at the last sample before the "hand_over" and in "hold"; None: no sampled loop."""
+    if ready.scenario.loop.mode != "sampled":
+        return None
+    return {
+        where: {name: _number(value) for name, value in found.worst().items()}
+        for where, (found, _) in margins.at_ends(ready.parts).items()
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def names(ready: Study) -> tuple[list[str], list[str]]:
@@ -40,27 +53,25 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     hold, before = ({name: getattr(course.at_input, name)[rows] for name in (*FIELDS, "stable", "crossover")}
                     for rows in (-1, slice(0, -1)))  # fmt: skip
 
-    def number(value: Any) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
     def table(found: dict[str, np.ndarray], labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
-        return {label: {name: number(found[name][k]) for name in fields} for k, label in enumerate(labels)}
+        return {label: {name: _number(found[name][k]) for name in fields} for k, label in enumerate(labels)}
 
-    worst = {name: number(v) for name, v in margins.Margins(*(v[-1] for v in course.at_input)).worst().items()}
+    held = margins.Margins(*(v[-1] for v in course.at_input)).worst()
     t_f = float(ready.parts.controller.t_f)
     exact = getattr(ready.scenario.controller, "sign_width", None) == 0.0
     return {
         "stable": bool(hold["stable"].all()),
-        "worst": worst,
+        "worst": {name: _number(v) for name, v in held.items()},
         "hold": table(hold, inputs, (*FIELDS, "crossover")),
-        "together": {name: number(course.together[name]) for name in FIELDS},
+        "together": {name: _number(course.together[name]) for name in FIELDS},
         "sensors": table(course.at_sensors._asdict(), seen, ("gain_up", "gain_down", "phase", "modulus")),
         "before": [
             {
                 "time_to_go": t_f - float(t),
                 "stable": bool(before["stable"][k].all()),
                 **{
-                    name: number(getattr(np, "max" if name == "modulus" else "min")(before[name][k])) for name in FIELDS
+                    name: _number(getattr(np, "max" if name == "modulus" else "min")(before[name][k]))
+                    for name in FIELDS
                 },
             }
             for k, t in enumerate(course.t[:-1])
