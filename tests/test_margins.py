@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import optimize, signal
 
-from ptsmc_jax import borders, linear, margins, plants, scenario
+from ptsmc_jax import borders, linear, margins, plants, rollout, scenario
 from ptsmc_jax.computer import schedule
 from tuning.gains import with_gains
 
@@ -174,6 +174,17 @@ KINDS = {
     "wheels and lag": {**BODY, "hardware": {"rate_noise": 1e-6, "torque_lag": 0.05}, "wheels": {}},
     "a system of one's own": COUPLED,
 }
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_nominal_run_is_the_one_that_flies(kind):
+    """The flight computer with a model of its own of the actuators flies as the one that is told what they did."""
+    law = {"controller": {"t_f": 10.0, "delta": 0.5}}
+    parts = linear.quiet(scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts)
+    log = rollout.simulate_jit(parts, record=True).log
+    run = linear.nominal_jit(parts)
+    sizes = jax.vmap(parts.plant.apart)(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
+    np.testing.assert_allclose(sizes, 0.0, atol=1e-11)  # rounding, in rad and rad/s of order 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
