@@ -100,12 +100,13 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
 
     value, slope = jax.jit(measured), jax.jit(jax.jacfwd(measured, 1))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
-        run, at, h = flown(controllers.PrescribedTime, c, k), vector(c), 1e-5
+        run, at, h = flown(controllers.PrescribedTime, c, k), vector(c), 1e-3
         forward = float(slope(run, at))
         # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
-        difference = (float(value(run, at + h)) - float(value(run, at - h))) / (2 * h)
-        np.testing.assert_allclose(forward, difference, rtol=1e-8)  # h^2 and rounding 1e-16 / h beside a slope of 0.01
+        two_back, back, ahead, two_ahead = (float(value(run, at + step * h)) for step in (-2, -1, 1, 2))
+        difference = (two_back - 8 * back + 8 * ahead - two_ahead) / (12 * h)
+        np.testing.assert_allclose(forward, difference, rtol=1e-8)  # h^4 and rounding 1e-15 / h beside a slope of 4e-4
 
 
 def test_envelopes_after_the_hand_over_are_not_empty():
