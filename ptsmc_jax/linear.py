@@ -242,17 +242,25 @@ def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
     return Opened(loop, error, s_command, s_direct)
 
 
-# for all periods, and run for a moment: what the compiler saves by optimising is less than what that takes
-@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+# run for a moment: what the compiler saves by optimising is less than what that takes
+_quickly = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@_quickly
 def opened_all(parts: Parts, run: Nominal) -> Opened:
     """The loop opened in every control period of the nominal run: arrays over them first."""
     return jax.vmap(partial(opened, parts, run))(jnp.arange(run.command.shape[0]))
 
 
-def mean(parts: Parts, loops: Loop, index: Any) -> Loop:
-    """Of the loops opened in every period that in this one; of a slower star tracker the mean over its interval."""
-    several = jnp.maximum(index - jnp.arange(getattr(parts.sensors, "every", 1)), 0)
-    return jax.tree.map(lambda v: jnp.mean(v[several], axis=0), loops)
+def opened_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
+    """The loops opened in these periods, arrays over them first; of a slower star tracker means over its interval."""
+    every = getattr(parts.sensors, "every", 1)
+    several = jnp.maximum(indices[:, None] - jnp.arange(every)[None], 0)
+    loops = jax.vmap(lambda index: opened(parts, run, index).loop)(several.reshape(-1))
+    return jax.tree.map(lambda v: jnp.mean(v.reshape(*several.shape, *v.shape[1:]), axis=1), loops)
+
+
+opened_at_jit = _quickly(opened_at)
 
 
 def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
@@ -271,57 +279,75 @@ def acting(loop: Loop, late: Scalar) -> tuple[Array, Array]:
     return jnp.tensordot(weights, loop.new, 1), jnp.tensordot(weights, loop.old, 1)
 
 
-def at_input(loop: Loop, w: Scalar, late: Any = None, axis: Any = None) -> Complex[Array, "m m"]:
-    """L(e^(i w h)) at the plant's input: what comes back as command, its sign changed, of what acts; w [rad/s].
+class Opening(NamedTuple):
+    """L(z) = -C (z - A)^-1 B of a loop opened somewhere: what comes back there, its sign changed.
 
-    late: further delay in periods, any number of at least 0, of this axis. 1 + L = 0 is the border of stability.
+    Its states are z and the commands on their way. 1 + L = 0 is the border of stability.
     """
+
+    a: Array  # (n, n)
+    b: Array  # (n, m)
+    c: Array  # (m, n)
+
+    def closed(self, gain: Any = 1.0) -> Array:
+        """Matrix of a period of the closed loop with this gain, a number or a matrix (m, m)."""
+        return self.a + self.b @ (gain * self.c if jnp.ndim(gain) == 0 else gain @ self.c)
+
+    def response(self, z: Array, *, triangular: bool = False) -> Complex[Array, "m m"]:
+        """L(z); triangular: A is, see `in_triangles`."""
+        system, b = z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j
+        return -self.c @ (jax.scipy.linalg.solve_triangular(system, b) if triangular else jnp.linalg.solve(system, b))
+
+    def in_triangles(self) -> "Opening":
+        """The same L with a triangular A, by Schur's decomposition: many of its values cost little."""
+        a, turned = jax.scipy.linalg.schur(self.a, output="complex")
+        return Opening(a, jnp.conj(turned.T) @ self.b, self.c @ turned)
+
+
+def at_input(loop: Loop, late: float = 0.0) -> Opening:
+    """The loop opened at the plant's input, the command late by so many periods more."""
     a, command = loop.closed_at_sensors()
-    z, sent = jnp.exp(1j * w * loop.period), loop.new[0]
-    if late is not None:
-        whole = jnp.floor(late)
-        new, old = acting(loop, late - whole)
-        delayed = (new + old / z) * z**-whole
-        sent = jnp.where(jnp.arange(sent.shape[1]) == axis, delayed, sent)
-    return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent + 0j))
-
-
-def at_sensors(loop: Loop, w: Scalar) -> Complex[Array, "k k"]:
-    """L(e^(i w h)) at the sensors: the state that follows, its sign changed, of what they see; w [rad/s]."""
-    k, z = loop.seen.shape[1], jnp.exp(1j * w * loop.period)
-    n = loop.a.shape[0]
-    back = z**-loop.delay * loop.new[0]
-    a = loop.a + back @ loop.command
-    return -jnp.linalg.solve(z * jnp.eye(n) - a, loop.seen + back @ loop.direct)[:k]
-
-
-def closed(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> np.ndarray:
-    """Matrix of a period of the closed loop with this gain, a number or a matrix (m, m), and delay in periods.
-
-    Its state is z and the commands on their way, the newest first: (n + delay m, n + delay m), for a command in [N m].
-    """
-    a, command = (np.asarray(v) for v in loop.closed_at_sensors())
     m, n = command.shape
     total = loop.delay + late
     whole = int(np.floor(total + 1e-12))
     part = max(total - whole, 0.0)
-    new, old = (np.asarray(v) for v in acting(loop, jnp.asarray(part)))
-    kept = whole + (part > 0.0)
-    sent = (gain * np.eye(m) if np.ndim(gain) == 0 else np.asarray(gain)) @ command
-    matrix = np.zeros((n + kept * m,) * 2, dtype=np.result_type(sent, float))
-    matrix[:n, :n] = a
+    new, old = (loop.new[0], None) if part == 0.0 else acting(loop, jnp.asarray(part))
+    kept = (whole + (part > 0.0)) * m  # states that hold commands on their way, the newest first
+    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(a)
+    full = full.at[n + m :, n : n + kept - m].set(jnp.eye(max(kept - m, 0)))
+    b = jnp.zeros((n + kept, m)).at[n : n + m].set(jnp.eye(min(kept, m), m))
     for back, push in ((whole, new), (whole + 1, old)):  # the command of so many periods ago
-        if back == 0:
-            matrix[:n, :n] += push @ sent
-        elif back <= kept:
-            at = n + (back - 1) * m
-            matrix[:n, at : at + m] += push
-    if kept:
-        matrix[n : n + m, :n] = sent
-        matrix[n + m :, n:-m] = np.eye((kept - 1) * m)
-    return matrix
+        if push is not None and back == 0:
+            b = b.at[:n].add(push)
+        elif push is not None:
+            full = full.at[:n, n + (back - 1) * m : n + back * m].add(push)
+    return Opening(full, b, jnp.zeros((m, n + kept)).at[:, :n].set(command))
+
+
+def at_sensors(loop: Loop) -> Opening:
+    """The loop opened at the sensors: the state that follows, of what they see."""
+    (n, k), (m, _) = loop.seen.shape, loop.command.shape
+    kept = loop.delay * m
+    first, last = (slice(n, n + m), slice(n + kept - m, n + kept)) if kept else (None, None)
+    full, b = jnp.zeros((n + kept,) * 2).at[:n, :n].set(loop.a), jnp.zeros((n + kept, k)).at[:n].set(loop.seen)
+    if first is None:
+        full, b = full.at[:n, :n].add(loop.new[0] @ loop.command), b.at[:n].add(loop.new[0] @ loop.direct)
+    else:
+        full = full.at[:n, last].set(loop.new[0]).at[n + m :, n : n + kept - m].set(jnp.eye(kept - m))
+        full, b = full.at[first, :n].set(loop.command), b.at[first].set(loop.direct)
+    return Opening(full, b, jnp.eye(k, n + kept))
+
+
+def one_late(loop: Loop, z: Array, late: Scalar, axis: Any) -> Complex[Array, "m m"]:
+    """L(z) at the plant's input, one axis late by any number of periods more."""
+    a, command = loop.closed_at_sensors()
+    whole = jnp.floor(late)
+    new, old = acting(loop, late - whole)
+    delayed = (new + old / z) * z**-whole
+    sent = jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0])
+    return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent))
 
 
 def radius(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> float:
     """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1."""
-    return float(np.abs(np.linalg.eigvals(closed(loop, gain, late))).max())
+    return float(np.abs(np.linalg.eigvals(at_input(loop, late).closed(gain))).max())

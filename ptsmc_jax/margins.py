@@ -1,8 +1,9 @@
 """Stability margins of a sampled loop at the plant's input, one axis opened at a time, the others closed.
 
-From L(e^(i w h)) of `linear.at_input` between 0 and the Nyquist frequency: crossings are found on a graded grid, closed
-in on, and end in a Newton step, through which they have their derivative. Gains and delays are those at which the loop
-that flies comes to its border of stability, the delayed command held in between: no continuous stand-in.
+From L(e^(i w h)) of `linear.at_input` between 0 and the Nyquist frequency: crossings are found on a grid that is fine
+around every pole, closed in on, and end in a Newton step, through which they have their derivative. Gains and delays
+are those at which the loop that flies comes to its border of stability, the delayed command held in between: no
+continuous stand-in.
 """
 
 from collections.abc import Callable
@@ -15,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ptsmc_jax import linear
-from ptsmc_jax.linear import Loop
-from ptsmc_jax.rollout import Parts
+from ptsmc_jax.assembly import Parts
+from ptsmc_jax.linear import Loop, Opening
 
 Scalar = Float[Array, ""]
 
@@ -27,9 +28,13 @@ CATALOGUE = {
     "delay_margin": ("s", "further delay to the border of stability"),
     "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1"),
 }
-MOST = 120.0  # dB: no limit of the gain
-LOWEST, POINTS = 1e-6, 400  # of the grid: share of the Nyquist frequency that it begins at, and its size
+MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
+LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that it begins at, and its size without poles
+AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
+NEAREST = 3  # crossings of a kind that are closed in on
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
+SLOWEST = 10  # periods to go: from one to the next the gains before the hand-over change by a tenth
+OCTAVES, SHARE = 6, 0.25  # of the time to go, at most, and the longest as a share of t_f
 
 
 class Margins(NamedTuple):
@@ -43,23 +48,36 @@ class Margins(NamedTuple):
     stable: Array  # bool, of the loop
     crossover: Array  # [rad/s] where the phase margin is
 
-    @property
-    def gain(self) -> Array:
-        """The nearer of both [dB]."""
-        return jnp.minimum(self.gain_up, self.gain_down)
-
     def worst(self) -> dict[str, Array]:
-        """Each of `CATALOGUE`, the worst over all axes."""
-        least = {"gain_margin": self.gain, "phase_margin": self.phase, "delay_margin": self.delay}
-        return {**{k: jnp.min(v) for k, v in least.items()}, "modulus_margin": jnp.max(self.modulus)}
+        """Each of `CATALOGUE`, the worst over all axes and loops."""
+        return {name: (jnp.max if name == "modulus_margin" else jnp.min)(v) for name, v in self.each().items()}
+
+    def each(self) -> dict[str, Array]:
+        """Each of `CATALOGUE` by axis: of the gain the nearer of both, of an unstable loop's sensitivity `MOST`."""
+        gain, modulus = jnp.minimum(self.gain_up, self.gain_down), jnp.where(self.stable, self.modulus, MOST)
+        return dict(zip(CATALOGUE, (gain, self.phase, self.delay, modulus), strict=True))
 
 
-def grid(period: Scalar) -> Float[Array, " points"]:
-    """Frequencies [rad/s], graded toward 0 and toward the Nyquist frequency."""
+FIELDS = Margins._fields[:5]  # that are margins
+
+
+def grid(loop: Loop, opening: Opening) -> Float[Array, " points"]:
+    """Frequencies [rad/s], graded toward 0 and toward the Nyquist frequency, and around every pole.
+
+    Of the closed loop, at which the sensitivity may have a peak, and of those with one axis open, at which its L may.
+    """
     low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
     high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
-    middle = np.linspace(0.05, 0.95, POINTS // 4)
-    return jnp.asarray(np.unique(np.concatenate([low, middle, high]))) * jnp.pi / period
+    base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
+    m = opening.c.shape[0]
+    closed = np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0)  # all of them, and all but one
+    poles = jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), jnp.asarray(closed))
+    upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # of pairs one; real ones need no more
+    poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
+    damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
+    near = jnp.abs(jnp.angle(poles))[None] / jnp.pi + AROUND[:, None] * damping[None]
+    both = jnp.append(jnp.asarray(base), jnp.clip(jnp.nan_to_num(near), LOWEST, 1.0))
+    return jnp.sort(both) * jnp.pi / loop.period
 
 
 def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
@@ -78,112 +96,106 @@ def of_each(loops: Loop, sensors: bool = False) -> Margins:
 
 
 def of(loop: Loop, sensors: bool = False) -> Margins:
-    """Margins of each axis of an opened loop; at the sensors of each coordinate that they see, not of delay."""
-    respond = linear.at_sensors if sensors else linear.at_input
-    w, channels = grid(loop.period), loop.seen.shape[1] if sensors else loop.command.shape[0]
-    responses = jax.vmap(partial(respond, loop))(w)
-    stable = jnp.max(jnp.abs(jax.lax.stop_gradient(_poles(loop)))) < 1.0 + NEUTRAL
+    """Margins of each axis of an opened loop; at the sensors of each coordinate that they see, not of delay.
+
+    NaN where the loop has a number that is not finite.
+    """
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(loop)]))
+    loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
+    opening = linear.at_sensors(loop) if sensors else linear.at_input(loop)
+    fixed, h = jax.lax.stop_gradient((opening, loop.period))
+    w, quick = jax.lax.stop_gradient((grid(loop, fixed), fixed.in_triangles()))
+    responses = jax.vmap(lambda w: quick.response(jnp.exp(1j * w * h), triangular=True))(w)
+    stable = finite & (jnp.max(jnp.abs(jnp.linalg.eigvals(fixed.closed()))) < 1.0 + NEUTRAL)
 
     def one(axis: Array) -> Margins:
-        return _axis(loop, respond, w, jax.vmap(lambda L: one_axis(L, axis))(responses), stable, axis)
+        seen = jax.vmap(lambda L: one_axis(L, axis))(responses)
 
-    return jax.lax.map(one, jnp.arange(channels))
+        def at(opening: Opening, w: Scalar, *, triangular: bool = False) -> tuple[Array, Array]:
+            """L and its derivative by w."""
+            z = jnp.exp(1j * w * h)
+            by = 1j * h * z
+            return jax.jvp(lambda z: one_axis(opening.response(z, triangular=triangular), axis), (z,), (by,))
+
+        found = _axis(jax.vmap(partial(at, opening)), jax.vmap(partial(at, quick, triangular=True)), w, seen, stable)
+        delay = jnp.nan if sensors else _delay(loop, w, seen, axis)
+        found = found._replace(delay=jnp.where(stable, delay, 0.0))
+        return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(finite, v, jnp.nan), found)
+
+    return jax.lax.map(one, jnp.arange(opening.c.shape[0]))
 
 
-def _poles(loop: Loop) -> Array:
-    a, command = loop.closed_at_sensors()
-    (m, n), late = command.shape, loop.delay
-    if not late:
-        return jnp.linalg.eigvals(a + loop.new[0] @ command)
-    shift = jnp.eye(late * m, k=-m)
-    pushed = jnp.zeros((n, late * m)).at[:, -m:].set(loop.new[0])
-    sent = jnp.zeros((late * m, n)).at[:m].set(command)
-    return jnp.linalg.eigvals(jnp.block([[a, pushed], [sent, shift]]))
+def _axis(at: Callable, quick: Callable, w: Array, seen: Array, stable: Array) -> Margins:
+    """Margins of one axis, whose L at frequencies w is `seen`; at, quick: L and its slope, with its gradient or not."""
+    begin, there, elsewhere = jax.lax.stop_gradient(_brackets(w, seen))
 
-
-def _axis(loop: Loop, respond: Callable, w: Array, seen: Array, stable: Array, axis: Array) -> Margins:
-    """Margins of one axis, whose L at frequencies w is `seen`."""
-
-    def at(w: Scalar) -> tuple[Array, Array]:
-        """L and its derivative by w."""
-        return jax.jvp(lambda w: one_axis(respond(loop, w), axis), (w,), (jnp.ones_like(w),))
-
-    begin, which, signs = jax.lax.stop_gradient(_brackets(w, seen))
-    at_each = jax.vmap(at)
-
-    def off(L: Array, slope: Array) -> tuple[Array, Array]:
-        """What is zero at each crossing, and its slope by w: Im L twice, ln |L|."""
-        return jnp.stack([L.imag[0], L.imag[1], jnp.log(jnp.abs(L[2]))]), jnp.stack(
-            [slope.imag[0], slope.imag[1], (slope[2] / L[2]).real]
-        )
+    def crossed(L: Array) -> Array:
+        """What is zero at crossings: of the real axis, of the size 1."""
+        return jnp.append(L[: _SPLIT[0]].imag, jnp.log(jnp.abs(L[_SPLIT[0] : _SPLIT[1]])))
 
     def closer(_: Any, ends: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         """Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), for all at once."""
         a, b, f_a, f_b = ends
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
-        L, slope = at_each(c)
-        f_c = jnp.append(off(L, slope)[0], (jnp.conj(1.0 + L[3]) * slope[3]).real)
-        crossed = f_c * f_b < 0.0
-        return jnp.where(crossed, b, a), c, jnp.where(crossed, f_b, f_a / 2), f_c
+        c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
+        L, slope = quick(c)
+        f_c = jnp.append(crossed(L), (jnp.conj(1.0 + L) * slope).real[_SPLIT[1] :])
+        between = f_c * f_b < 0.0
+        return jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c
 
-    _, root, _, _ = jax.lax.stop_gradient(jax.lax.fori_loop(0, 14, closer, begin))
+    _, root, _, _ = jax.lax.stop_gradient(jax.lax.fori_loop(0, 10, closer, begin))
     root = jnp.where(jnp.isfinite(root), root, begin[1])
-    L, slope = at_each(jax.lax.stop_gradient(jnp.where(which, root, signs)))
-    left, fall = off(L, slope)
+    L, slope = at(jnp.append(root, elsewhere))
+    crosses = _SPLIT[1]
+    slope = slope[:crosses]
+    fall = jnp.append(slope[: _SPLIT[0]].imag, (slope / L[:crosses]).real[_SPLIT[0] :])
     # one step of Newton's, with slopes that stay: through it the crossing has its derivative
-    step = left / jax.lax.stop_gradient(jnp.where(fall == 0.0, 1.0, fall))
-    crossing = L[:3] - jax.lax.stop_gradient(slope[:3]) * step
-    factors = [_factor(crossing[k].real, which[k], seen, side) for k, side in ((0, 1.0), (1, -1.0))]
-    up, down = factors
-    nearest, sign = jnp.minimum(up, down), jnp.where(stable, 1.0, -1.0)
-    phase = jnp.where(which[2], jnp.rad2deg(jnp.abs(jnp.angle(-crossing[2]))), 180.0)
-    delay = _delay(loop, w, seen, axis) if respond is linear.at_input else jnp.nan
+    rate = jax.lax.stop_gradient(slope / jnp.where(fall == 0.0, 1.0, fall))
+    real, even = jnp.split(L[:crosses] - rate * crossed(L), _SPLIT[:1])
+    ends = L[-2:]  # where a pole comes to 1, and to -1
+    on = jnp.append(there[: real.size], jnp.abs(ends.imag) < 1e-2 * jnp.abs(ends.real))
+    real = jnp.append(real.real, ends.real)
+    factor = -20.0 * jnp.log10(jnp.where(on & (real < 0.0), -real, 1.0))
+    up, down = (jnp.min(jnp.where(side * factor > 0.0, side * factor, MOST)) for side in (1.0, -1.0))
+    angles = jnp.where(there[real.size - 2 : crosses], jnp.rad2deg(jnp.abs(jnp.angle(-even))), 180.0)
+    nearest, worst = jnp.minimum(up, down), jnp.argmin(angles)
     return Margins(
-        gain_up=jnp.where(stable, up, -nearest),
-        gain_down=jnp.where(stable, down, -nearest),
-        phase=sign * phase,
-        delay=jnp.where(stable, delay, 0.0),
-        modulus=-20.0 / jnp.log(10.0) * jnp.log(jnp.abs(1.0 + L[3])),  # its slope by w is none: no step to take
+        gain_up=jnp.where(stable, jnp.where(up < MOST, up, jnp.inf), -nearest),
+        gain_down=jnp.where(stable, jnp.where(down < MOST, down, jnp.inf), -nearest),
+        phase=jnp.where(stable, 1.0, -1.0) * jnp.min(angles),
+        delay=jnp.zeros_like(up),
+        modulus=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # its slope by w is none: no step to take
         stable=stable,
-        crossover=jnp.where(which[2], root[2], jnp.nan),
+        crossover=jnp.where(there[real.size - 2 + worst], root[real.size - 2 + worst], jnp.nan),
     )
 
 
-def _brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
-    """Between which points L is real at the nearest gain up and down, has the size 1, and is nearest to -1.
+_SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
 
-    (low, high) and what is zero there at both; which of the four are there, and where to look if they are not.
+
+def _brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
+    """Between which points L is real and may be -1 with more gain, or with less, has the size 1, is nearest to -1.
+
+    `NEAREST` each: (low, high) and what is zero there at both; which of them are there; frequencies to look at besides.
     """
     real, imag, size = seen.real, seen.imag, jnp.log(jnp.abs(seen))
     share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
     crossing = real[:-1] + share * (real[1:] - real[:-1])
     there = (imag[:-1] * imag[1:] < 0.0) & (crossing < 0.0)
     factor = -jnp.log(jnp.where(there, -crossing, 1.0))
-    far = [jnp.where(there & (side * factor > 0.0), side * factor, jnp.inf) for side in (1.0, -1.0)]
+    # one that lies a little to the other side may turn out to lie on this one
+    far = [jnp.where(there & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0)]
     even, left = _crossings(seen)
     far.append(jnp.where(even, jnp.abs(left), jnp.inf))
-    j = jnp.stack([jnp.argmin(v) for v in far])
     near = jnp.abs(1.0 + seen) ** 2
-    k = jnp.argmin(near)
-    inside = (k > 0) & (k < near.size - 1)
-    m = jnp.clip(k, 1, near.size - 2)
-    low, high = jnp.append(w[j], w[m - 1]), jnp.append(w[j + 1], w[m + 1])
-    values = [jnp.stack([imag[j[0] + e], imag[j[1] + e], size[j[2] + e]]) for e in (0, 1)]
-    slopes = [(near[m] - near[m - 1]) / (w[m] - w[m - 1]), (near[m + 1] - near[m]) / (w[m + 1] - w[m])]
-    f_low, f_high = (jnp.append(v, s / 2) for v, s in zip(values, slopes, strict=True))
-    found = jnp.append(jnp.stack([jnp.isfinite(v[at]) for v, at in zip(far, j, strict=True)]), inside)
-    return (low, high, f_low, f_high), found, jnp.append(w[j], w[k])
-
-
-def _factor(real: Array, found: Array, seen: Array, side: float) -> Array:
-    """Factor on the gain [dB], up or down, at which 1 + k L = 0: where L is real, or a pole lies at 1 or -1."""
-    known = found & (real < 0.0)
-    best = jnp.where(known, -side * 20.0 * jnp.log10(jnp.where(known, -real, 1.0)), MOST)
-    for end in (seen[0], seen[-1]):
-        there = (end.real < 0.0) & (jnp.abs(end.imag) < 1e-2 * jnp.abs(end.real))
-        size = -side * 20.0 * jnp.log10(jnp.where(there, -end.real, 1.0))
-        best = jnp.where(there & (size > 0.0), jnp.minimum(best, size), best)
-    return jnp.where(best >= MOST, jnp.inf, best)
+    least = jnp.append(jnp.inf, jnp.where((near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:]), near[1:-1], jnp.inf))
+    values, places = zip(*(jax.lax.top_k(-v, NEAREST) for v in (*far, least)), strict=True)
+    j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
+    slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
+    zero = [jnp.append(imag[j + e][: _SPLIT[0]], size[j + e][_SPLIT[0] :]) for e in (0, 1)]
+    begin = jnp.append(w[j], w[k - 1]), jnp.append(w[j + 1], w[k + 1])
+    off = jnp.append(zero[0], slope[k - 1]), jnp.append(zero[1], slope[k])
+    return (*begin, *off), jnp.isfinite(jnp.concatenate(values)), w[jnp.stack([jnp.argmin(near), 0, -1])]
 
 
 def _crossings(seen: Array) -> tuple[Array, Array]:
@@ -204,7 +216,8 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     start = jnp.stack([jnp.log(w[j + 1]), sizes[j] / loop.period])
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
-        value = -one_axis(linear.at_input(loop, jnp.exp(at[0]), jnp.maximum(at[1], 0.0), axis), axis)
+        z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
+        value = -one_axis(linear.one_late(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
     def newton(_: Any, x: Array) -> Array:
@@ -220,113 +233,163 @@ class Course(NamedTuple):
     """Margins along a nominal run."""
 
     t: np.ndarray  # (times,) [s], the last in hold, those before it before the hand-over
+    judged: np.ndarray  # (times,) bool: where the frozen loop means something, see `moments`
     loops: Loop  # arrays over the times first
     at_input: Margins  # (times, m)
     at_sensors: Margins  # (k,) in hold
     together: dict[str, float]  # the same of all axes of the input at once, in hold
 
     @property
-    def hold(self) -> Loop:
-        """The loop in hold."""
-        return jax.tree.map(lambda v: v[-1], self.loops)
+    def hold(self) -> tuple[Loop, Margins]:
+        """The loop in hold, and its margins (m,)."""
+        return jax.tree.map(lambda v: v[-1], (self.loops, self.at_input))
+
+    @property
+    def before(self) -> Margins:
+        """(times, m) before the hand-over."""
+        return jax.tree.map(lambda v: v[:-1], self.at_input)
+
+    def worst(self) -> dict[str, float]:
+        """Each of `CATALOGUE`, the worst over the axes, in hold and where it is judged before the hand-over."""
+        kept = jax.tree.map(lambda v: v[self.judged], self.at_input)
+        return {name: float(v) for name, v in kept.worst().items()}
+
+
+def octaves(t_f: float, period: float) -> np.ndarray:
+    """Times to go [s] at which frozen gains mean something, the shortest first.
+
+    Not so short that from one sample to the next the gains change by more than a tenth, nor so long that the loop takes
+    as long to settle as it has left.
+    """
+    times = SLOWEST * period * 2.0 ** np.arange(OCTAVES)
+    return times[(times <= SHARE * t_f) | (times == times[0])]
+
+
+def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
+    """Numbers of the whole control periods of the nominal run so long before t_f [s], and then of one in hold.
+
+    A time to go after the hand-over is one in hold too. In hold: the last; of an unstable loop the last at whose start
+    it is no farther off than at the hand-over.
+    """
+    ticks, law = run.listed[0], parts.controller
+    whole = ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    left = jnp.where(whole, law.t_f - ticks.t, jnp.inf)
+    off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
+    size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
+    first = jnp.argmax(hold)
+    near = hold & (size <= 2.0 * size[first])
+    last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
+    return jnp.append(jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1), last)
+
+
+_moments = jax.jit(moments)
+
+
+class Found(NamedTuple):
+    """Margins at times of a nominal run, the last of them in hold."""
+
+    t: np.ndarray  # (times,) [s]
+    hold: np.ndarray  # (times,) bool: in hold
+    loops: Loop  # arrays over the times first
+    margins: Margins  # (times, m)
+
+
+def at(parts: Parts, left: np.ndarray, run: linear.Nominal | None = None) -> Found:
+    """Margins of sampled parts at these times to go [s], (times,), and in hold."""
+    run = linear.nominal_jit(parts) if run is None else run
+    indices = np.asarray(_moments(parts, run, jnp.asarray(left)))
+    loops = linear.opened_at_jit(parts, run, jnp.asarray(indices))
+    ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.listed[0])
+    return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
+
+
+def judged(parts: Parts) -> Found:
+    """Margins where requirements are judged, see `octaves`: in hold, and before the hand-over where they mean some."""
+    found = at(parts, _octaves(parts))
+    kept = np.append(np.flatnonzero(~found.hold[:-1]), len(found.t) - 1)
+    return jax.tree.map(lambda v: v[kept], found)
+
+
+def _octaves(parts: Parts) -> np.ndarray:
+    return octaves(float(parts.controller.t_f), float(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def along(parts: Parts, times: int = 24) -> Course:
-    """Margins of sampled parts along their nominal run: in hold, and at so many times before the hand-over."""
-    run = linear.nominal_jit(parts)
-    t = np.asarray(run.listed[0].t)
-    before, last = linear.whole_periods(parts, run, hold=False), _in_hold(parts, run)
-    left = float(parts.controller.t_f) - t[before]
-    wanted = np.geomspace(left[-1], left[0], times)
-    chosen = np.unique([before[np.argmin(np.abs(left - tau))] for tau in wanted])
-    indices = np.append(chosen, last)
-    loops = _several(parts, run, indices)
-    found = jax.tree.map(np.asarray, of_each(loops))
+    """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
+    kept, law = _octaves(parts), parts.controller
+    period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    found = at(parts, np.append(kept, np.geomspace(period, float(law.t_f), times)))
+    known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}
+    order = np.asarray([k for _, k in sorted(known.items())] + [len(found.t) - 1])
+    t, _, loops, margins = jax.tree.map(lambda v: v[order], found)
+    count = (order < kept.size) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
     seen = jax.tree.map(lambda v: np.asarray(v)[0], of_each(last, sensors=True))
-    return Course(t[indices], loops, found, seen, together(jax.tree.map(lambda v: v[0], last)))
-
-
-def _in_hold(parts: Parts, run: linear.Nominal) -> int:
-    """The last whole period in hold; of an unstable loop the last at whose start it is no farther off than at first."""
-    after = linear.whole_periods(parts, run, hold=True)
-    x, t = jax.tree.map(lambda v: v[after], (run.carry.x, run.listed[0].t))
-    off = jax.vmap(lambda x, t: parts.controller.errors(x, parts.reference(t))[0])(x, t)
-    size = np.linalg.norm(np.asarray(off), axis=1)
-    near = np.flatnonzero(size <= 2.0 * size[0])
-    return int(after[near[-1] if near.size else 0])
-
-
-def _several(parts: Parts, run: linear.Nominal, indices: Any) -> Loop:
-    """The loops of these periods, arrays over them first."""
-    every = linear.opened_all(parts, run).loop
-    each = [linear.mean(parts, every, index) for index in indices]
-    return jax.tree.map(lambda *v: jnp.stack(v), *each)
+    return Course(t, count, loops, margins, seen, together(jax.tree.map(lambda v: v[0], last)))
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
-    """Margins at the last whole period before the "hand_over" and in "hold", and the largest modulus of the poles."""
+    """Margins at the last whole period before the "hand_over" and in "hold", and the largest modulus of the poles.
+
+    Without a whole period before the hand-over those in hold are both.
+    """
     run = linear.nominal_jit(parts)
-    indices = [linear.whole_periods(parts, run, hold=False)[-1], _in_hold(parts, run)]
-    loops = _several(parts, run, indices)
-    found = jax.tree.map(np.asarray, of_each(loops))
-    each = [jax.tree.map(lambda v, k=k: v[k], (found, loops)) for k in range(2)]
-    return {name: (one, linear.radius(loop)) for name, (one, loop) in zip(("hand_over", "hold"), each, strict=True)}
+    before = linear.whole_periods(parts, run, hold=False)[-1:]
+    left = float(parts.controller.t_f) - np.asarray(run.listed[0].t)[before]
+    found = at(parts, left, run)
+    ends = {"hand_over": 0, "hold": -1}
+    each = {name: jax.tree.map(lambda v, k=k: v[k], (found.margins, found.loops)) for name, k in ends.items()}
+    return {name: (margins, linear.radius(loop)) for name, (margins, loop) in each.items()}
 
 
 def together(loop: Loop) -> dict[str, float]:
-    """Margins with the same gain, phase or delay at all axes at once, by poles; the modulus by singular values.
+    """`FIELDS` with the same gain, phase or delay at all axes at once, by poles; the modulus by singular values.
 
     [dB], [deg], [s]: infinite beyond 80 dB and 200 periods, `nan` where the loop itself is unstable.
     """
-    names = ("gain_up", "gain_down", "phase", "delay", "modulus")
-    if linear.radius(loop) >= 1.0 + NEUTRAL:
-        return dict.fromkeys(names, float("nan"))
-    h = float(loop.period)
-    w = grid(loop.period)
-    m = loop.command.shape[0]
-    responses = np.asarray(_responses(loop, w))
-    least = np.linalg.svd(np.eye(m) + responses, compute_uv=False)[:, -1].min()
 
-    def first(unstable: Callable[[float], bool], values: np.ndarray) -> float:
+    def unstable(gain: Any = 1.0, late: float = 0.0) -> bool:
+        return not linear.radius(loop, gain, late) < 1.0 + NEUTRAL
+
+    def first(lost: Callable[[float], bool], values: np.ndarray) -> float:
         """The least of these values, closed in on, at which it is unstable."""
         low = 0.0
         for high in values:
-            if unstable(high):
+            if lost(high):
                 for _ in range(40):
                     middle = 0.5 * (low + high)
-                    low, high = (low, middle) if unstable(middle) else (middle, high)
+                    low, high = (low, middle) if lost(middle) else (middle, high)
                 return float(high)
             low = high
         return float("inf")
 
-    def unstable(gain: Any = 1.0, late: float = 0.0) -> bool:
-        return linear.radius(loop, gain, late) >= 1.0 + NEUTRAL
-
+    if not all(np.isfinite(v).all() for v in jax.tree.leaves(loop)) or unstable():
+        return dict.fromkeys(FIELDS, float("nan"))
+    seen, _ = _responses(loop)[1:]
+    least = np.linalg.svd(np.eye(seen.shape[1]) + np.asarray(seen), compute_uv=False)[:, -1].min()
     decibels, degrees = np.arange(1.0, 81.0), np.arange(2.0, 181.0, 2.0)
+    periods = np.unique(np.append(np.linspace(0.0, 10.0, 41)[1:], np.geomspace(10, 200, 40)))
     found = (
         first(lambda dB: unstable(10.0 ** (dB / 20.0)), decibels),
         first(lambda dB: unstable(10.0 ** (-dB / 20.0)), decibels),
         first(lambda angle: unstable(np.exp(-1j * np.deg2rad(angle))), degrees),
-        first(
-            lambda late: unstable(late=late),
-            np.unique(np.append(np.linspace(0.0, 10.0, 41)[1:], np.geomspace(10, 200, 40))),
-        )
-        * h,
+        first(lambda late: unstable(late=late), periods) * float(loop.period),
         float(-20.0 * np.log10(least)),
     )
-    return dict(zip(names, found, strict=True))
+    return dict(zip(FIELDS, found, strict=True))
 
 
 @jax.jit
-def _responses(loop: Loop, w: Array) -> Array:
-    return jax.vmap(partial(linear.at_input, loop))(w)
+def _responses(loop: Loop) -> tuple[Array, Array, Array]:
+    """Frequencies, L (points, m, m) and that of each axis with the others closed (points, m)."""
+    opening = linear.at_input(loop)
+    w, quick = grid(loop, opening), opening.in_triangles()
+    seen = jax.vmap(lambda w: quick.response(jnp.exp(1j * w * loop.period), triangular=True))(w)
+    axes = jnp.arange(seen.shape[1])
+    return w, seen, jax.vmap(lambda L: jnp.stack([one_axis(L, k) for k in range(axes.size)]))(seen)
 
 
 def responses(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (points,) [rad/s] and L of each axis (points, m), the others closed."""
-    w = grid(loop.period)
-    m = loop.command.shape[0]
-    seen = _responses(loop, w)
-    each = [jax.vmap(lambda L, k=k: one_axis(L, k))(seen) for k in range(m)]
-    return np.asarray(w), np.stack([np.asarray(v) for v in each], axis=1)
+    w, _, each = _responses(loop)
+    return np.asarray(w), np.asarray(each)

@@ -32,7 +32,7 @@ def chain(**changes):
 def opened(parts, hold=True):
     run = linear.nominal_jit(parts)
     index = linear.whole_periods(parts, run, hold=hold)[-1]
-    return linear.mean(parts, linear.opened_all(parts, run).loop, index)
+    return jax.tree.map(lambda v: v[0], linear.opened_at_jit(parts, run, jnp.asarray([index])))
 
 
 def of(loop):
@@ -201,7 +201,7 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
         parts = scenario.study(scenario.from_tables(table)).parts
         run = linear.nominal_jit(parts)
         index = linear.whole_periods(parts, run, hold=True)[-1]
-        loop = linear.mean(parts, linear.opened_all(parts, run).loop, index)
+        loop = jax.tree.map(lambda v: v[0], linear.opened_at_jit(parts, run, jnp.asarray([index])))
         found, m = of(loop), loop.command.shape[0]
         axis = int(RNG.integers(m))
         only = np.arange(m) == axis

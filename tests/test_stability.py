@@ -4,10 +4,11 @@ import csv
 import json
 
 import numpy as np
+import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import margins, scenario
 from tests.helpers import SHORT
-from tuning import page, stability, told
+from tuning import page, stability, told_margins
 
 
 def tables(path):
@@ -19,7 +20,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     status, out, _ = command("margins", "s.toml")
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
-    assert "gain up [dB]" in out
+    assert "gain up  down [dB]" in out
     assert "the loop in hold is stable" in out
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
@@ -37,7 +38,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
     made = page.build(folder)
     assert "ptsmc margins scenario.toml" in made
-    assert "all inputs at once" in made
+    assert "all inputs" in made
 
 
 def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
@@ -66,19 +67,31 @@ def test_inputs_and_sensors_of_other_plants_have_names():
 
 
 def test_few_margins_are_warned_of():
-    enough = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "modulus_margin": 5.0}
-    unlimited = {"gain_margin": None, "phase_margin": 61.0, "delay_margin": None, "modulus_margin": 1.0}
-    few = {"gain_margin": 5.9, "phase_margin": 29.0, "delay_margin": 0.1, "modulus_margin": 7.0}
+    enough = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "modulus_margin": 5.0, "stable": True}
+    unlimited = {**dict.fromkeys(enough), "phase_margin": 61.0, "modulus_margin": 1.0, "stable": True}
+    few = {**enough, "gain_margin": 5.9, "phase_margin": 0.0, "modulus_margin": 7.0}
 
-    def said(hold, hand_over):
-        believed = {"influence": {}, "margins": {"hold": hold, "hand_over": hand_over}}
-        summary = {"at_bound": {}, "trust": {**believed, "slopes_off_central_differences": {"start": 0.0, "end": 0.0}}}
-        return list(told.trust(summary))
-
-    assert not [line for line in said(enough, unlimited) if line.startswith("less than")]
-    lines = said(few, enough)
+    assert not [line for line in told_margins.tuned({"hold": enough, "before": unlimited}) if "less than" in line]
+    lines = list(told_margins.tuned({"hold": few, "before": enough}))
     assert lines[:2] == [
-        "margins in hold: gain 5.9 dB, phase 29 deg, delay 0.1 s, modulus 7 dB",
+        "margins in hold: gain 5.9 dB, phase 0 deg, delay 0.1 s, modulus 7 dB",
         "less than 6 dB of gain and 30 deg of phase in hold: what the model leaves out may cost the stability",
     ]
-    assert any(line.startswith("less than 6 dB of gain") and "hand-over" in line for line in said(enough, few))
+    said = list(told_margins.tuned({"hold": enough, "before": few}))
+    assert any(line.startswith("less than 6 dB of gain") and "hand-over" in line for line in said)
+    lost = {**few, "gain_margin": -1.2, "stable": False}
+    assert "the frozen loop is NOT stable in hold" in next(told_margins.tuned({"hold": lost}))
+
+
+@pytest.mark.parametrize("period", [0.1, 0.5])
+def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
+    """t_f - delta is half a period: no sample before the hand-over lasts a whole one."""
+    law = {"t_f": 10.0, "delta": 10.0 - 0.5 * period}
+    tables = {"controller": law, "loop": {"mode": "sampled", "period": period}, "hardware": {"rate_noise": 1e-6}}
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    ends = margins.at_ends(parts)
+    for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
+        np.testing.assert_array_equal(one, other)
+    course = margins.along(parts, times=3)
+    assert course.t.size == 1
+    assert course.worst()["phase_margin"] == course.hold[1].phase.min()

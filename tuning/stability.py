@@ -3,35 +3,50 @@
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from ptsmc_jax import margins, schema, store, systems
-from ptsmc_jax.margins import Course
+from ptsmc_jax.margins import FIELDS, Course
 from ptsmc_jax.plants import Spacecraft
 from ptsmc_jax.scenario import Study, study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 
-FIELDS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 _NO_SIGN = "the exact sign has no slope: it counts as if it were not there"
 
 
 def find(scenario: Scenario) -> tuple[Study, Course]:
-    """Margins of a scenario with the sampled loop, along its nominal run. Raises ScenarioError without one."""
+    """Margins of a scenario, along its nominal run. Raises ScenarioError without the sampled loop, or slopes of it."""
     if scenario.loop.mode != "sampled":
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
-    return ready, margins.along(ready.parts)
+    course = margins.along(ready.parts)
+    if np.isnan(course.hold[1].modulus).any():
+        raise ScenarioError(
+            f"margins need slopes of the loop by all that it carries, but with controller.kind = "
+            f"{schema.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
+        )
+    return ready, course
 
 
-def worst(ready: Study) -> dict[str, dict[str, float | None]] | None:
-    """Margins of the worst axis at the last sample before the "hand_over" and in "hold"; None: no sampled loop."""
+def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
+    """Margins of the worst axis "before" the hand-over, where they are judged, and in "hold".
+
+    None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable".
+    """
     if ready.scenario.loop.mode != "sampled":
         return None
-    return {
-        where: {name: _number(value) for name, value in found.worst().items()}
-        for where, (found, _) in margins.at_ends(ready.parts).items()
-    }
+    found = margins.judged(ready.parts).margins
+    if np.isnan(found.modulus[-1]).any():
+        return None
+    parts = {"before": slice(0, -1), "hold": slice(-1, None)}
+    return {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in parts.items()
+            if found.stable[rows].size}  # fmt: skip
+
+
+def _worst(found: margins.Margins) -> dict[str, Any]:
+    return {"stable": bool(found.stable.all()), **{name: _number(v) for name, v in found.worst().items()}}
 
 
 def _number(value: Any) -> float | None:
@@ -50,31 +65,27 @@ def names(ready: Study) -> tuple[list[str], list[str]]:
 def summary(ready: Study, course: Course) -> dict[str, Any]:
     """What `summary.json` says: [dB], [deg], [s]; null: no limit, or no value."""
     inputs, seen = names(ready)
-    hold, before = ({name: getattr(course.at_input, name)[rows] for name in (*FIELDS, "stable", "crossover")}
-                    for rows in (-1, slice(0, -1)))  # fmt: skip
+    (_, hold), before = course.hold, course.before
 
-    def table(found: dict[str, np.ndarray], labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
-        return {label: {name: _number(found[name][k]) for name in fields} for k, label in enumerate(labels)}
+    def table(found: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
+        return {label: {name: _number(getattr(found, name)[k]) for name in fields} for k, label in enumerate(labels)}
 
-    held = margins.Margins(*(v[-1] for v in course.at_input)).worst()
     t_f = float(ready.parts.controller.t_f)
     exact = getattr(ready.scenario.controller, "sign_width", None) == 0.0
     return {
-        "stable": bool(hold["stable"].all()),
-        "worst": {name: _number(v) for name, v in held.items()},
+        "stable": bool(hold.stable.all()),
+        "worst": {name: _number(v) for name, v in course.worst().items()},
         "hold": table(hold, inputs, (*FIELDS, "crossover")),
         "together": {name: _number(course.together[name]) for name in FIELDS},
-        "sensors": table(course.at_sensors._asdict(), seen, ("gain_up", "gain_down", "phase", "modulus")),
+        "sensors": table(course.at_sensors, seen, tuple(name for name in FIELDS if name != "delay")),
         "before": [
             {
                 "time_to_go": t_f - float(t),
-                "stable": bool(before["stable"][k].all()),
-                **{
-                    name: _number(getattr(np, "max" if name == "modulus" else "min")(before[name][k]))
-                    for name in FIELDS
-                },
+                "judged": bool(counts),
+                "stable": bool(before.stable[k].all()),
+                **{name: _number((max if name == "modulus" else min)(getattr(before, name)[k])) for name in FIELDS},
             }
-            for k, t in enumerate(course.t[:-1])
+            for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
         "said": _NO_SIGN if exact else None,
     }
@@ -100,12 +111,11 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     if figures:
         from ptsmc_jax import drawing, margin_plots
 
-        w, seen = margins.responses(course.hold)
-        before = margins.Margins(*(v[:-1] for v in course.at_input))
-        hold = margins.Margins(*(v[-1] for v in course.at_input))
+        loop, hold = course.hold
+        w, seen = margins.responses(loop)
         made = {
             "nichols": margin_plots.nichols(seen, inputs),
             "sensitivity": margin_plots.sensitivity(w, seen, inputs),
-            "margins": margin_plots.over_time(t_f - course.t[:-1], before, hold),
+            "margins": margin_plots.over_time(t_f - course.t[:-1], course.before, hold),
         }
         drawing.save(made, folder / "figures")

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-MARGINS = (("gain_margin", "dB"), ("phase_margin", "deg"), ("delay_margin", "s"), ("modulus_margin", "dB"))
-ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
 AGREE = 0.01  # slopes off from differences by more than this share say little
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
@@ -210,7 +208,9 @@ def trust(summary: Summary) -> Iterator[str]:
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
     if believed is None:
         return
-    yield from _margins(believed.get("margins"))
+    from tuning import told_margins
+
+    yield from told_margins.tuned(believed.get("margins"))
     if believed["slopes_off_central_differences"] is None:
         yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
         return
@@ -223,20 +223,6 @@ def trust(summary: Summary) -> Iterator[str]:
             f"slopes by automatic differentiation are off from differences by {shown}: the loop chatters or breaks off "
             "there, and the descent had little to go by; trust the global check (--global-check) instead"
         )
-
-
-def _margins(found: dict[str, Any] | None) -> Iterator[str]:
-    """What the loop leaves of gain, phase and delay, and whether an engineer would ask for more."""
-    for where, place in (("hold", "in hold"), ("hand_over", "frozen at the last sample before the hand-over")):
-        known = {} if found is None else {k: v for k, v in found[where].items() if v is not None}
-        if not known:
-            continue
-        shown = [f"{name.removesuffix('_margin')} {known[name]:.3g} {unit}" for name, unit in MARGINS if name in known]
-        yield f"margins {place}: {', '.join(shown)}"
-        few = [f"{least:g} {unit} of {name.removesuffix('_margin')}" for name, unit in MARGINS
-               if (least := ENOUGH.get(name)) is not None and known.get(name, least) < least]  # fmt: skip
-        if few:
-            yield f"less than {' and '.join(few)} {place}: what the model leaves out may cost the stability"
 
 
 def shortest(summary: Summary) -> Iterator[str]:

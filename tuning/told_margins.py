@@ -1,43 +1,70 @@
-"""Margins as a table and in words, from their `summary.json`."""
+"""Margins as a table and in words: those of `ptsmc margins`, and those that tuned gains leave."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from ptsmc_jax.margins import CATALOGUE, FIELDS
 from tuning.told import Summary, Table
+
+ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
+HEAD = ("in hold", "gain up", "down [dB]", "phase [deg]", "delay [s]", "|S| [dB]")
 
 
 def table(summary: Summary) -> Table:
     """Margins in hold: of each axis of the plant's input alone, of all at once, and of what each sensor sees."""
 
-    def row(where: str, found: Mapping[str, Any]) -> tuple[str, ...]:
-        return where, *(_limit(found.get(name, "-")) for name in ("gain_up", "gain_down", "phase", "delay", "modulus"))
+    def row(where: str, found: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
+        known = (found.get(name, "-") for name in FIELDS)
+        return where, *(none if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in known)
 
     rows = [row(f"input {name}", found) for name, found in summary["hold"].items()]
-    rows.append(row("all inputs at once", summary["together"]))
-    rows += [row(f"sensor {name}", found) for name, found in summary["sensors"].items()]
-    head = ("in hold, opened at", "gain up [dB]", "gain down [dB]", "phase [deg]", "delay [s]", "sensitivity [dB]")
-    return Table(head, rows)
+    rows.append(row("all inputs", summary["together"], "none" if summary["stable"] else "-"))
+    rows += [row(name, found) for name, found in summary["sensors"].items()]
+    return Table(HEAD, rows)
 
 
-def _limit(value: Any) -> str:
-    return value if isinstance(value, str) else "none" if value is None else f"{value:.3g}"
-
-
-def lines(summary: Summary) -> list[str]:
-    """Whether the loop is stable, and where before the hand-over its margins are least."""
-    lines = ["the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"]
-    lost = [one["time_to_go"] for one in summary["before"] if not one["stable"]]
-    if lost:
-        lines.append(
-            f"frozen at {max(lost):.3g} s to go and less, before the hand-over, it is unstable: "
-            "for so short a time that may do no harm, but gains there cost torque and accuracy"
+def lines(summary: Summary) -> Iterator[str]:
+    """Whether the loop is stable, and what is least where it is judged."""
+    yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
+    for counts in (True, False):
+        times = sorted(one["time_to_go"] for one in summary["before"] if not one["stable"] and one["judged"] == counts)
+        if not times:
+            continue
+        when = f"at {times[0]:.3g}" if len(times) == 1 else f"at {len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
+        yield f"frozen before the hand-over it is unstable {when} s to go" + (
+            "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
         )
-    least = min(
-        (one for one in summary["before"] if one["stable"]), key=lambda one: one["phase"] or 180.0, default=None
-    )
-    if least is not None:
-        lines.append(
-            f"least before the hand-over: phase {_limit(least['phase'])} deg, gain up {_limit(least['gain_up'])} dB, "
-            f"delay {_limit(least['delay'])} s, at {least['time_to_go']:.3g} s to go"
-        )
-    return [*lines, *([summary["said"]] if summary["said"] else [])]
+    if summary["stable"]:
+        yield f"worst in hold and where judged before the hand-over: {_shown(summary['worst'])}"
+    if summary["said"]:
+        yield summary["said"]
+
+
+def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
+    """What tuned gains leave, see `stability.worst`, and whether an engineer would ask for more."""
+    places = {"hold": "in hold", "before": "before the hand-over"}
+    for where, place in places.items():
+        if found is None or where not in found:
+            continue
+        known = found[where]
+        if not known["stable"]:
+            yield f"the frozen loop is NOT stable {place}: what the model leaves out may cost the stability"
+            continue
+        yield f"margins {place}: {_shown(known)}"
+        few = [
+            f"{least:g} {CATALOGUE[name][0]} of {_short(name)}"
+            for name, least in ENOUGH.items()
+            if known[name] is not None and known[name] < least
+        ]
+        if few:
+            yield f"less than {' and '.join(few)} {place}: what the model leaves out may cost the stability"
+
+
+def _shown(found: Mapping[str, Any]) -> str:
+    """Those that are limited, in words."""
+    known = {name: found[name] for name in CATALOGUE if found[name] is not None}
+    return ", ".join(f"{_short(name)} {value:.3g} {CATALOGUE[name][0]}" for name, value in known.items())
+
+
+def _short(name: str) -> str:
+    return name.removesuffix("_margin")
