@@ -90,6 +90,13 @@ def _check_requirements(scenario: Scenario) -> None:
     for key, value in scenario.requirements.items():
         if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
             raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
+        if key in layouts.MARGINS and scenario.loop.mode != "sampled":
+            raise ScenarioError(f'requirements.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+        if key in layouts.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
+            raise ScenarioError(
+                f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
+                "allowed is a width greater than 0"
+            )
 
 
 def _check_plant(scenario: Scenario) -> None:

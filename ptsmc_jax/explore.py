@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from ptsmc_jax import animation, campaign, metrics, plotting, runs, scenario
+from ptsmc_jax import animation, campaign, margin_verdicts, metrics, plotting, runs, scenario
 from ptsmc_jax.estimation import Floor
 from ptsmc_jax.montecarlo import OwnMetrics
 from ptsmc_jax.requirements import Verdict
@@ -148,8 +148,13 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 
 
 def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
-    """One for each requirement of the scenario over these rows; a failed trial breaks every one."""
-    return campaign.verdicts(scenario.requirements(what), rows)
+    """One for each requirement of the scenario over these rows; a failed trial breaks every one of its runs.
+
+    Margins are those of its loop, see `margin_verdicts`.
+    """
+    asked = scenario.margin_requirements(what)
+    judged = margin_verdicts.over_trials(scenario.study(what), 0) if asked else []
+    return [*campaign.verdicts(scenario.requirements(what), rows), *judged]
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

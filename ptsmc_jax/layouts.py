@@ -84,6 +84,13 @@ TABLES: dict[str, dict[str, type[values.Table] | Kinds]] = {  # by the kind of t
         **_STATE_LOOP,
     },
 }
+# margins of the loop, see `margins`: name: (unit, what it is, whether a requirement is the least that is allowed)
+MARGINS = {
+    "gain_margin": ("dB", "factor on the gain, up or down, to the border of stability", True),
+    "phase_margin": ("deg", "phase, either way, to the border of stability", True),
+    "delay_margin": ("s", "further delay to the border of stability", True),
+    "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1", False),
+}
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
 _RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
 DISPERSIONS: dict[str, Kinds] = {

@@ -253,7 +253,10 @@ def opened_all(parts: Parts, run: Nominal) -> Opened:
 
 
 def opened_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
-    """The loops opened in these periods, arrays over them first; of a slower star tracker means over its interval."""
+    """The loops opened in these periods, by their numbers (periods,), arrays over them first, h in [s].
+
+    Of a star tracker that is slower than the loop means over its interval.
+    """
     every = getattr(parts.sensors, "every", 1)
     several = jnp.maximum(indices[:, None] - jnp.arange(every)[None], 0)
     loops = jax.vmap(lambda index: opened(parts, run, index).loop)(several.reshape(-1))
@@ -290,22 +293,22 @@ class Opening(NamedTuple):
     c: Array  # (m, n)
 
     def closed(self, gain: Any = 1.0) -> Array:
-        """Matrix of a period of the closed loop with this gain, a number or a matrix (m, m)."""
+        """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
         return self.a + self.b @ (gain * self.c if jnp.ndim(gain) == 0 else gain @ self.c)
 
     def response(self, z: Array, *, triangular: bool = False) -> Complex[Array, "m m"]:
-        """L(z); triangular: A is, see `in_triangles`."""
+        """L(z) [-], (m, m), what comes back by what acts; triangular: A is, see `in_triangles`."""
         system, b = z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j
         return -self.c @ (jax.scipy.linalg.solve_triangular(system, b) if triangular else jnp.linalg.solve(system, b))
 
     def in_triangles(self) -> "Opening":
-        """The same L with a triangular A, by Schur's decomposition: many of its values cost little."""
+        """The same L [-] with a triangular A (n, n), by Schur's decomposition: many of its values cost little."""
         a, turned = jax.scipy.linalg.schur(self.a, output="complex")
         return Opening(a, jnp.conj(turned.T) @ self.b, self.c @ turned)
 
 
 def at_input(loop: Loop, late: float = 0.0) -> Opening:
-    """The loop opened at the plant's input, the command late by so many periods more."""
+    """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
     a, command = loop.closed_at_sensors()
     m, n = command.shape
     total = loop.delay + late
@@ -325,7 +328,7 @@ def at_input(loop: Loop, late: float = 0.0) -> Opening:
 
 
 def at_sensors(loop: Loop) -> Opening:
-    """The loop opened at the sensors: the state that follows, of what they see."""
+    """The loop opened at the sensors, B (n, k): the state that follows, in rad and rad/s, of what they see."""
     (n, k), (m, _) = loop.seen.shape, loop.command.shape
     kept = loop.delay * m
     first, last = (slice(n, n + m), slice(n + kept - m, n + kept)) if kept else (None, None)
@@ -339,7 +342,7 @@ def at_sensors(loop: Loop) -> Opening:
 
 
 def one_late(loop: Loop, z: Array, late: Scalar, axis: Any) -> Complex[Array, "m m"]:
-    """L(z) at the plant's input, one axis late by any number of periods more."""
+    """L(z) [-] at the plant's input, (m, m), one axis late by any number of periods more."""
     a, command = loop.closed_at_sensors()
     whole = jnp.floor(late)
     new, old = acting(loop, late - whole)

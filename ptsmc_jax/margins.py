@@ -21,13 +21,6 @@ from ptsmc_jax.linear import Loop, Opening
 
 Scalar = Float[Array, ""]
 
-# name: (unit, what it is)
-CATALOGUE = {
-    "gain_margin": ("dB", "factor on the gain, up or down, to the border of stability"),
-    "phase_margin": ("deg", "phase, either way, to the border of stability"),
-    "delay_margin": ("s", "further delay to the border of stability"),
-    "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1"),
-}
 MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
 LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that it begins at, and its size without poles
 AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
@@ -49,13 +42,17 @@ class Margins(NamedTuple):
     crossover: Array  # [rad/s] where the phase margin is
 
     def worst(self) -> dict[str, Array]:
-        """Each of `CATALOGUE`, the worst over all axes and loops."""
+        """Each of `layouts.MARGINS`, the worst over all axes and loops."""
         return {name: (jnp.max if name == "modulus_margin" else jnp.min)(v) for name, v in self.each().items()}
 
     def each(self) -> dict[str, Array]:
-        """Each of `CATALOGUE` by axis: of the gain the nearer of both, of an unstable loop's sensitivity `MOST`."""
-        gain, modulus = jnp.minimum(self.gain_up, self.gain_down), jnp.where(self.stable, self.modulus, MOST)
-        return dict(zip(CATALOGUE, (gain, self.phase, self.delay, modulus), strict=True))
+        """Each of `layouts.MARGINS` by axis: the nearer of both gains, of an unstable loop's sensitivity `MOST`."""
+        return {
+            "gain_margin": jnp.minimum(self.gain_up, self.gain_down),
+            "phase_margin": self.phase,
+            "delay_margin": self.delay,
+            "modulus_margin": jnp.where(self.stable, self.modulus, MOST),
+        }
 
 
 FIELDS = Margins._fields[:5]  # that are margins
@@ -233,7 +230,7 @@ class Course(NamedTuple):
     """Margins along a nominal run."""
 
     t: np.ndarray  # (times,) [s], the last in hold, those before it before the hand-over
-    judged: np.ndarray  # (times,) bool: where the frozen loop means something, see `moments`
+    judged: np.ndarray  # (times,) bool: where the frozen loop means something, see `judged_times`
     loops: Loop  # arrays over the times first
     at_input: Margins  # (times, m)
     at_sensors: Margins  # (k,) in hold
@@ -250,19 +247,19 @@ class Course(NamedTuple):
         return jax.tree.map(lambda v: v[:-1], self.at_input)
 
     def worst(self) -> dict[str, float]:
-        """Each of `CATALOGUE`, the worst over the axes, in hold and where it is judged before the hand-over."""
+        """Each of `layouts.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
         kept = jax.tree.map(lambda v: v[self.judged], self.at_input)
         return {name: float(v) for name, v in kept.worst().items()}
 
 
-def octaves(t_f: float, period: float) -> np.ndarray:
+def judged_times(parts: Parts) -> np.ndarray:
     """Times to go [s] at which frozen gains mean something, the shortest first.
 
     Not so short that from one sample to the next the gains change by more than a tenth, nor so long that the loop takes
     as long to settle as it has left.
     """
-    times = SLOWEST * period * 2.0 ** np.arange(OCTAVES)
-    return times[(times <= SHARE * t_f) | (times == times[0])]
+    times = SLOWEST * float(parts.clock.period) * 2.0 ** np.arange(OCTAVES)  # pyright: ignore[reportAttributeAccessIssue]
+    return times[(times <= SHARE * float(parts.controller.t_f)) | (times == times[0])]
 
 
 def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
@@ -303,20 +300,19 @@ def at(parts: Parts, left: np.ndarray, run: linear.Nominal | None = None) -> Fou
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
-def judged(parts: Parts) -> Found:
-    """Margins where requirements are judged, see `octaves`: in hold, and before the hand-over where they mean some."""
-    found = at(parts, _octaves(parts))
-    kept = np.append(np.flatnonzero(~found.hold[:-1]), len(found.t) - 1)
-    return jax.tree.map(lambda v: v[kept], found)
+def judged(parts: Parts, times: Array) -> tuple[Margins, Array]:
+    """Margins at these times to go [s] and in hold, (times + 1, m), and which are in hold; for any transformation."""
+    run = linear.nominal(parts)
+    indices = moments(parts, run, times)
+    return of_each(linear.opened_at(parts, run, indices)), run.listed[0].hold[indices]
 
 
-def _octaves(parts: Parts) -> np.ndarray:
-    return octaves(float(parts.controller.t_f), float(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+judged_jit = jax.jit(judged)
 
 
 def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
-    kept, law = _octaves(parts), parts.controller
+    kept, law = judged_times(parts), parts.controller
     period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
     found = at(parts, np.append(kept, np.geomspace(period, float(law.t_f), times)))
     known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}

@@ -1,7 +1,11 @@
-"""Requirements on metrics: "peak_torque at most 0.5 N m in 99 % of trials", one declaration for verdict and loss."""
+"""Requirements: "peak_torque at most 0.5 N m in 99 % of trials", one declaration for verdict and loss.
+
+On metrics of what is flown, and on margins of its loop, most of which are to be at least so large.
+"""
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,11 +50,12 @@ class Verdict:
     limit: float
     unit: str
     worst: float  # largest value, NaN if a trial failed
-    margin: float  # factor on the limit with which it would just be met: met up to 1; NaN or infinite: none is enough
+    margin: float  # how near it comes to the limit, see `Requirement.over`: met up to 1; NaN or infinite: never
     failures: int  # trials beyond the limit or without a value
     trials: int
     quantile: float | None = None  # share of trials that must keep the limit; None: every one
     confidence: float | None = None  # with which that is shown for all trials there could be
+    at_least: bool = False  # the limit is the smallest value allowed, and `worst` the smallest there is
 
     @property
     def met(self) -> bool:
@@ -60,7 +65,15 @@ class Verdict:
 
     def __str__(self) -> str:
         return verdict_text(
-            self.metric, self.limit, self.unit, self.worst, self.failures, self.trials, self.quantile, self.confidence
+            self.metric,
+            self.limit,
+            self.unit,
+            self.worst,
+            self.failures,
+            self.trials,
+            self.quantile,
+            self.confidence,
+            at_least=self.at_least,
         )
 
 
@@ -73,9 +86,11 @@ def verdict_text(
     trials: int,
     quantile: float | None = None,
     confidence: float | None = None,
+    *,
+    at_least: bool = False,
 ) -> str:
     """A verdict in one line; worst: None or NaN where a trial failed or has no value."""
-    wanted = f"{metric} at most {limit:g} {unit}".rstrip(" -")
+    wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -")
     if quantile is not None:
         wanted += f" in {100 * quantile:g} % of trials"
         wanted += f" with {100 * confidence:g} % confidence" if confidence is not None else ""
@@ -96,7 +111,7 @@ def verdict_text(
 
 @dataclass(frozen=True)
 class Requirement:
-    """metric <= limit in every trial, or in a share of them.
+    """metric <= limit in every trial, or in a share of them; or metric >= limit.
 
     >>> limit = Requirement("peak_torque", 0.5, quantile=0.75)
     >>> print(limit.verdict(np.array([0.3, 0.4, 0.45, 0.7]), np.array([True, True, True, True])))
@@ -108,6 +123,15 @@ class Requirement:
     unit: str | None = None  # of the metric; None: as for a spacecraft
     quantile: float | None = None
     confidence: float | None = None
+    at_least: bool = False
+
+    def over(self, values: Any) -> Any:
+        """How near values come to the limit, which is 1: as a share of it, or 2 less that where they are to be larger.
+
+        A value that is infinite on the right side is as far from the limit as there is: 0.
+        """
+        share = values / self.limit
+        return 2.0 - np.minimum(share, 2.0) if self.at_least else share
 
     def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
         """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
@@ -116,13 +140,15 @@ class Requirement:
         """
         single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
-        within = ok & (values <= self.limit)
-        worst = float(np.max(np.where(ok, values, np.nan)))
+        within = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
+        known = np.where(ok, values, np.nan)
+        worst = float(np.min(known) if self.at_least else np.max(known))
         share = (None, None) if single else (self.quantile, self.confidence)
         least = least_within(values.size, *share)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan
-        margin = worst / self.limit if least == values.size else deciding / self.limit
+        margin = self.over(worst) if least == values.size else deciding / self.limit
         unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
         failures = int(np.sum(~within))
-        return Verdict(self.metric, self.limit, unit, worst, margin, failures, int(values.size), *share)
+        count = int(values.size)
+        return Verdict(self.metric, self.limit, unit, worst, float(margin), failures, count, *share, self.at_least)

@@ -1,6 +1,6 @@
 """One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import estimation, rollout
+from ptsmc_jax import estimation, margin_verdicts, rollout
 from ptsmc_jax.estimation import Floor
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.rollout import Log, Parts
@@ -65,6 +65,11 @@ def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
 
 def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
     """Fly one run: nominal with the noise of trial 0, or a trial with its dispersions and its noise."""
+    run = _fly(ready, seed, trial)
+    return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
+
+
+def _fly(ready: Study, seed: int, trial: int | None) -> Run:
     key, number = jnp.uint32(seed), jnp.uint32(trial or 0)
     parts = ready.parts if trial is None else ready.dispersion.apply(ready.parts, key, number)
     result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
@@ -85,5 +90,5 @@ def floor(ready: Study, seed: int = 0) -> float | None:
     flown to the end.
     """
     trials = range(FLOORS) if ready.dispersion.varies else (None,)
-    runs = (fly(ready, seed, trial) for trial in trials)
+    runs = (_fly(ready, seed, trial) for trial in trials)
     return estimation.pooled(run.floor for run in runs if run.floor is not None)

@@ -1,6 +1,7 @@
 """Scenarios: read, checked as a whole, changed, and turned into the parts that the rollout flies."""
 
 import dataclasses
+import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from ptsmc_jax import (
     controllers,
     dispersions,
     free_gains,
+    layouts,
     metrics,
     observers,
     pace,
@@ -43,7 +45,8 @@ class Study:
     scenario: Scenario
     parts: Parts
     dispersion: dispersions.Dispersion
-    requirements: tuple[Requirement, ...]
+    requirements: tuple[Requirement, ...]  # of its runs
+    margins: tuple[Requirement, ...]  # of its loop
 
     @property
     def drawn(self) -> bool:
@@ -70,6 +73,16 @@ def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
         if isinstance(value, t.Limit)
         else Requirement(name, float(value), units[name][0])
         for name, value in scenario.requirements.items()
+        if name in units
+    )
+
+
+def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
+    """What a scenario asks of its loop."""
+    asked = {name: value for name, value in scenario.requirements.items() if name in layouts.MARGINS}
+    return tuple(
+        Requirement(name, float(typing.cast(float, value)), layouts.MARGINS[name][0], at_least=layouts.MARGINS[name][2])
+        for name, value in asked.items()
     )
 
 
@@ -138,7 +151,7 @@ def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = Non
     # a drawn trial that meets the singularity is marked and counted
     if scenario.initial is not None and (not drawn or (dispersion.attitude is None and dispersion.reference is None)):
         _check_start(scenario, parts)
-    return Study(scenario, parts, dispersion, requirements(scenario))
+    return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))
 
 
 def _check_system(scenario: Scenario, system: System, parts: Parts) -> None:

@@ -279,9 +279,11 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
 
 def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
     key = f"requirements.{metric}"
-    if metric not in metrics:
-        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, metrics)}")
+    if metric not in metrics and metric not in layouts.MARGINS:
+        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *layouts.MARGINS))}")
     if isinstance(value, Mapping):
+        if metric in layouts.MARGINS:
+            raise wrong(key, value, "a number greater than 0, which every loop must keep")
         if "limit" not in value:
             raise wrong(key, value, "a number greater than 0 or a table with `limit`")
         return typing.cast(Limit, _fields(key, value, Limit))

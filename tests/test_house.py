@@ -46,7 +46,8 @@ FLOORS = {
         build
         pace
         scenario
-        montecarlo runs
+        montecarlo margin_verdicts
+        runs
         store remark_2 drawing rows statistics
         plotting study_plots campaign_plots margin_plots campaign
         cluster animation
@@ -57,6 +58,7 @@ FLOORS = {
     "tuning": """
         gains own_parts
         bounds design journal
+        margin_rows
         objective
         evaluate
         worst trust descent starts confirm
@@ -67,8 +69,9 @@ FLOORS = {
         report single reproduction mapping
         results pareto compare campaign_folder
         campaign_summary
-        told options
-        told_margins
+        cells
+        told_margins options
+        told
         show
         show_campaign page_charts convert new
         page

@@ -88,8 +88,10 @@ def montecarlo(
     if (bits, device) != (64, "cpu") and cluster is not None:
         raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
-    if width is not None and not loaded.requirements:
-        raise UsageError("--until-confident needs [requirements] in the scenario, whose shares it looks at")
+    from ptsmc_jax import layouts
+
+    if width is not None and not any(name not in layouts.MARGINS for name in loaded.requirements):
+        raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning import campaign_folder
 
     folder = campaign_folder.Folder(path, loaded, key, count, metrics, bits)

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax import campaign as flying
-from ptsmc_jax import rows, runs, scenario, schema, store, systems
+from ptsmc_jax import margin_verdicts, rows, runs, scenario, schema, store, systems
 from ptsmc_jax.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.rows import Part, Rows
 from ptsmc_jax.scenario import Study
@@ -247,17 +247,32 @@ def fly(
 
 
 def find_floor(folder: Folder) -> None:
-    """Write the RMS window error that no controller can beat into the folder, where it is not there yet."""
+    """Write what theory says into the folder, where it is not there yet.
+
+    The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
+    """
     if not (folder.path / FLOOR).exists():
-        store.write_json(folder.path / FLOOR, {"window_error": runs.floor(folder.campaign.ready, folder.seed)})
+        ready = folder.campaign.ready
+        judged = [{**msgspec.to_builtins(v), "met": v.met} for v in margin_verdicts.over_trials(ready, folder.seed)]
+        found = {"window_error": runs.floor(ready, folder.seed), "margins": judged}
+        store.write_json(folder.path / FLOOR, found)
 
 
 def floor_of(folder: Folder) -> float | None:
-    """What `find_floor` wrote; None: nothing, as in campaigns of earlier versions."""
+    """The floor that `find_floor` wrote; None: none, as in campaigns of earlier versions."""
+    return _theory(folder).get("window_error")
+
+
+def margins_of(folder: Folder) -> list[dict[str, Any]]:
+    """The verdicts on margins that `find_floor` wrote, as `summary.json` says them."""
+    return _theory(folder).get("margins", [])
+
+
+def _theory(folder: Folder) -> dict[str, Any]:
     try:
-        return json.loads((folder.path / FLOOR).read_text(encoding="utf-8"))["window_error"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        return dict(json.loads((folder.path / FLOOR).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:

@@ -15,7 +15,7 @@ from ptsmc_jax import drawing, metrics, rows, runs, scenario, schema, statistics
 from ptsmc_jax.requirements import Requirement, Verdict
 from ptsmc_jax.rollout import STATUS
 from ptsmc_jax.store import RefusedError
-from tuning.campaign_folder import Folder, floor_of
+from tuning.campaign_folder import Folder, floor_of, margins_of
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
@@ -41,7 +41,7 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
 
 
 def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
-    """Verdicts over the trials (the first so many), and what `summary.json` says of each."""
+    """Verdicts over the trials (the first so many), and what `summary.json` says of each; not of margins."""
     wanted = scenario.requirements(folder.scenario)
     names = dict.fromkeys(r.metric for r in wanted)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
@@ -66,7 +66,7 @@ def _told(verdict: Verdict, wanted: Requirement) -> dict[str, Any]:
 def summarise(folder: Folder) -> dict[str, Any]:
     """What `summary.json` says."""
     parts = folder.whole_parts()
-    _, told = judged(folder)
+    told = [*judged(folder)[1], *margins_of(folder)]
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
     finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")

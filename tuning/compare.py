@@ -129,7 +129,7 @@ def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
     ready = study(flown)
     trials = report.judge(flown, fresh_seed, ready.requirements)
-    verdicts, floor = report.verdicts_of(ready.requirements, trials), report.floor_of(flown, fresh_seed)
+    verdicts, floor = report.verdicts_of(flown, trials, fresh_seed), report.floor_of(flown, fresh_seed)
     return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
 
 

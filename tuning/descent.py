@@ -104,7 +104,7 @@ def descend(
             jac=lambda scaled: _usable(at(scaled).f_slope)[0] / scale,
             method="SLSQP",
             bounds=[(at, at) if k in fixed else (0.0, scale) for k, at in enumerate(first)],
-            constraints=[limits] if problem.metrics else [],
+            constraints=[limits] if problem.rows else [],
             callback=passed,
             options={"maxiter": steps, "ftol": close},
         )

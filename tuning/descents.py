@@ -5,7 +5,7 @@ Sequential quadratic programming on the slopes of what flies, see `descend`; whe
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax.numpy as jnp
@@ -104,7 +104,7 @@ class Descents:
     def problem(self) -> Problem:
         """What it is the best point of, with its own limits."""
         assert self._problem is not None
-        return replace(self._problem, limits=self._problem.limits / (1.0 - self._margin))
+        return self._problem.tightened(1.0 / (1.0 - self._margin))
 
     @property
     def share(self) -> np.ndarray:
@@ -190,13 +190,13 @@ class Descents:
         tightened = self.tightened(problem)
         share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
         share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
-        best = Best(share[0], len(problem.metrics), self._margin)
+        best = Best(share[0], len(problem.rows), self._margin)
         best.offer(share, self._evaluate.fly(tightened, share))
         self._take(best, tightened, 0, afresh=True)
 
     def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
         """Better points around these shares, without slopes."""
-        best, tightened = Best(share, len(problem.metrics), self._margin), self.tightened(problem)
+        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
         best.offer(share[None], self._evaluate.fly(tightened, share[None]))
         try:
             refine(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
@@ -206,7 +206,7 @@ class Descents:
             self._take(best, tightened, 0, afresh=True)
         on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
         if on_samples.size:
-            best = Best(on_samples[0], len(problem.metrics), self._margin)
+            best = Best(on_samples[0], len(problem.rows), self._margin)
             best.offer(on_samples, self._evaluate.fly(tightened, on_samples))
             self._take(best, tightened, 0, afresh=best.over <= self.best.over)
 
@@ -227,7 +227,7 @@ class Descents:
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
             share = np.stack([np.where(np.isin(np.arange(own.size), change), own, found.share) for change in changes])
             flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
-            made = [Best(one, len(problem.metrics), self._margin) for one in share]
+            made = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(made):
                 best.offer(share[k : k + 1], flown.at(k))
             return made
@@ -275,7 +275,7 @@ class Descents:
         afresh: bool = False,
         seen: dict[bytes, Sloped] | None = None,
     ) -> None:
-        best, tightened = Best(share, len(problem.metrics), self._margin), self.tightened(problem)
+        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
         keep = partial(self._keep, start)
         try:
             descend(
@@ -298,4 +298,4 @@ class Descents:
 
     def tightened(self, problem: Problem) -> Problem:
         """With the margin kept from the limits."""
-        return replace(problem, limits=problem.limits * (1.0 - self._margin))
+        return problem.tightened(1.0 - self._margin)

@@ -1,12 +1,13 @@
 """Evaluates tuning problems at many gains: compiled once for each problem's shape, shared over devices, journaled."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import numpy as np
 
 from ptsmc_jax import montecarlo
+from tuning import margin_rows
 from tuning.bounds import Bounds
 from tuning.journal import Journal
 from tuning.objective import Problem, ended, measure
@@ -20,7 +21,7 @@ class Measured:
 
     gains: np.ndarray  # (points, gains)
     f: np.ndarray  # (points,)
-    c: np.ndarray  # (points, requirements, trials)
+    c: np.ndarray  # (points, rows, trials), see `Problem.rows`
     value: np.ndarray  # (points,)
 
     @property
@@ -39,7 +40,7 @@ class Sloped(Measured):
     """The same with derivatives by the shares of the bounds' intervals."""
 
     f_slope: np.ndarray  # (points, gains)
-    c_slope: np.ndarray  # (points, requirements, trials, gains)
+    c_slope: np.ndarray  # (points, rows, trials, gains)
 
     @property
     def finite(self) -> np.ndarray:
@@ -59,7 +60,7 @@ class Evaluator:
         """Without slopes."""
         self.rollouts += len(share) * problem.trials.size
         asked = _question(b"fly", problem, share)
-        return Measured(**self._journal.get(asked, lambda: self._in_calls(_fly, problem, share, FLOWN)))
+        return Measured(**self._journal.get(asked, lambda: self._measured(_fly, problem, share, FLOWN)))
 
     def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
         """With slopes."""
@@ -67,7 +68,25 @@ class Evaluator:
         # one point for each device a call
         most = len(jax.local_devices())
         asked = _question(b"slopes", problem, share)
-        return Sloped(**self._journal.get(asked, lambda: self._in_calls(_slopes, problem, share, most)))
+        return Sloped(**self._journal.get(asked, lambda: self._measured(_slopes, problem, share, most)))
+
+    def _measured(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
+        found = self._in_calls(compiled, replace(problem, margins=None), share, size)
+        if problem.margins is None:
+            return found
+        each = [margin_rows.sloped(problem.margins, self.bounds, one) for one in share]
+        of_loop = {name: np.stack([np.asarray(one[name]) for one in each]) for name in each[0]}
+        wide = max(found["c"].shape[2], of_loop["c"].shape[2])
+
+        def padded(c: np.ndarray, kept: float) -> np.ndarray:  # every row as long as the longest
+            widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
+            return np.pad(c, widths, constant_values=kept)
+
+        both = {name: kept for name, kept in (("c", -1.0), ("c_slope", 0.0)) if name in found}
+        return found | {
+            name: np.concatenate([padded(found[name], kept), padded(of_loop[name], kept)], axis=1)
+            for name, kept in both.items()
+        }
 
     def _in_calls(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
         devices = max(d for d in range(1, len(jax.local_devices()) + 1) if size % d == 0)

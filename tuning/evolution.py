@@ -1,6 +1,6 @@
 """A global search of the same problem without slopes: how far the gradient search ended from it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -36,7 +36,7 @@ def check(
 
     Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
     """
-    problem = replace(found.problem, limits=found.problem.limits * (1.0 - found.margin))
+    problem = found.problem.tightened(1.0 - found.margin)
     before, generation = evaluate.rollouts, 0
 
     def merit(share: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def check(
         init="sobol",
         callback=tell,
     )
-    best = Best(result.x, len(problem.metrics), found.margin)
+    best = Best(result.x, len(problem.rows), found.margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
     if sloped:  # near a limit evolution goes slowly: from where it ends, along it
         run = Descents(evaluate, found.margin, STEPS, np.random.default_rng(seed))

@@ -15,6 +15,7 @@ from ptsmc_jax.numerics import Leaf
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import Parts
 from tuning.gains import with_gains
+from tuning.margin_rows import Asked
 
 FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
 T_F = "t_f"
@@ -40,6 +41,17 @@ class Problem:
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
     torque_weight: float = field(default=0.0, metadata={"static": True})
+    margins: Asked | None = None  # of the loop; their rows stand after those of the requirements, see `Evaluator`
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """What the rows of c are of."""
+        return self.metrics + (() if self.margins is None else self.margins.metrics)
+
+    def tightened(self, factor: float) -> "Problem":
+        """The problem with limits so many times as large."""
+        margins = None if self.margins is None else self.margins.tightened(factor)
+        return replace(self, limits=self.limits * factor, margins=margins)
 
 
 def problem(

@@ -229,7 +229,7 @@ def _value(known: float | None) -> float:
 
 def _distance(verdict: dict[str, Any]) -> str:
     margin = _value(verdict["margin"])
-    return "" if np.isnan(margin) else f", {100 * margin:.3g} % of the limit"
+    return "" if np.isnan(margin) or verdict.get("at_least") else f", {100 * margin:.3g} % of the limit"
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -300,7 +300,7 @@ def _margins(result: Result) -> tuple[Heading, list[Section]]:
     mood, headline = (
         ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
     )
-    return Heading(mood, headline, told_margins.lines(summary)), [
+    return Heading(mood, headline, list(told_margins.lines(summary))), [
         Section("Margins", [_table(told_margins.table(summary))])
     ]
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from ptsmc_jax import drawing, metrics, schema, statistics, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
-from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario import study
 from ptsmc_jax.schema import wrong
@@ -122,7 +121,7 @@ def trace(
     fixed = {}
     for name, other in others.items():
         trials, values = report.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
-        fixed[name] = _point(np.nan, values, np.nan, trials, ready.requirements)
+        fixed[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
     count = next(iter(judged.values()))[1].status.size if judged else 0
     floor = report.floor_of(scenario, fresh_seed)
     return Front(_marked(judged), fixed, refused, fresh_seed, count, floor, evaluate.rollouts, evaluate.gradients)
@@ -191,16 +190,18 @@ def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[fl
     for k, (limit, best) in enumerate(found.items()):
         tell("judging on fresh trials", k, len(found), np.nan, 0.0)
         named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(best.share))), report.DIGITS)
-        trials = report.judge(gains.in_scenario(scenario, named), fresh_seed, requirements)
-        judged[limit] = _point(limit, named, best.value, trials, requirements), trials
+        tuned = gains.in_scenario(scenario, named)
+        trials = report.judge(tuned, fresh_seed, requirements)
+        judged[limit] = _point(limit, named, best.value, trials, tuned, fresh_seed), trials
     return judged
 
 
-def _point(limit, named, trained, trials: Trials, requirements: Sequence[Requirement]) -> Point:
+def _point(limit, named, trained, trials: Trials, scenario: Scenario, fresh_seed: int) -> Point:
     errors = np.asarray(trials.metrics.window_error)[trials.finished]
     peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
-    quantile = next(r.quantile for r in requirements if r.metric == TORQUE) or 1.0
-    verdicts = report.verdicts_of(requirements, trials)
+    asked = scenario.requirements[TORQUE]
+    quantile = (asked.quantile if isinstance(asked, Limit) else None) or 1.0
+    verdicts = report.verdicts_of(scenario, trials, fresh_seed)
     return Point(
         limit=limit,
         gains=dict(named),

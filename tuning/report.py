@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ptsmc_jax import draws, montecarlo, runs, tables
+from ptsmc_jax import draws, margin_verdicts, montecarlo, runs, tables
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
 from tuning import bounds as gain_bounds
-from tuning import confirm, evolution, gains, objective, stability, trust
+from tuning import confirm, evolution, gains, margin_rows, objective, stability, trust
 from tuning.design import ShortestTime, shortest_time
 from tuning.evaluate import Evaluator
 from tuning.evolution import Check
@@ -123,7 +123,7 @@ def tune(
         fresh[name] = judge(candidate, fresh_seed, ready.requirements)
         judged_gains[name] = gains.gains_of(study(as_flown(candidate)).parts)
         floors[name] = floor_of(candidate, fresh_seed)
-    verdicts = verdicts_of(ready.requirements, fresh["tuned"])
+    verdicts = verdicts_of(tuned, fresh["tuned"], fresh_seed)
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
     if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
@@ -193,6 +193,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
         goal=T_F if table.objective == T_F else "window_error",
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
+        margins=margin_rows.ask(ready, bounds.names, seed),
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
@@ -229,12 +230,15 @@ def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
     return runs.floor(study(as_flown(scenario)), fresh_seed)
 
 
-def verdicts_of(requirements: Sequence[Requirement], trials: Trials) -> list[Verdict]:
-    """One for each requirement over these trials."""
+def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Verdict]:
+    """One for each of the scenario's requirements over these trials, and for each margin asked of its loop."""
+    ready = study(as_flown(scenario))
+    requirements = ready.requirements
     alone = trials.status.size == 1  # nothing is drawn: no share of the trials to speak of
     finished = trials.finished[0] if alone else trials.finished
     values = [getattr(trials.metrics, r.metric) for r in requirements]
-    return [r.verdict(v[0] if alone else v, finished) for r, v in zip(requirements, values, strict=True)]
+    flown = [r.verdict(v[0] if alone else v, finished) for r, v in zip(requirements, values, strict=True)]
+    return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
 
 
 def as_flown(scenario: Scenario) -> Scenario:

@@ -73,7 +73,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "starts": len({step.start for step in found.history}),
             "steps": len(found.history),
             "rounds_with_harder_trials": found.rounds,
-            "largest_over_limit": dict(zip(tuning.tuned.requirements, found.worst.tolist(), strict=True)),
+            "largest_over_limit": dict(zip(found.problem.rows, found.worst.tolist(), strict=True)),
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
             ],
@@ -138,7 +138,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     assert scenario.tune is not None
     objective = scenario.tune.objective
     goal = objective if objective == "t_f" else f"{objective}_window_error"
-    over = [f"{m}_over_limit" for m in scenario.requirements]
+    over = [f"{m}_over_limit" for m in tuning.search.problem.rows]
     rows = [
         [step, row.start, row.value, *row.gains, *row.worst]
         for path in _paths(tuning.search.history)

@@ -12,7 +12,10 @@ from ptsmc_jax.tables import Scenario
 
 def summary(run: Run) -> dict[str, Any]:
     """What `summary.json` says."""
-    verdicts = {v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met} for v in run.verdicts}
+    verdicts = {
+        v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least}
+        for v in run.verdicts
+    }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     floor = None if run.floor is None else run.floor.window_error
     return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts}

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import margins, schema, store, systems
@@ -37,12 +38,13 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if ready.scenario.loop.mode != "sampled":
         return None
-    found = margins.judged(ready.parts).margins
+    times = margins.judged_times(ready.parts)
+    found, hold = jax.tree.map(np.asarray, margins.judged_jit(ready.parts, jnp.asarray(times)))
     if np.isnan(found.modulus[-1]).any():
         return None
-    parts = {"before": slice(0, -1), "hold": slice(-1, None)}
-    return {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in parts.items()
-            if found.stable[rows].size}  # fmt: skip
+    places = {"before": ~hold, "hold": hold}
+    return {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in places.items()
+            if rows.any()}  # fmt: skip
 
 
 def _worst(found: margins.Margins) -> dict[str, Any]:

@@ -2,21 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
+
+from tuning import told_margins
+from tuning.cells import Summary, Table
 
 AGREE = 0.01  # slopes off from differences by more than this share say little
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
-
-Summary = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells as text; the first column names the row."""
-
-    head: tuple[str, ...]
-    rows: list[tuple[str, ...]]
 
 
 def verdict(told: Summary) -> str:
@@ -25,7 +17,7 @@ def verdict(told: Summary) -> str:
 
     fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
     values: list[Any] = [told.get(field) for field in fields]
-    text = verdict_text(*values)
+    text = verdict_text(*values, at_least=told.get("at_least", False))
     if "share_interval" not in told:
         return text
     low, high = told["share_interval"]
@@ -62,10 +54,12 @@ def run_lines(summary: Summary) -> list[str]:
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
+    from ptsmc_jax.layouts import MARGINS
     from ptsmc_jax.metrics import CATALOGUES
 
+    units = {**CATALOGUES[kind], **MARGINS}
     return [
-        {"metric": name, **told, "unit": CATALOGUES[kind][name][0], "worst": summary[name], "trials": 1,
+        {"metric": name, "worst": summary.get(name), "at_least": False, **told, "unit": units[name][0], "trials": 1,
          "failures": int(not told["met"])}
         for name, told in summary["verdicts"].items()
     ]  # fmt: skip
@@ -208,8 +202,6 @@ def trust(summary: Summary) -> Iterator[str]:
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
     if believed is None:
         return
-    from tuning import told_margins
-
     yield from told_margins.tuned(believed.get("margins"))
     if believed["slopes_off_central_differences"] is None:
         yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"

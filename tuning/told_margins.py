@@ -3,24 +3,30 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ptsmc_jax.margins import CATALOGUE, FIELDS
-from tuning.told import Summary, Table
+from ptsmc_jax.layouts import MARGINS
+from tuning.cells import Summary, Table
 
 ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
-HEAD = ("in hold", "gain up", "down [dB]", "phase [deg]", "delay [s]", "|S| [dB]")
+COLUMNS = {
+    "gain_up": "gain up",
+    "gain_down": "down [dB]",
+    "phase": "phase [deg]",
+    "delay": "delay [s]",
+    "modulus": "|S| [dB]",
+}
 
 
 def table(summary: Summary) -> Table:
     """Margins in hold: of each axis of the plant's input alone, of all at once, and of what each sensor sees."""
 
     def row(where: str, found: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
-        known = (found.get(name, "-") for name in FIELDS)
+        known = (found.get(name, "-") for name in COLUMNS)
         return where, *(none if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in known)
 
     rows = [row(f"input {name}", found) for name, found in summary["hold"].items()]
     rows.append(row("all inputs", summary["together"], "none" if summary["stable"] else "-"))
     rows += [row(name, found) for name, found in summary["sensors"].items()]
-    return Table(HEAD, rows)
+    return Table(("in hold", *COLUMNS.values()), rows)
 
 
 def lines(summary: Summary) -> Iterator[str]:
@@ -52,7 +58,7 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
             continue
         yield f"margins {place}: {_shown(known)}"
         few = [
-            f"{least:g} {CATALOGUE[name][0]} of {_short(name)}"
+            f"{least:g} {MARGINS[name][0]} of {_short(name)}"
             for name, least in ENOUGH.items()
             if known[name] is not None and known[name] < least
         ]
@@ -62,8 +68,8 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
 
 def _shown(found: Mapping[str, Any]) -> str:
     """Those that are limited, in words."""
-    known = {name: found[name] for name in CATALOGUE if found[name] is not None}
-    return ", ".join(f"{_short(name)} {value:.3g} {CATALOGUE[name][0]}" for name, value in known.items())
+    known = {name: found[name] for name in MARGINS if found[name] is not None}
+    return ", ".join(f"{_short(name)} {value:.3g} {MARGINS[name][0]}" for name, value in known.items())
 
 
 def _short(name: str) -> str:

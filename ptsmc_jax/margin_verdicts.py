@@ -1,0 +1,54 @@
+"""Whether loops have the margins that a scenario asks for: nominal, or over the inertias that are drawn."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ptsmc_jax import margins
+from ptsmc_jax.assembly import Parts
+from ptsmc_jax.dispersions import INERTIA, Dispersion
+from ptsmc_jax.requirements import Requirement, Verdict
+from ptsmc_jax.scenario import Study
+
+TRIALS = 256  # loops that are looked at, where inertias are drawn
+
+
+def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
+    """One for each margin that is asked of the loop of these parts, see `margins.judged`."""
+    if not asked:
+        return []
+    found = margins.judged_jit(parts, jnp.asarray(margins.judged_times(parts)))[0].worst()
+    values = [np.asarray(found[one.metric]) for one in asked]
+    return [one.verdict(value, ~np.isnan(value)) for one, value in zip(asked, values, strict=True)]
+
+
+def over_trials(ready: Study, seed: int) -> list[Verdict]:
+    """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops."""
+    if not ready.margins or not differ(ready.dispersion):
+        return of_loop(ready.parts, ready.margins)
+    found = worst(ready.parts, ready.dispersion, seed, np.arange(TRIALS))
+    values = [found[one.metric] for one in ready.margins]
+    return [one.verdict(value, ~np.isnan(value)) for one, value in zip(ready.margins, values, strict=True)]
+
+
+def differ(dispersion: Dispersion) -> bool:
+    """Whether loops differ from trial to trial."""
+    return INERTIA in dispersion.kinds
+
+
+def worst(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
+    """Each of `layouts.MARGINS` of each trial's loop, (trials,), the worst over axes and times; NaN without slopes."""
+    times = jnp.asarray(margins.judged_times(parts))
+    found = _worst(parts, dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32), times)
+    return {name: np.asarray(v) for name, v in found.items()}
+
+
+@jax.jit
+def _worst(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array, times: Array) -> dict[str, Array]:
+    def one(trial: Array) -> dict[str, Array]:
+        return margins.judged(dispersion.apply(parts, seed, trial), times)[0].worst()
+
+    return jax.lax.map(one, trials)  # not shared over devices: solving on two of a processor's at once never ends
