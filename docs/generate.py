@@ -40,7 +40,9 @@ part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 
 input. `peak_wheel_momentum` is there with `[wheels]` only. Numbers of one's own: `ptsmc montecarlo --metrics`."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
-such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`:"""
+such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. And, of the sampled loop, any
+margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are the least allowed,
+`modulus_margin` [dB] is the largest peak of the sensitivity. The keys of a table:"""
 
 
 def scenarios() -> str:

@@ -22,7 +22,7 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
         return []
     found = margins.judged_jit(parts, jnp.asarray(margins.judged_times(parts)))[0].worst()
     values = [np.asarray(found[one.metric]) for one in asked]
-    return [one.verdict(value, ~np.isnan(value)) for one, value in zip(asked, values, strict=True)]
+    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(asked, values, strict=True)]
 
 
 def over_trials(ready: Study, seed: int) -> list[Verdict]:
@@ -31,7 +31,7 @@ def over_trials(ready: Study, seed: int) -> list[Verdict]:
         return of_loop(ready.parts, ready.margins)
     found = worst(ready.parts, ready.dispersion, seed, np.arange(TRIALS))
     values = [found[one.metric] for one in ready.margins]
-    return [one.verdict(value, ~np.isnan(value)) for one, value in zip(ready.margins, values, strict=True)]
+    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(ready.margins, values, strict=True)]
 
 
 def differ(dispersion: Dispersion) -> bool:

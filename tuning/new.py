@@ -119,7 +119,9 @@ class _File:
         catalogue, live = metrics.CATALOGUES[self.plant], self.live.get("requirements")
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
-            f"The metrics are {', '.join(catalogue)}."
+            f"The metrics are {', '.join(catalogue)}. "
+            f"Of the sampled loop also {', '.join(layouts.MARGINS)}: the least allowed, but for the last, which is the "
+            "largest sensitivity."
         )
         yield f"{'#' if live is None else ''}[requirements]"
         for name, limit in (live or REQUIREMENTS).items():
