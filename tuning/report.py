@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Trust:
     slope_error: tuple[float, float] | None  # at the first start and at the end; None: flown with the exact sign
     profiles: dict[str, Profile]
     sensitivities: dict[str, dict[str, float]]
-    margins: dict[str, dict[str, float | None]] | None  # of the tuned gains, see `stability.worst`
+    margins: dict[str, dict[str, Any]] | None  # of the tuned gains, see `stability.worst`
 
 
 @dataclass(frozen=True)
