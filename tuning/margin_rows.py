@@ -20,7 +20,7 @@ from ptsmc_jax.scenario import Study
 from tuning.bounds import Bounds
 from tuning.gains import with_gains
 
-CASES = 8  # loops with drawn inertias, those of the screened trials that come nearest to a limit
+CASES = 2  # loops with drawn inertias, those of the screened trials that come nearest to a limit
 
 
 @jax.tree_util.register_dataclass
