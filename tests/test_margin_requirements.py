@@ -80,6 +80,7 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes():
     """Slopes against central differences of order 4, over all axes and times; those of what has no limit are zero."""
     posed = report.pose(scenario.from_tables(BODY), 0)
     asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
+    assert asked is not None
     found = margin_rows.sloped(asked, bounds, share)
     verdicts = margin_verdicts.over_trials(posed.ready, 0)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
