@@ -330,14 +330,12 @@ def at_input(loop: Loop, late: float = 0.0) -> Opening:
 def at_sensors(loop: Loop) -> Opening:
     """The loop opened at the sensors, B (n, k): the state that follows, in rad and rad/s, of what they see."""
     (n, k), (m, _) = loop.seen.shape, loop.command.shape
-    kept = loop.delay * m
-    first, last = (slice(n, n + m), slice(n + kept - m, n + kept)) if kept else (None, None)
-    full, b = jnp.zeros((n + kept,) * 2).at[:n, :n].set(loop.a), jnp.zeros((n + kept, k)).at[:n].set(loop.seen)
-    if first is None:
-        full, b = full.at[:n, :n].add(loop.new[0] @ loop.command), b.at[:n].add(loop.new[0] @ loop.direct)
-    else:
-        full = full.at[:n, last].set(loop.new[0]).at[n + m :, n : n + kept - m].set(jnp.eye(kept - m))
-        full, b = full.at[first, :n].set(loop.command), b.at[first].set(loop.direct)
+    push, kept = loop.new[0], loop.delay * m
+    if not kept:
+        return Opening(loop.a + push @ loop.command, loop.seen + push @ loop.direct, jnp.eye(k, n))
+    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(push)
+    full = full.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + kept - m].set(jnp.eye(kept - m))
+    b = jnp.zeros((n + kept, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
     return Opening(full, b, jnp.eye(k, n + kept))
 
 

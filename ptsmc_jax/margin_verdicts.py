@@ -1,6 +1,7 @@
 """Whether loops have the margins that a scenario asks for: nominal, or over the inertias that are drawn."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +21,20 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """One for each margin that is asked of the loop of these parts, see `margins.judged`."""
     if not asked:
         return []
-    found = margins.judged_jit(parts, jnp.asarray(margins.judged_times(parts)))[0].worst()
-    values = [np.asarray(found[one.metric]) for one in asked]
-    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(asked, values, strict=True)]
+    return _verdicts(asked, margins.judged_jit(parts, jnp.asarray(margins.judged_times(parts)))[0].worst())
 
 
 def over_trials(ready: Study, seed: int) -> list[Verdict]:
     """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops."""
     if not ready.margins or not differ(ready.dispersion):
         return of_loop(ready.parts, ready.margins)
-    found = worst(ready.parts, ready.dispersion, seed, np.arange(TRIALS))
-    values = [found[one.metric] for one in ready.margins]
-    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(ready.margins, values, strict=True)]
+    return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, np.arange(TRIALS)))
+
+
+def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Verdict]:
+    """From each margin by its name, of one loop or of many."""
+    values = [np.asarray(found[one.metric]) for one in asked]
+    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(asked, values, strict=True)]
 
 
 def differ(dispersion: Dispersion) -> bool:

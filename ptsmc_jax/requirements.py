@@ -42,6 +42,15 @@ def fewest_trials(quantile: float, confidence: float) -> int:
     return math.ceil(math.log(1.0 - confidence) / math.log(quantile) - 1e-9)
 
 
+def over(values: Any, limit: Any, *, at_least: bool) -> Any:
+    """How near arrays, NumPy's or JAX's, come to a limit, which is 1: as a share of it, or 2 less that.
+
+    The latter where they are to be larger; one that is infinite is then as far from the limit as there is: 0.
+    """
+    share = values / limit
+    return 2.0 - share.clip(max=2.0) if at_least else share
+
+
 @dataclass(frozen=True)
 class Verdict:
     """How a requirement fared over some trials."""
@@ -50,7 +59,7 @@ class Verdict:
     limit: float
     unit: str
     worst: float  # largest value, NaN if a trial failed
-    margin: float  # how near it comes to the limit, see `Requirement.over`: met up to 1; NaN or infinite: never
+    margin: float  # how near it comes to the limit, see `over`: met up to 1; NaN or infinite: never
     failures: int  # trials beyond the limit or without a value
     trials: int
     quantile: float | None = None  # share of trials that must keep the limit; None: every one
@@ -125,14 +134,6 @@ class Requirement:
     confidence: float | None = None
     at_least: bool = False
 
-    def over(self, values: Any) -> Any:
-        """How near values come to the limit, which is 1: as a share of it, or 2 less that where they are to be larger.
-
-        A value that is infinite on the right side is as far from the limit as there is: 0.
-        """
-        share = values / self.limit
-        return 2.0 - np.minimum(share, 2.0) if self.at_least else share
-
     def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
         """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
 
@@ -147,7 +148,7 @@ class Requirement:
         least = least_within(values.size, *share)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan
-        margin = self.over(worst) if least == values.size else deciding / self.limit
+        margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)
         unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
         failures = int(np.sum(~within))
         count = int(values.size)

@@ -90,7 +90,7 @@ def montecarlo(
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
     from ptsmc_jax import layouts
 
-    if width is not None and not any(name not in layouts.MARGINS for name in loaded.requirements):
+    if width is not None and set(loaded.requirements) <= set(layouts.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning import campaign_folder
 

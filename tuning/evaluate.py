@@ -74,6 +74,7 @@ class Evaluator:
         found = self._in_calls(compiled, replace(problem, margins=None), share, size)
         if problem.margins is None:
             return found
+        # slopes or not, by the one program: another takes longer to compile than most searches would save by it
         each = [margin_rows.sloped(problem.margins, self.bounds, one) for one in share]
         of_loop = {name: np.stack([np.asarray(one[name]) for one in each]) for name in each[0]}
         wide = max(found["c"].shape[2], of_loop["c"].shape[2])

@@ -16,6 +16,7 @@ from ptsmc_jax.assembly import Parts
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.layouts import MARGINS
 from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.requirements import over
 from ptsmc_jax.scenario import Study
 from tuning.bounds import Bounds
 from tuning.gains import with_gains
@@ -33,7 +34,7 @@ class Asked:
     coordinates: Coordinates  # of what is drawn, arrays over the cases first; empty: the nominal loop alone
     times: Leaf  # (times,) to go [s] at which they are judged, besides in hold
     wanted: Leaf  # (margins,) the limits in their units
-    limits: Leaf  # (margins,) how near a loop may come, see `Requirement.over`: 1, less what the search keeps from it
+    limits: Leaf  # (margins,) how near a loop may come, see `over`: 1, less what the search keeps from it
     metrics: tuple[str, ...] = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
 
@@ -50,7 +51,8 @@ def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
     if margin_verdicts.differ(ready.dispersion):
         trials = np.arange(margin_verdicts.TRIALS)
         found = margin_verdicts.worst(ready.parts, ready.dispersion, seed, trials)
-        near = [np.nan_to_num(one.over(found[one.metric]), nan=np.inf) for one in ready.margins]
+        shares = [over(found[one.metric], one.limit, at_least=one.at_least) for one in ready.margins]
+        near = np.nan_to_num(shares, nan=np.inf)
         hardest = np.argsort(-np.max(near, axis=0), kind="stable")[:CASES]
         own = jax.vmap(lambda trial: ready.dispersion.coordinates(jnp.uint32(seed), trial))
         coordinates = own(jnp.asarray(trials[hardest], dtype=jnp.uint32))
@@ -77,17 +79,16 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
         found = margins.judged(parts, asked.times)[0].each()
         each = []
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True):
-            share = found[name].reshape(-1) / wanted
-            over = 2.0 - jnp.minimum(share, 2.0) if MARGINS[name][2] else share
-            each.append(jnp.where(jnp.isnan(over), 2.0, over))
+            share = over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
+            each.append(jnp.where(jnp.isnan(share), 2.0, share))
         return jnp.stack(each)
 
     if asked.coordinates:
         cases = jax.lax.map(lambda c: near(asked.dispersion.at(parts, c)), asked.coordinates)
-        over = jnp.concatenate(list(cases), axis=1)
+        found = jnp.concatenate(list(cases), axis=1)
     else:
-        over = near(parts)
-    return over / asked.limits[:, None] - 1.0
+        found = near(parts)
+    return found / asked.limits[:, None] - 1.0
 
 
 @partial(jax.jit, static_argnames="bounds")
