@@ -3,15 +3,13 @@
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
-
 from ptsmc_jax.clock import Anchored, Flight, Graded
 from ptsmc_jax.hardware import Actuators
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import Plant
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Parts:
     """Everything a run is made of. `plant` is the truth; controller and observer hold their own, nominal model."""

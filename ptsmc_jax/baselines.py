@@ -11,14 +11,13 @@ has a hand-over or a prescribed time; t_f is when they are judged. They fly in t
 from dataclasses import dataclass
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import numerics
 from ptsmc_jax.controllers import ErrorQuaternion
 from ptsmc_jax.laws import Law
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState, Spacecraft
 from ptsmc_jax.signals import Target
 
@@ -52,7 +51,7 @@ class Baseline(ErrorQuaternion, Law):
         return numerics.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class QuaternionPD(Baseline):
     """u = w x J w - d_hat + J (R w_f' - w_e x R w_f) - k_p J v - k_d J w_e.
@@ -80,7 +79,7 @@ class QuaternionPD(Baseline):
         return u, q_e[:3] + self.k_d / self.k_p * w_e
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Terminal(Baseline):
     """s = v + sig^p(v')/b, alpha = -(b/p) sig^(2-p)(v') - k s - K sign(s), with sig^a(x) = sign(x) |x|^a, 1 < p < 2.
@@ -101,7 +100,7 @@ class Terminal(Baseline):
         return s, -self.b / self.p * numerics.signed_power(v_dot, 2.0 - self.p) - self.k * s
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class FixedTime(Baseline):
     """s = v + sig^p(v'/kappa), kappa = a1 |v|^(gamma-1/p) + b1; 1 < p < 2, gamma - 1/p > 1, m > 1 > n > 0.

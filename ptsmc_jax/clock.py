@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 
 Scalar = Float[Array, ""]
 
@@ -37,7 +37,7 @@ def _not_above(t: Array, limit: Scalar) -> Array:
     return jnp.where(t < limit, t, limit)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Anchored:
     """Control clock with a sample at the hand-over t_s: t_k = t_s + (k - before) period.
@@ -63,7 +63,7 @@ class Anchored:
         return Ticks(t, t_next, sample >= 0, sample, partial)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Flight:
     """Control clock as flown: samples at k period from t = 0, the hand-over at the first one not before t_s."""
@@ -80,7 +80,7 @@ class Flight:
         return Ticks(t, t_next, hold, jnp.arange(self.count, dtype=jnp.int32), jnp.ones_like(t))
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Graded:
     """Integration grid of the continuous loop, graded toward t_f; nodes at t_s, t_f, t_f + window and `saves`.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
 from ptsmc_jax.laws import Motion, Prescribed, SecondOrder, surface_roots
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft, System
 from ptsmc_jax.signals import Target
 
@@ -42,7 +42,7 @@ class _Attitude(SecondOrder):
         return 0.5 * numerics.norm(self.model.inertia_inverse) * k2
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class PrescribedTime(_Attitude):
     """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
@@ -140,7 +140,7 @@ class ErrorQuaternion:
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
     """The same law on the vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
@@ -168,7 +168,7 @@ class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
         return Motion(x, feedforward + turning, square)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class PrescribedTimeSystem(SecondOrder):
     """Law (29) for a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation.
@@ -237,7 +237,7 @@ def expansion(eta: Scalar, order: int) -> list[Scalar]:
     return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class PrescribedTimeChain(Prescribed):
     """Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.

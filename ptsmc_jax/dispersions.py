@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude, draws, numerics, signals
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState, Spacecraft
 from ptsmc_jax.rollout import Parts
 
@@ -31,7 +31,7 @@ Drawn = Literal["uniform", "normal"]
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class UniformAttitude:
     """An attitude uniform on SO(3): a normal 4-vector, normalised (Muller, 1959)."""
@@ -45,7 +45,7 @@ class UniformAttitude:
         return attitude.normalise(c)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class AxisAngle:
     """An attitude turned away from the reference at t = 0: axis uniform on the sphere, angle uniform."""
@@ -65,7 +65,7 @@ class AxisAngle:
         return attitude.multiply(reference, attitude.from_rotation_vector(angle * axis))
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class NormalAttitude:
     """An attitude turned from the nominal one by a normal rotation vector."""
@@ -80,7 +80,7 @@ class NormalAttitude:
         return attitude.multiply(nominal, attitude.from_rotation_vector(self.std * c))
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Uniform:
     """Numbers uniform about nominal ones."""
@@ -98,7 +98,7 @@ class Uniform:
         return nominal + self.half_width * (2.0 * c - 1.0)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Normal:
     """Numbers normal about nominal ones."""
@@ -116,7 +116,7 @@ class Normal:
         return nominal + self.std * c
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class TruncatedNormal:
     """Numbers normal about nominal ones, truncated (not clipped) at `FARTHEST` standard deviations."""
@@ -135,7 +135,7 @@ class TruncatedNormal:
         return nominal + self.std * math.sqrt(2.0) * jax.lax.erf_inv((2.0 * c - 1.0) * within)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class RelativeInertia:
     """True inertia whose principal moments are each off by a normal share, and whose axes are turned.
@@ -205,7 +205,7 @@ def _normal(uniform: Float[Array, "..."]) -> Float[Array, "..."]:
     return math.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(uniform, -end, end))
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class UniformPhase:
     """Phase of every sinusoidal disturbance, and of an orbit, later by an angle uniform between 0 and 2 pi."""
@@ -230,7 +230,7 @@ LEVELS = {
 }
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Dispersion:
     """Everything that is drawn for a trial; what is None stays nominal.

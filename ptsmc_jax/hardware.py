@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import numerics
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
@@ -23,7 +23,7 @@ def quantise(u: Array, step: Scalar) -> Array:
     return u + jax.lax.stop_gradient(step * jnp.round(u / step) - u)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Wheels:
     """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A.
@@ -104,7 +104,7 @@ class Push(NamedTuple):
         return None if self.stored is None else self.stored - self.mean * self.dt / 2
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Actuators:
     """Delay, the limit per axis, then per axis or per wheel: quantisation, limits, rate limit and first-order lag."""

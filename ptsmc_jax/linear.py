@@ -28,7 +28,7 @@ from ptsmc_jax.assembly import Parts
 from ptsmc_jax.clock import Graded
 from ptsmc_jax.computer import Computer, Decision, Period, boot, decide, schedule, told
 from ptsmc_jax.hardware import Actuators, ActuatorState
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.sensors import Sensors, StateSensor
 
 Scalar = Float[Array, ""]
@@ -46,7 +46,7 @@ class Carry(NamedTuple):
     model: ActuatorState  # the flight computer's own of its actuators, with them
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Loop:
     """A period of the loop, opened, see above: z (n,), of which the first k are x; u (m,)."""

@@ -1,8 +1,9 @@
 """Numerical pieces that the equations are written with: smooth sign, guarded norm, phi functions, integrators."""
 
 from collections.abc import Callable
+from dataclasses import fields
 from math import factorial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,34 @@ if TYPE_CHECKING:
     Leaf = Array
 else:
     Leaf = Any
+
+
+_Class = TypeVar("_Class", bound=type)
+
+
+def pytree(cls: _Class) -> _Class:
+    """Registers a dataclass with JAX: its fields are children, those with the metadata `static` part of the structure.
+
+    As `jax.tree_util.register_dataclass` does, which must not be used: up to jaxlib 0.10.2 two such classes whose
+    fields have the same structure compare equal, so that where their hashes fall together, about once in thirty
+    processes, `jit` runs the program compiled for the one on the numbers of the other.
+    """
+    static = tuple(f.name for f in fields(cls) if f.metadata.get("static"))
+    names = tuple(f.name for f in fields(cls) if f.name not in static)
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in names)
+
+    def flatten(x: Any) -> tuple[tuple, tuple]:
+        return tuple([getattr(x, name) for name in names]), tuple([getattr(x, name) for name in static])
+
+    def with_keys(x: Any) -> tuple[tuple, tuple]:
+        children, fixed = flatten(x)
+        return tuple(zip(keys, children, strict=True)), fixed
+
+    def unflatten(fixed: tuple, children: tuple) -> Any:
+        return cls(**dict(zip(names, children, strict=True)), **dict(zip(static, fixed, strict=True)))
+
+    jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
+    return cls
 
 
 def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array, "..."]:

@@ -9,12 +9,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import numerics
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import Plant
 
 Scalar = Float[Array, ""]
@@ -84,7 +83,7 @@ class Observer(ABC):
         return ()
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class NoObserver(Observer):
     """No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
@@ -148,7 +147,7 @@ class Linear(Observer):
         return a @ phi
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class NonlinearObserver(Linear):
     """Nonlinear disturbance observer (53) with constant l(w) = diag(gain), so lambda(w) = gain w.
@@ -207,7 +206,7 @@ class PrescribedTimeBound(NamedTuple):
         return floor + remaining * (reached - floor)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class PrescribedTimeObserver(Linear):
     """The nonlinear observer with l = diag(gain) + mu M/(T_o - t) until T_o - delta_o: its error is gone by T_o.
@@ -282,7 +281,7 @@ class FiniteTimeBound(NamedTuple):
         return jnp.where(t < self.settled, self.largest, self.floor)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class FiniteTimeObserver(Observer):
     """Super-twisting observer on H = M w, per component (Levant, Automatica 34, 1998; order 1, full M allowed).

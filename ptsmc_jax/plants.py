@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude, numerics
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 
 Scalar = Float[Array, ""]
 
@@ -101,7 +101,7 @@ class AttitudeState(NamedTuple):
     w: Array  # (3,) body rate in body axes [rad/s]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Spacecraft(Plant):
     """Rigid spacecraft, J w' = -w x J w + u + d (2); build it with `spacecraft`, which checks the inertia."""
@@ -161,7 +161,7 @@ class Spacecraft(Plant):
         return {"q": x.q, "w": x.w}
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Chain(Plant):
     """Integrator chain (35) of any order n >= 2: x_i' = x_(i+1), x_n' = f(x) + g(x) u + d; order 2 is (6).
@@ -231,7 +231,7 @@ def _called(function: Callable | None) -> Any:
     return jax.tree_util.Partial(function) if plain else function
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class System(Plant):
     """Second-order system (25) of one's own: x_1' = F, x_2' = H + G u + D d; all are functions of (t, x_1, x_2).

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from ptsmc_jax import attitude, draws, numerics
 from ptsmc_jax.clock import Ticks
 from ptsmc_jax.draws import Whole
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState
 
 Scalar = Float[Array, ""]
@@ -67,7 +67,7 @@ class Estimate(NamedTuple):
     bias: Array  # (3,) of the gyro [rad/s]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class AttitudeFilter:
     """Steady-state multiplicative filter: propagated by the gyro, corrected by star tracker samples.
@@ -184,7 +184,7 @@ class Memory(NamedTuple):
     rate: Any  # (3,) as last measured [rad/s]; None without a filter
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Sensors:
     """Star tracker [rad] and gyro [rad/s] sampled once a period, white noise, independent per axis and sample.
@@ -289,7 +289,7 @@ class Sensors:
         return Reading(rows, np.repeat([star, gyro], 3), kept, np.full(3, bias), np.full(3, drift), start)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class StateSensor:
     """All states sampled once a period, white noise in the states' own units, independent per state and sample."""

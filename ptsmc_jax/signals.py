@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState
 
 Time = Float[Array, ""]
@@ -27,7 +27,7 @@ class Target(NamedTuple):
         return attitude.vector_rates(self.q, self.w, self.w_dot)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Fixed:
     """A constant reference attitude."""
@@ -39,7 +39,7 @@ class Fixed:
         return Target(self.q, jnp.zeros(3), jnp.zeros(3))
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Spin:
     """A reference that turns at a constant rate: q_f(t) = q(0) exp(w t)."""
@@ -64,7 +64,7 @@ def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
     return Target(q, 2.0 * attitude.multiply(inverse, q_dot)[:3], 2.0 * attitude.multiply(inverse, q_ddot)[:3])
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Swing:
     """A reference that swings about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
@@ -84,7 +84,7 @@ class Swing:
         return moving(path, t)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Slew:
     """A reference that turns about a fixed axis from rest to rest: q_f(t) = q exp(share(t / duration) turn).
@@ -107,7 +107,7 @@ class Slew:
         return moving(path, t)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Origin:
     """The reference of an integrator chain: the origin, which needs no numbers."""
@@ -116,7 +116,7 @@ class Origin:
         """Nothing, at any time."""
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Now:
     """The reference of a system of one's own: the time itself, since F says how far from its target the system is."""
@@ -126,7 +126,7 @@ class Now:
         return t
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Constant:
     """A constant disturbance; zero serves as none."""
@@ -138,7 +138,7 @@ class Constant:
         return self.value
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Sinusoid:
     """bias + amplitude sin(frequency t + phase), per axis."""
@@ -153,7 +153,7 @@ class Sinusoid:
         return self.bias + self.amplitude * jnp.sin(self.frequency * t + self.phase)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class GravityGradient:
     """Gravity-gradient torque on a circular orbit, 3 n^2 c x J c, c the unit vector to the planet in body axes.
@@ -174,7 +174,7 @@ class GravityGradient:
         return 3.0 * self.rate**2 * jnp.cross(c, self.inertia @ c)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Sum:
     """The sum of several disturbances."""

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from ptsmc_jax import attitude, controllers, observers, paper, plants, runs, theory
+from ptsmc_jax.numerics import pytree
 from ptsmc_jax.runs import Run
 from ptsmc_jax.scenario import from_tables, study
 
@@ -176,7 +177,7 @@ def _effective_gain() -> Slip:
     )
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class _Unaligned(controllers.PrescribedTime):
     """The law as printed: the sign of q is taken as it comes."""

@@ -228,6 +228,12 @@ def sources():
     return [path for folder in (*FLOORS, "tests") for path in sorted((ROOT / folder).glob("**/*.py"))]
 
 
+def test_dataclasses_are_registered_by_our_own_decorator():
+    """See `numerics.pytree`: by JAX's own, one law's compiled program is taken for another's now and then."""
+    files = [path for package in FLOORS for path in (ROOT / package).glob("**/*.py") if path.stem != "numerics"]
+    assert not [path.name for path in files if "register_dataclass" in path.read_text(encoding="utf-8")]
+
+
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_file_is_too_long(path: Path):
     assert len(path.read_text().splitlines()) <= LONGEST[path.relative_to(ROOT).parts[0]]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import dispersions, hardware, montecarlo, plants, rollout, scenario, sensors, signals
+from ptsmc_jax import dispersions, hardware, montecarlo, numerics, plants, rollout, scenario, sensors, signals
 from tests.helpers import FIRST_FLIGHT, parts, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
@@ -116,16 +116,12 @@ torque_limit = { kind = "relative_normal", std = 0.2 }
 """
 
 
+@numerics.pytree
 class _Biased(sensors.Sensors):
     """Sensors with a gyro that is off by what is given, not by what is drawn."""
 
     def first_bias(self, seed, trial):
         return jnp.asarray(self.rate_bias)
-
-
-jax.tree_util.register_dataclass(
-    _Biased, ["attitude_noise", "rate_noise", "rate_bias", "bias_rate", "filter"], ["every"]
-)
 
 
 def test_a_trial_made_by_hand_from_its_row_is_the_trial():

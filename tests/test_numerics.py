@@ -1,7 +1,9 @@
 import math
+from dataclasses import dataclass, field
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,33 @@ from ptsmc_jax import numerics
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
+
+
+# pytrees
+
+
+@dataclass(frozen=True)
+class _Law:
+    gain: Any
+    model: Any
+    order: int = field(metadata={"static": True})
+
+
+class _Other(_Law):
+    """Another law with the same numbers."""
+
+
+def test_two_classes_with_the_same_fields_are_two_structures():
+    """What `jit` goes by, and where `jax.tree_util.register_dataclass` of jaxlib 0.10.2 takes one for the other."""
+    kinds = [numerics.pytree(kind) for kind in (_Law, _Other)]
+    one, other = (jax.tree.structure(kind(1.0, {"inertia": 2.0}, 3)) for kind in kinds)
+    assert one != other
+    assert one == jax.tree.structure(_Law(5.0, {"inertia": 6.0}, 3))
+    assert one != jax.tree.structure(_Law(1.0, {"inertia": 2.0}, 4))  # its metadata says: part of the structure
+    doubled = jax.tree.map(lambda x: 2.0 * x, _Other(1.0, {"inertia": 2.0}, 3))
+    assert doubled == _Other(2.0, {"inertia": 4.0}, 3)
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(doubled)[0]]
+    assert paths == [".gain", ".model['inertia']"]
 
 
 # smooth sign

@@ -15,7 +15,7 @@ from ptsmc_jax import margin_verdicts, margins
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.layouts import MARGINS
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.requirements import over
 from ptsmc_jax.scenario import Study
 from tuning.bounds import Bounds
@@ -24,7 +24,7 @@ from tuning.gains import with_gains
 CASES = 2  # loops with drawn inertias, those of the screened trials that come nearest to a limit
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Asked:
     """Margins that are asked for, and of which loops."""

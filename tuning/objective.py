@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import montecarlo, rollout
 from ptsmc_jax.dispersions import Coordinates, Dispersion
-from ptsmc_jax.numerics import Leaf
+from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import Parts
 from tuning.gains import with_gains
@@ -21,7 +21,7 @@ FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that fai
 T_F = "t_f"
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Problem:
     """A tuning problem. The first `averaged` trials count in the objective, all of them in the constraints."""
