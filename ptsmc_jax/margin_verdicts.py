@@ -21,7 +21,7 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """One for each margin that is asked of the loop of these parts, see `margins.judged`."""
     if not asked:
         return []
-    return _verdicts(asked, margins.judged_jit(parts, jnp.asarray(margins.judged_times(parts)))[0].worst())
+    return _verdicts(asked, margins.judged_jit(parts)[0].worst())
 
 
 def over_trials(ready: Study, seed: int) -> list[Verdict]:
@@ -44,14 +44,13 @@ def differ(dispersion: Dispersion) -> bool:
 
 def worst(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
     """Each of `layouts.MARGINS` of each trial's loop, (trials,), the worst over axes and times; NaN without slopes."""
-    times = jnp.asarray(margins.judged_times(parts))
-    found = _worst(parts, dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32), times)
+    found = _worst(parts, dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32))
     return {name: np.asarray(v) for name, v in found.items()}
 
 
 @jax.jit
-def _worst(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array, times: Array) -> dict[str, Array]:
+def _worst(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> dict[str, Array]:
     def one(trial: Array) -> dict[str, Array]:
-        return margins.judged(dispersion.apply(parts, seed, trial), times)[0].worst()
+        return margins.judged(dispersion.apply(parts, seed, trial))[0].worst()
 
     return jax.lax.map(one, trials)  # not shared over devices: solving on two of a processor's at once never ends

@@ -27,7 +27,7 @@ AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its 
 NEAREST = 3  # crossings of a kind that are closed in on
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 SLOWEST = 10  # periods to go: from one to the next the gains before the hand-over change by a tenth
-OCTAVES, SHARE = 6, 0.25  # of the time to go, at most, and the longest as a share of t_f
+TIMES, SHARE = 4, 0.25  # to go at which margins are judged, and the longest as a share of t_f
 
 
 class Margins(NamedTuple):
@@ -252,31 +252,35 @@ class Course(NamedTuple):
         return {name: float(v) for name, v in kept.worst().items()}
 
 
-def judged_times(parts: Parts) -> np.ndarray:
-    """Times to go [s] at which frozen gains mean something, the shortest first.
+def judged_times(parts: Parts) -> Float[Array, " times"]:
+    """Times to go [s] at which frozen gains mean something, the shortest first, evenly spaced by their logarithms.
 
-    Not so short that from one sample to the next the gains change by more than a tenth, nor so long that the loop takes
-    as long to settle as it has left.
+    From the hand-over, where gains are largest, but no nearer than where they change by a tenth from one sample to the
+    next; to where the loop takes as long to settle as it has left. They move with t_f and delta, and with them slopes.
     """
-    times = SLOWEST * float(parts.clock.period) * 2.0 ** np.arange(OCTAVES)  # pyright: ignore[reportAttributeAccessIssue]
-    return times[(times <= SHARE * float(parts.controller.t_f)) | (times == times[0])]
+    law = parts.controller
+    shortest = jnp.maximum(law.delta, SLOWEST * parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    longest = jnp.maximum(SHARE * law.t_f, shortest)
+    return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
 
 
 def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
-    """Numbers of the whole control periods of the nominal run so long before t_f [s], and then of one in hold.
+    """Numbers of the whole control periods nearest to so long before t_f [s], and then of one in hold.
 
-    A time to go after the hand-over is one in hold too. In hold: the last; of an unstable loop the last at whose start
+    Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
     it is no farther off than at the hand-over.
     """
     ticks, law = run.listed[0], parts.controller
     whole = ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
-    left = jnp.where(whole, law.t_f - ticks.t, jnp.inf)
     off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])
     last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
-    return jnp.append(jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1), last)
+    before = whole & ~ticks.hold
+    left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
+    nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)
+    return jnp.append(jnp.where(jnp.any(before), nearest, last), last)
 
 
 _moments = jax.jit(moments)
@@ -291,19 +295,19 @@ class Found(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def at(parts: Parts, left: np.ndarray, run: linear.Nominal | None = None) -> Found:
+def at(parts: Parts, left: Float[Array, " times"], run: linear.Nominal | None = None) -> Found:
     """Margins of sampled parts at these times to go [s], (times,), and in hold."""
     run = linear.nominal_jit(parts) if run is None else run
-    indices = np.asarray(_moments(parts, run, jnp.asarray(left)))
+    indices = np.asarray(_moments(parts, run, left))
     loops = linear.opened_at_jit(parts, run, jnp.asarray(indices))
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.listed[0])
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
-def judged(parts: Parts, times: Array) -> tuple[Margins, Array]:
-    """Margins at these times to go [s] and in hold, (times + 1, m), and which are in hold; for any transformation."""
+def judged(parts: Parts) -> tuple[Margins, Array]:
+    """Margins where they are judged and in hold, (times + 1, m), and which are in hold; for any transformation."""
     run = linear.nominal(parts)
-    indices = moments(parts, run, times)
+    indices = moments(parts, run, judged_times(parts))
     return of_each(linear.opened_at(parts, run, indices)), run.listed[0].hold[indices]
 
 
@@ -314,7 +318,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
     kept, law = judged_times(parts), parts.controller
     period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
-    found = at(parts, np.append(kept, np.geomspace(period, float(law.t_f), times)))
+    found = at(parts, jnp.append(kept, jnp.geomspace(period, float(law.t_f), times)))
     known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}
     order = np.asarray([k for _, k in sorted(known.items())] + [len(found.t) - 1])
     t, _, loops, margins = jax.tree.map(lambda v: v[order], found)
@@ -332,7 +336,7 @@ def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     run = linear.nominal_jit(parts)
     before = linear.whole_periods(parts, run, hold=False)[-1:]
     left = float(parts.controller.t_f) - np.asarray(run.listed[0].t)[before]
-    found = at(parts, left, run)
+    found = at(parts, jnp.asarray(left), run)
     ends = {"hand_over": 0, "hold": -1}
     each = {name: jax.tree.map(lambda v, k=k: v[k], (found.margins, found.loops)) for name, k in ends.items()}
     return {name: (margins, linear.radius(loop)) for name, (margins, loop) in each.items()}

@@ -32,7 +32,6 @@ class Asked:
     parts: Parts
     dispersion: Dispersion
     coordinates: Coordinates  # of what is drawn, arrays over the cases first; empty: the nominal loop alone
-    times: Leaf  # (times,) to go [s] at which they are judged, besides in hold
     wanted: Leaf  # (margins,) the limits in their units
     limits: Leaf  # (margins,) how near a loop may come, see `over`: 1, less what the search keeps from it
     metrics: tuple[str, ...] = field(metadata={"static": True})
@@ -60,7 +59,6 @@ def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
         parts=ready.parts,
         dispersion=ready.dispersion,
         coordinates=coordinates,
-        times=jnp.asarray(margins.judged_times(ready.parts)),
         wanted=jnp.asarray([one.limit for one in ready.margins]),
         limits=jnp.ones(len(ready.margins)),
         metrics=tuple(one.metric for one in ready.margins),
@@ -76,7 +74,7 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
 
     def near(parts: Parts) -> Array:
-        found = margins.judged(parts, asked.times)[0].each()
+        found = margins.judged(parts)[0].each()
         each = []
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True):
             share = over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])

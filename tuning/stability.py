@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import margins, schema, store, systems
@@ -38,8 +37,7 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if ready.scenario.loop.mode != "sampled":
         return None
-    times = margins.judged_times(ready.parts)
-    found, hold = jax.tree.map(np.asarray, margins.judged_jit(ready.parts, jnp.asarray(times)))
+    found, hold = jax.tree.map(np.asarray, margins.judged_jit(ready.parts))
     if np.isnan(found.modulus[-1]).any():
         return None
     places = {"before": ~hold, "hold": hold}
