@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import polars as pl
 
-from ptsmc_jax import lanes, montecarlo, rollout
+from ptsmc_jax import lanes, montecarlo, programs, rollout
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.montecarlo import OwnMetrics
 from ptsmc_jax.requirements import Requirement, Verdict
@@ -76,7 +76,7 @@ class Campaign:
         return list(found.own)
 
 
-@jax.jit
+@programs.jit
 def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> dict[str, jax.Array]:
     return lanes.vmap(lambda trial: montecarlo.values(dispersion, dispersion.apply(parts, seed, trial), seed, trial))(
         trials
@@ -161,7 +161,7 @@ def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
 
 
-@jax.jit
+@programs.jit
 def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> tuple:
     def one(trial: jax.Array) -> tuple:
         log = rollout.simulate(dispersion.apply(parts, seed, trial), seed, trial, record=True).log

@@ -99,7 +99,7 @@ def _campaign(make: Any, told: tuple) -> tuple[Campaign, Rows]:
     from ptsmc_jax.configure import configure
 
     with contextlib.suppress(RuntimeError):  # the worker's process has used JAX already
-        configure()
+        configure(keep_programs=True)
     return make(*told)
 
 

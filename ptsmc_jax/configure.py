@@ -22,6 +22,10 @@ _OPTIONS = (
 )
 
 
+# folder of whole compiled programs, see `ptsmc_jax.programs`; None: they are not kept
+programs: Path | None = None
+
+
 class NoDeviceError(ValueError):
     """A device that JAX does not find here. Its text is one sentence."""
 
@@ -33,6 +37,7 @@ def configure(
     *,
     device: Literal["cpu", "gpu"] | None = None,
     bits: Literal[32, 64] = 64,
+    keep_programs: bool = False,
 ) -> None:
     """64 bit numbers, one host device per core, compiler options and a persistent compile cache.
 
@@ -44,13 +49,16 @@ def configure(
     and processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
     XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
     first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
-    of reach stands in docs/python.md. Call it before anything runs on JAX; later it raises RuntimeError where the
-    backend has already started with something else.
+    of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in
+    which no code is patched, see `ptsmc_jax.programs`. Call it before anything runs on JAX; later it raises
+    RuntimeError where the backend has already started with something else.
     """
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     flags = os.environ.get("XLA_FLAGS", "")
     if fast and "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
+    global programs
+    programs = folder / "programs" if keep_programs and folder is not None else None
     import jax
 
     jax.config.update("jax_enable_x64", bits == 64)

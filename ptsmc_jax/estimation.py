@@ -16,7 +16,6 @@ It bounds the mean over trials. A single run, or a small campaign, may come out 
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax import metrics, rollout
+from ptsmc_jax import metrics, programs, rollout
 from ptsmc_jax.clock import Graded, Ticks
 from ptsmc_jax.hardware import Actuators
 from ptsmc_jax.rollout import Log, Parts
@@ -66,8 +65,7 @@ def along(parts: Parts, log: Log) -> Floor:
     seen = deviations(_model(parts, log, ticks), delay)
     squares = np.sum(seen.reshape(len(seen), 3, -1) ** 2, axis=2)
     judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
-    t, t_next, start, middle, end = (jnp.asarray(v) for v in (ticks.t, ticks.t_next, *squares.T))
-    total = jnp.sum(metrics.in_window(t, t_next, (start, middle, end), judged))
+    total = float(_total(ticks.t, ticks.t_next, squares, judged))
     return Floor(float(np.sqrt(total / float(parts.window))), ticks.t_next, np.sqrt(squares[:, 2]))
 
 
@@ -79,10 +77,21 @@ def pooled(floors: Iterable[Floor]) -> float | None:
 
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
     """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays."""
-    ticks = jax.tree.map(np.asarray, parts.clock.ticks(parts.controller.t_f, parts.controller.delta))
+    ticks = jax.tree.map(np.asarray, _ticks(parts))
     times, least = np.asarray(log.t), 1e-9 * float(np.max(ticks.t_next - ticks.t))
     there, kept = ticks.t_next - ticks.t > least, np.append(np.diff(times) > least, True)
     return jax.tree.map(lambda v: v[there], ticks), jax.tree.map(lambda v: np.asarray(v)[kept], log)
+
+
+@programs.jit
+def _ticks(parts: Parts) -> Any:
+    return parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+
+
+@programs.jit
+def _total(t: Array, t_next: Array, squares: Array, judged: metrics.Judged) -> Array:
+    """Over the window, of squares (periods, 3) at start, middle and end."""
+    return jnp.sum(metrics.in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), judged))
 
 
 def deviations(model: Model, delay: int = 0) -> np.ndarray:
@@ -186,7 +195,7 @@ class _Linear(NamedTuple):
 
 
 # runs for milliseconds: what the compiler saves by optimising is less than what that takes
-@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+@programs.jit(compiler_options={"xla_backend_optimization_level": 0})
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
     actuators = Actuators() if parts.actuators is None else parts.actuators

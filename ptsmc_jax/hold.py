@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import numerics, theory
+from ptsmc_jax import numerics, programs, theory
 from ptsmc_jax.laws import surface_roots
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.theory import ChainMotion
@@ -90,7 +90,7 @@ def _at_hand_over(parts: Parts) -> _HandOver:
     return _handed(parts, *(jnp.asarray(v) for v in (*theory.sliding_envelope(parts), floor)))
 
 
-@jax.jit
+@programs.jit
 def _handed(parts: Parts, s0: Scalar, floor_before: Scalar, floor: Scalar) -> _HandOver:
     law = parts.controller
 
@@ -102,7 +102,7 @@ def _handed(parts: Parts, s0: Scalar, floor_before: Scalar, floor: Scalar) -> _H
     return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), floor)
 
 
-@jax.jit
+@programs.jit
 def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Array:
     law, n = parts.controller, parts.controller.order
     surface, rate = law.surface(), law.reaching_rate()

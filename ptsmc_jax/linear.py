@@ -23,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from ptsmc_jax import rollout
+from ptsmc_jax import programs, rollout
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.clock import Graded
 from ptsmc_jax.computer import Computer, Decision, Period, boot, decide, schedule, told
@@ -117,7 +117,7 @@ def nominal(parts: Parts) -> Nominal:
     return Nominal(listed, *found)
 
 
-nominal_jit = jax.jit(nominal)
+nominal_jit = programs.jit(nominal)
 
 
 def _actuators(parts: Parts) -> Actuators:
@@ -243,7 +243,7 @@ def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
 
 
 # run for a moment: what the compiler saves by optimising is less than what that takes
-_quickly = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+_quickly = partial(programs.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @_quickly

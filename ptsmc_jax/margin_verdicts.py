@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ptsmc_jax import margins
+from ptsmc_jax import margins, programs
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.dispersions import INERTIA, Dispersion
 from ptsmc_jax.requirements import Requirement, Verdict
@@ -48,7 +48,7 @@ def worst(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -
     return {name: np.asarray(v) for name, v in found.items()}
 
 
-@jax.jit
+@programs.jit
 def _worst(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> dict[str, Array]:
     def one(trial: Array) -> dict[str, Array]:
         return margins.judged(dispersion.apply(parts, seed, trial))[0].worst()

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from ptsmc_jax import linear
+from ptsmc_jax import linear, programs
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.linear import Loop, Opening
 
@@ -86,7 +86,7 @@ def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
     return response[axis, axis] - row @ jnp.linalg.solve(back, column)
 
 
-@partial(jax.jit, static_argnames="sensors")
+@programs.jit(static_argnames="sensors")
 def of_each(loops: Loop, sensors: bool = False) -> Margins:
     """Margins of several loops, arrays over them first; sensors: opened there, and not at the plant's input."""
     return jax.lax.map(partial(of, sensors=sensors), loops)
@@ -283,7 +283,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     return jnp.append(jnp.where(jnp.any(before), nearest, last), last)
 
 
-_moments = jax.jit(moments)
+_moments = programs.jit(moments)
 
 
 class Found(NamedTuple):
@@ -311,7 +311,7 @@ def judged(parts: Parts) -> tuple[Margins, Array]:
     return of_each(linear.opened_at(parts, run, indices)), run.listed[0].hold[indices]
 
 
-judged_jit = jax.jit(judged)
+judged_jit = programs.jit(judged)
 
 
 def along(parts: Parts, times: int = 24) -> Course:
@@ -379,7 +379,7 @@ def together(loop: Loop) -> dict[str, float]:
     return dict(zip(FIELDS, found, strict=True))
 
 
-@jax.jit
+@programs.jit
 def _responses(loop: Loop) -> tuple[Array, Array, Array]:
     """Frequencies, L (points, m, m) and that of each axis with the others closed (points, m)."""
     opening = linear.at_input(loop)

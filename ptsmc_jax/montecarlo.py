@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from ptsmc_jax import lanes, rollout
+from ptsmc_jax import lanes, programs, rollout
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.rollout import Parts
@@ -138,7 +137,7 @@ def _joined(v: np.ndarray, share: int) -> np.ndarray:
     return flat.reshape(-1, *flat.shape[2:])
 
 
-@partial(jax.jit, static_argnames=("devices", "own", "kernel"))
+@programs.jit(static_argnames=("devices", "own", "kernel"))
 def _fly(
     parts: Parts,
     dispersion: Dispersion,

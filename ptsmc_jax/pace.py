@@ -19,6 +19,7 @@ from ptsmc_jax import (
     law_tables,
     observers,
     plant_tables,
+    programs,
     signal_tables,
     theory,
 )
@@ -215,13 +216,13 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     return wrong(key, value, f"{'longer' if key == 'reference.duration' else 'lower'}: {asks}")
 
 
-@jax.jit  # one program, where each of its operations would be one
+@programs.jit  # one program, where each of its operations would be one
 def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
     """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
     return controller.boundary_layer(observer.error_bound().largest, visited)
 
 
-@jax.jit
+@programs.jit
 def _rates_of_system(parts: Parts, visited: tuple) -> tuple:
     """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
     plant, law = parts.plant, parts.controller

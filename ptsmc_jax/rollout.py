@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax import draws, metrics, numerics
+from ptsmc_jax import draws, metrics, numerics, programs
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.clock import Graded, Ticks
 from ptsmc_jax.computer import Computer, boot, decide, schedule, told
@@ -105,7 +105,7 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
 
 
 # One compiled program for all parts of the same structure.
-simulate_jit = jax.jit(simulate, static_argnames="record")
+simulate_jit = programs.jit(simulate, static_argnames="record")
 
 
 def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import estimation, margin_verdicts, rollout
+from ptsmc_jax import estimation, margin_verdicts, programs, rollout
+from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.estimation import Floor
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.rollout import Log, Parts
@@ -71,7 +72,7 @@ def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
 
 def _fly(ready: Study, seed: int, trial: int | None) -> Run:
     key, number = jnp.uint32(seed), jnp.uint32(trial or 0)
-    parts = ready.parts if trial is None else ready.dispersion.apply(ready.parts, key, number)
+    parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, number)
     result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
     assert result.log is not None
     lasts = result.log.lasts
@@ -81,6 +82,11 @@ def _fly(ready: Study, seed: int, trial: int | None) -> Run:
     finished = np.asarray(int(result.status) in rollout.FINISHED)
     verdicts = [r.verdict(np.asarray(metrics[r.metric]), finished) for r in ready.requirements]
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
+
+
+@programs.jit
+def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array) -> Parts:
+    return dispersion.apply(parts, seed, trial)
 
 
 def floor(ready: Study, seed: int = 0) -> float | None:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+from jaxtyping import Array
 
 from ptsmc_jax import (
     attitude_keys,
@@ -24,6 +25,7 @@ from ptsmc_jax import (
     metrics,
     observers,
     pace,
+    programs,
     schema,
     theory,
 )
@@ -176,8 +178,8 @@ _OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is sing
 def _check_reference(scenario: Scenario, parts: Parts) -> None:
     """Refuse a reference on which the additive law meets its singularity."""
     assert scenario.reference is not None
-    grid = jnp.linspace(0.0, float(parts.t_end), 4001)
-    held = np.asarray(jax.vmap(lambda time: parts.reference(time).q[3])(grid))
+    grid = np.linspace(0.0, float(parts.t_end), 4001)
+    held = np.asarray(_scalar_part(parts, grid))
     worst = int(np.argmin(np.abs(held)))
     crosses = np.any(np.sign(held) != np.sign(held[0]))
     if crosses or abs(held[worst]) < SINGULAR_CLEARANCE:
@@ -187,6 +189,12 @@ def _check_reference(scenario: Scenario, parts: Parts) -> None:
             f"at t = {when:.4g} s; allowed is a reference that stays away from it until t_end, "
             'or controller.error = "multiplicative"'
         )
+
+
+@programs.jit
+def _scalar_part(parts: Parts, times: Array) -> Array:
+    """q_f4 of the reference at these times (times,) [s]."""
+    return jax.vmap(lambda time: parts.reference(time).q[3])(times)
 
 
 def _check_start(scenario: Scenario, parts: Parts) -> None:
@@ -212,7 +220,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
         )
 
 
-_path = jax.jit(theory.exact_path)
+_path = programs.jit(theory.exact_path)
 
 
 def _parts(scenario: Scenario, saves: object, reach: pace.Reach | None) -> Parts:

@@ -7,7 +7,6 @@ is weighted by the period's share, so that nothing jumps where that period vanis
 """
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ptsmc_jax import attitude, draws, numerics
+from ptsmc_jax import attitude, draws, numerics, programs
 from ptsmc_jax.clock import Ticks
 from ptsmc_jax.draws import Whole
 from ptsmc_jax.numerics import Leaf, pytree
@@ -128,7 +127,7 @@ def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, inte
     return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))
 
 
-@partial(jax.jit, static_argnames="every")  # one program, where each of its operations would be one
+@programs.jit(static_argnames="every")  # one program, where each of its operations would be one
 def attitude_filter(
     bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, every: int
 ) -> AttitudeFilter:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+from ptsmc_jax import configure
 from ptsmc_jax.plants import System
 
 WHERE = '"FILE.py:NAME" or "package.module:NAME"'
@@ -132,6 +133,7 @@ def _run(path: Path, content: bytes) -> ModuleType:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up there
+    configure.programs = None  # what they are made of may be patched from here on
     try:
         exec(compile(content, str(path), "exec", dont_inherit=True), module.__dict__)
     except BaseException:

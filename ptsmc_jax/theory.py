@@ -5,7 +5,6 @@ K2 = 0. The paper writes ln(t_f - t) in (20)-(22) and (47)-(50) where its absolu
 """
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import attitude, numerics
+from ptsmc_jax import attitude, numerics, programs
 from ptsmc_jax.controllers import expansion
 from ptsmc_jax.laws import SecondOrder
 from ptsmc_jax.plants import Chain, System
@@ -266,7 +265,7 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     return np.asarray(_error_bound(parts, jnp.asarray(t), s0, floor))
 
 
-@jax.jit
+@programs.jit
 def _error_bound(parts: Parts, t: Array, s0: Scalar, floor: Scalar) -> Array:
     law = parts.controller
 
@@ -284,7 +283,7 @@ def exact_sizes(parts: Parts, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(error), np.asarray(s)
 
 
-@jax.jit
+@programs.jit
 def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
     law = parts.controller
 
@@ -315,7 +314,7 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
 
 
-@partial(jax.jit, static_argnames="points")
+@programs.jit(static_argnames="points")
 def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
     """Targets and states of a second-order run, (2 points,) each: along the exact motion, then on the target.
 

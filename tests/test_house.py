@@ -16,7 +16,7 @@ from tests.helpers import ROOT
 FLOORS = {
     "ptsmc_jax": """
         configure
-        numerics elementary
+        programs numerics elementary
         draws
         attitude
         plants

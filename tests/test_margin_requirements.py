@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import layouts, margin_verdicts, margins, scenario
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.requirements import Requirement, over
 from tests.helpers import SHORT
 from tuning import margin_rows, report, stability
+from tuning.gains import with_gains
 
 BODY = {
     "controller": {"t_f": 8.0, "delta": 0.4, "sign_width": 0.02, "k1": 2.0},
@@ -112,3 +113,15 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     each = margin_verdicts.worst(posed.ready.parts, posed.ready.dispersion, 3, np.arange(4))
     assert len(np.unique(each["gain_margin"])) == 4
+    # with other gains others are the hardest, and they take the places
+    asked = posed.problem.margins
+    assert asked is not None
+    other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
+    parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
+    each = margin_verdicts.worst(parts, asked.dispersion, 3, np.arange(4))
+    harder, near = margin_rows.hardest(asked, other)
+    row = np.asarray(margin_rows.rows(harder, jnp.asarray(other)))
+    np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
+    limits = posed.ready.margins
+    shares = [over(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
+    np.testing.assert_allclose(near, np.max(shares), rtol=1e-12)

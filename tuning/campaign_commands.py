@@ -207,7 +207,7 @@ def _configured(folder: Path) -> None:
     from ptsmc_jax import store
     from ptsmc_jax.configure import configure
 
-    configure(device="cpu", bits=32 if store.made(folder).get("precision") == 32 else 64)
+    configure(keep_programs=True, device="cpu", bits=32 if store.made(folder).get("precision") == 32 else 64)
 
 
 def _summarised(folder, quiet: bool, figures: bool) -> int:

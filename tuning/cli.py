@@ -92,7 +92,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     store.check(folder, force)
     from ptsmc_jax.configure import configure
 
-    configure()
+    configure(keep_programs=True)
     from tuning import reproduction
 
     made = reproduction.reproduce()

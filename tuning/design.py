@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import montecarlo, scenario, theory
+from ptsmc_jax import montecarlo, programs, scenario, theory
 from ptsmc_jax.dispersions import Dispersion
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.schema import ScenarioError
@@ -75,7 +75,7 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
     return ShortestTime(limit, rule, found, len(trials))
 
 
-@jax.jit
+@programs.jit
 def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, t_f: jax.Array) -> jax.Array:
     controller = replace(parts.controller, t_f=jnp.asarray(t_f, float))
 

@@ -1,12 +1,11 @@
 """Evaluates tuning problems at many gains: compiled once for each problem's shape, shared over devices, journaled."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax
 import numpy as np
 
-from ptsmc_jax import montecarlo
+from ptsmc_jax import montecarlo, programs
 from tuning import margin_rows
 from tuning.bounds import Bounds
 from tuning.journal import Journal
@@ -105,7 +104,7 @@ def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
     return b"|".join([kind, share.tobytes(), str(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
-@partial(jax.jit, static_argnames=("bounds", "devices"))
+@programs.jit(static_argnames=("bounds", "devices"))
 def _fly(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
     def one(share: jax.Array) -> dict[str, jax.Array]:
         gains = bounds.gains(share)
@@ -115,7 +114,7 @@ def _fly(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> di
     return montecarlo.spread(lambda share: jax.lax.map(one, share), share, devices)
 
 
-@partial(jax.jit, static_argnames=("bounds", "devices"))
+@programs.jit(static_argnames=("bounds", "devices"))
 def _slopes(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
     """Tangents forward, as one more batch axis; point after point, so that a branch on the time stays a branch."""
 

@@ -4,24 +4,25 @@ One for each axis, time and case, so that what is the least of several has slope
 """
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax import margin_verdicts, margins
+from ptsmc_jax import margin_verdicts, margins, programs
 from ptsmc_jax.assembly import Parts
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.layouts import MARGINS
 from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.requirements import over
 from ptsmc_jax.scenario import Study
+from tuning import gains as gain_names
 from tuning.bounds import Bounds
 from tuning.gains import with_gains
 
-CASES = 2  # loops with drawn inertias, those of the screened trials that come nearest to a limit
+CASES = 2  # loops with drawn inertias, those that come nearest to a limit
+WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
 
 
 @pytree
@@ -31,6 +32,7 @@ class Asked:
 
     parts: Parts
     dispersion: Dispersion
+    seed: Leaf  # uint32
     coordinates: Coordinates  # of what is drawn, arrays over the cases first; empty: the nominal loop alone
     wanted: Leaf  # (margins,) the limits in their units
     limits: Leaf  # (margins,) how near a loop may come, see `over`: 1, less what the search keeps from it
@@ -46,24 +48,36 @@ def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
     """The margins that a scenario asks for, or None; where inertias are drawn, of the trials hardest by its gains."""
     if not ready.margins:
         return None
-    coordinates: Coordinates = {}
-    if margin_verdicts.differ(ready.dispersion):
-        trials = np.arange(margin_verdicts.TRIALS)
-        found = margin_verdicts.worst(ready.parts, ready.dispersion, seed, trials)
-        shares = [over(found[one.metric], one.limit, at_least=one.at_least) for one in ready.margins]
-        near = np.nan_to_num(shares, nan=np.inf)
-        hardest = np.argsort(-np.max(near, axis=0), kind="stable")[:CASES]
-        own = jax.vmap(lambda trial: ready.dispersion.coordinates(jnp.uint32(seed), trial))
-        coordinates = own(jnp.asarray(trials[hardest], dtype=jnp.uint32))
-    return Asked(
+    asked = Asked(
         parts=ready.parts,
         dispersion=ready.dispersion,
-        coordinates=coordinates,
+        seed=jnp.uint32(seed),
+        coordinates={},
         wanted=jnp.asarray([one.limit for one in ready.margins]),
         limits=jnp.ones(len(ready.margins)),
         metrics=tuple(one.metric for one in ready.margins),
         names=names,
     )
+    return hardest(asked, np.asarray(gain_names.own(ready.parts, names)))[0]
+
+
+def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
+    """With the `CASES` trials whose loops come nearest to a limit by these gains, and how near the nearest comes.
+
+    As it is where no inertia is drawn: all loops are one, which is among the rows.
+    """
+    if not margin_verdicts.differ(asked.dispersion):
+        return asked, 0.0
+    parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
+    each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS))
+    shares = [
+        over(each[name], wanted, at_least=MARGINS[name][2])
+        for name, wanted in zip(asked.metrics, np.asarray(asked.wanted), strict=True)
+    ]
+    near = np.max(np.nan_to_num(shares, nan=WITHOUT), axis=0)
+    trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
+    coordinates = jax.vmap(lambda trial: asked.dispersion.coordinates(asked.seed, trial))(trials)
+    return replace(asked, coordinates=coordinates), float(near.max())
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:
@@ -78,7 +92,7 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
         each = []
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True):
             share = over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
-            each.append(jnp.where(jnp.isnan(share), 2.0, share))
+            each.append(jnp.where(jnp.isnan(share), WITHOUT, share))
         return jnp.stack(each)
 
     if asked.coordinates:
@@ -89,7 +103,7 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     return found / asked.limits[:, None] - 1.0
 
 
-@partial(jax.jit, static_argnames="bounds")
+@programs.jit(static_argnames="bounds")
 def sloped(asked: Asked, bounds: Bounds, share: Array) -> dict[str, Array]:
     """The rows "c" at shares (gains,) of the bounds' intervals, and "c_slope" by these."""
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax import montecarlo, rollout
+from ptsmc_jax import montecarlo, programs, rollout
 from ptsmc_jax.dispersions import Coordinates, Dispersion
 from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.requirements import Requirement
@@ -86,7 +86,7 @@ def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coo
     return _coordinates(dispersion, jnp.uint32(seed), numbers)
 
 
-@jax.jit
+@programs.jit
 def _coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
     return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 

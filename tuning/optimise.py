@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.requirements import Requirement
-from tuning import confirm
+from tuning import confirm, margin_rows
 from tuning import worst as worst_case
 from tuning.descent import BROKEN
 from tuning.descents import Descents, Step, planned
@@ -103,6 +103,7 @@ def search(
         else:
             run.sweep(problem, own)
         joined = 0
+        problem, _ = _harder_margins(problem, run.gains)
         if sure:  # what is hardest for gains that are about right
             harder = _hardest(problem, *screened(run.gains))
             problem, joined = _add(problem, joined, Joining(harder, whole_rows(problem))), harder.size
@@ -110,8 +111,9 @@ def search(
             run.descend(problem, run.explore(problem, starts, seed) if starts > 1 else {0: run.share})
         else:
             run.evolve(problem, run.share)
-        while sure or shares:
+        while sure or shares or problem.margins is not None:
             found, joining = run.gains, list[Joining]()
+            others, beyond = _harder_margins(problem, found)
             if shares:  # each time on other trials, which those screened are not among
                 report("confirming on other trials", 0, 0, *run.best_so_far)
                 counts = confirm.count(problem, shares, found, problem.averaged + worst_case.SCREENED, rounds)
@@ -130,8 +132,9 @@ def search(
                 known = screened(found)
                 if np.any(known[1] > 1.0):
                     joining.append(Joining(_hardest(problem, *known), whole_rows(problem)))
-            if not joining or rounds == ROUNDS:
+            if not (joining or beyond) or rounds == ROUNDS:
                 break
+            problem = others if beyond else problem
             for more in joining:
                 problem, joined = _add(problem, joined, more), joined + more.trials.size
             hardest = None  # it was the worst case of gains that are searched on from
@@ -170,6 +173,14 @@ def search(
 def _with_room(problem: Problem, places: int) -> Problem:
     """With so many places more, that hold the first trial again: it must keep what every trial must keep, twice."""
     return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], places))
+
+
+def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
+    """With the loops whose margins are least by these gains, and whether one of them breaks a limit."""
+    if problem.margins is None:
+        return problem, False
+    asked, near = margin_rows.hardest(problem.margins, gains)
+    return replace(problem, margins=asked), near > 1.0
 
 
 def _add(problem: Problem, joined: int, more: Joining) -> Problem:

@@ -75,7 +75,7 @@ def prepare(
     from ptsmc_jax.configure import NoDeviceError, configure
 
     try:
-        configure(device=device, bits=bits)
+        configure(device=device, bits=bits, keep_programs=True)
     except NoDeviceError as error:
         raise UsageError(f"--device is {device}, but {error}") from None
     from ptsmc_jax.scenario import from_tables

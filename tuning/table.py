@@ -13,7 +13,7 @@ TRIALS = 1000
 
 def main() -> None:
     """Fly every row without noise, with noise, and with noise through the filter; else scenarios/first_flight.toml."""
-    configure()
+    configure(keep_programs=True)
     from ptsmc_jax import montecarlo, scenario
     from tuning.gains import in_scenario
 

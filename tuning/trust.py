@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from ptsmc_jax import montecarlo
-from tuning.bounds import Bounds
+from tuning.bounds import TIMES, Bounds
 from tuning.evaluate import Evaluator
 from tuning.gains import with_gains
 from tuning.objective import Problem
@@ -25,9 +25,11 @@ RESAMPLED = 2000  # times, for an interval
 def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> float:
     """Largest difference of F's slopes, by automatic differentiation, from central differences, at shares (gains,).
 
-    Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it.
+    Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it, beside
+    a hand-over on a sample just behind it: F has a kink there, where the first period of the anchored clock vanishes.
     """
-    count, inside = share.size, np.clip(share, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
+    behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
+    count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
     f = evaluate.fly(problem, inside + offsets).f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import numpy as np
 import optax
 from scipy.stats import chi2
 
-from ptsmc_jax import lanes, montecarlo, rollout
+from ptsmc_jax import lanes, montecarlo, programs, rollout
 from ptsmc_jax.dispersions import INERTIA, Coordinates
 from ptsmc_jax.requirements import Requirement
 from tuning.gains import with_gains
@@ -126,12 +125,12 @@ def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str,
     return found
 
 
-@jax.jit
+@programs.jit
 def _fly(parts, dispersion, seed, trial, coordinates) -> montecarlo.Flown:
     return montecarlo.one(parts, dispersion, seed, trial, coordinates)
 
 
-@partial(jax.jit, static_argnames=("moved", "names"))
+@programs.jit(static_argnames=("moved", "names"))
 def _climb(parts, dispersion, seed, trials, coordinates, limits, y, moved, names) -> tuple[jax.Array, jax.Array]:
     """Largest metric / limit of each case, (cases,), and its slopes by the free reals, (cases, reals)."""
 

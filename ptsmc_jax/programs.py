@@ -1,0 +1,244 @@
+"""`jax.jit`, with compiled programs that outlive the process: loading one takes a tenth of tracing and lowering it.
+
+Kept beside the compile cache where `configure(programs=True)` asks for it, as the `ptsmc` command does. A session in
+which code may be patched should not ask: what a program is made of is known here from files alone. Any doubt, a file
+cut short among them, falls back to compiling.
+"""
+
+import functools
+import hashlib
+import importlib
+import inspect
+import os
+import pickle
+import stat
+import tempfile
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import jax
+import jaxlib
+import numpy as np
+import scipy
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
+
+from ptsmc_jax import configure
+
+KEPT = 400  # programs; those not used for longest make room
+OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files
+PLAIN = (int, float, str, bool, bytes, type(None))
+
+
+class _UnknownError(Exception):
+    """What a program hangs on cannot be told from its name."""
+
+
+class Program:
+    """A function compiled once for each structure of its arguments, here or by an earlier process."""
+
+    def __init__(self, function: Callable, static: tuple[str, ...] = (), options: dict[str, Any] | None = None):
+        functools.update_wrapper(self, function)
+        self._function, self._static, self._options = function, static, options
+        self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
+        self._signature = inspect.signature(function)
+        self._ready: dict[Any, Callable] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jitted, name)  # lower, trace, clear_cache
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """As the jitted function."""
+        if configure.programs is None:
+            return self._jitted(*args, **kwargs)
+        bound = self._signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        given = {name: v for name, v in bound.arguments.items() if name not in self._static}
+        fixed = tuple((name, v) for name, v in bound.arguments.items() if name in self._static)
+        leaves, structure = jax.tree.flatten(given)
+        try:
+            key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed)
+            ready = self._ready.get(key)
+            said = "" if ready else self._said(key)
+        except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
+            return self._jitted(*args, **kwargs)
+        if ready is not None:
+            return ready(given)
+        path = configure.programs / (hashlib.sha256(said.encode()).hexdigest() + ".program")
+        found = _read(path, said, jax.tree.structure(((given,), {})))
+        if found is not None:
+            try:
+                result = jax.block_until_ready(found(given))
+            except Exception:  # it was whole, and yet does not run here
+                path.unlink(missing_ok=True)
+            else:
+                self._ready[key] = found
+                return result
+        self._ready[key] = compiled = self._compiled(given, dict(fixed))
+        _write(path, said, compiled)
+        return compiled(given)
+
+    def _said(self, key: tuple) -> str:
+        """All that the program hangs on, in words that mean the same in every process."""
+        structure, shapes, fixed = key
+        return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
+
+    def _compiled(self, given: dict, fixed: dict) -> Callable:
+        def function(given: dict) -> Any:
+            return self._function(**given, **fixed)
+
+        function.__name__ = self._function.__name__
+        lowered = jax.jit(function, compiler_options=self._options).lower(given)
+        # what the compile cache gives back cannot be written again: a loaded copy would lack its functions
+        jax.config.update("jax_enable_compilation_cache", False)
+        compilation_cache.reset_cache()
+        try:
+            return lowered.compile()
+        finally:
+            jax.config.update("jax_enable_compilation_cache", True)
+            compilation_cache.reset_cache()
+
+    def _origin(self) -> tuple[str, str, str]:
+        package = self._function.__module__.split(".")[0]
+        if package not in OURS or "<locals>" in self._function.__qualname__:
+            raise _UnknownError
+        return self._function.__module__, self._function.__qualname__, _code(package)
+
+
+def jit(
+    function: Callable | None = None,
+    *,
+    static_argnames: str | tuple[str, ...] = (),
+    compiler_options: dict | None = None,
+) -> Any:
+    """`jax.jit` of a function at the top of a module of this project, see above."""
+    if function is None:
+        return functools.partial(jit, static_argnames=static_argnames, compiler_options=compiler_options)
+    static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
+    return Program(function, static, compiler_options)
+
+
+def _shape(leaf: Any) -> tuple:
+    """What of an array a program is compiled for."""
+    if isinstance(leaf, jax.core.Tracer):
+        raise _UnknownError
+    if isinstance(leaf, jax.Array):
+        if leaf.devices() != {jax.local_devices()[0]}:
+            raise _UnknownError
+        return leaf.shape, leaf.dtype.name, leaf.weak_type
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.shape, leaf.dtype.name, False
+    if type(leaf) in (bool, int, float):
+        return (), type(leaf).__name__, True
+    raise _UnknownError
+
+
+def _structure(structure: Any) -> Any:
+    """A tree's structure in words that mean the same in every process."""
+    data = structure.node_data()
+    if data is None:  # a leaf
+        return "*"
+    kind, fixed = data
+    return _plain(kind), _plain(fixed), [_structure(child) for child in structure.children()]
+
+
+def _plain(value: Any) -> Any:
+    """What is fixed in a program, in such words."""
+    if type(value) in PLAIN:
+        return value
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    if isinstance(value, dict):
+        return [(_plain(k), _plain(v)) for k, v in value.items()]
+    kind = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
+    where = kind.__module__, kind.__qualname__
+    if where[0].split(".")[0] not in (*OURS, "builtins", "collections") or "<locals>" in where[1]:
+        raise _UnknownError
+    if kind is value:
+        return where
+    if isinstance(value, Enum):
+        return where, value.name
+    if is_dataclass(value):
+        return where, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
+    raise _UnknownError
+
+
+@functools.cache
+def _code(package: str) -> str:
+    """Digest of a package's files, and of the library's."""
+    digest = hashlib.sha256()
+    for name in sorted({package, OURS[0]}):
+        folder = Path(str(importlib.import_module(name).__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{path.relative_to(folder)} {path.stat().st_size}".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+# settings that no program hangs on
+_ELSEWHERE = ("cache", "log", "dump", "profil", "traceback", "compil", "distributed", "coordination", "explain")
+
+
+def _surroundings() -> tuple:
+    """What else a program hangs on; the cache's folder is one processor's own."""
+    settings = {k: repr(v) for k, v in jax.config.values.items() if not any(word in k for word in _ELSEWHERE)}
+    versions = jax.__version__, jaxlib.__version__, np.__version__, scipy.__version__
+    devices = [f"{d.platform} {d.device_kind} {d.id}" for d in jax.local_devices()]
+    return versions, devices, os.environ.get("XLA_FLAGS", ""), sorted(settings.items())
+
+
+def _read(path: Path, said: str, inside: Any) -> Callable | None:
+    """The program in a file, if it is ours, whole, and the one that is asked for."""
+    try:
+        for place in (path.parent, path):
+            known = place.lstat()
+            own = known.st_uid == os.geteuid() and not known.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+            if stat.S_ISLNK(known.st_mode) or not own:
+                return None
+        content = path.read_bytes()
+        digest, body = content[:32], content[32:]
+        if digest != hashlib.sha256(said.encode() + body).digest():
+            return None
+        payload, skeleton, count = pickle.loads(body)
+        if b"lapack" in payload:
+            _lapack()
+        found = serialize_executable.deserialize_and_load(
+            payload, inside, jax.tree.structure(skeleton), execution_devices=jax.local_devices()[:count]
+        )
+        os.utime(path)  # used
+    except Exception:  # whatever is wrong with it, it can be compiled again
+        return None
+    return found
+
+
+def _write(path: Path, said: str, compiled: Any) -> None:
+    """Keep a program; nothing is said where that does not work."""
+    try:
+        payload, _, outside = serialize_executable.serialize(compiled)
+        devices = {device for way in jax.tree.leaves(compiled.output_shardings) for device in way.device_set}
+        body = pickle.dumps((payload, jax.tree.unflatten(outside, range(outside.num_leaves)), len(devices)))
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle, made = tempfile.mkstemp(dir=path.parent)
+        try:
+            with open(handle, "wb") as file:
+                file.write(hashlib.sha256(said.encode() + body).digest() + body)
+            os.replace(made, path)
+        except BaseException:
+            Path(made).unlink(missing_ok=True)
+            raise
+        kept = sorted(path.parent.glob("*.program"), key=lambda p: p.stat().st_mtime)
+        for old in kept[:-KEPT]:
+            old.unlink(missing_ok=True)
+    except Exception:
+        pass
+
+
+@functools.cache
+def _lapack() -> None:
+    """A loaded program calls LAPACK through pointers that tracing would have set."""
+    from jaxlib.cpu import _lapack
+
+    _lapack.initialize()

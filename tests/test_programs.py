@@ -1,0 +1,219 @@
+"""Compiled programs that are kept: what is loaded, what is not, and that in any doubt the right numbers come out."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import configure, numerics, programs
+from tests.helpers import ROOT
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(configure, "programs", tmp_path / "programs")
+    return tmp_path / "programs"
+
+
+def spied(name="spied", factor=2.0):
+    """A program that counts how often it is traced, as if it stood at the top of one of our files."""
+    traced = []
+
+    def function(x, y=1.0, kind="plain"):
+        traced.append(kind)
+        return {"both": jnp.sin(factor * x) + y * len(kind)}
+
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.attitude", name, name
+    return programs.jit(function, static_argnames="kind"), traced
+
+
+X = np.linspace(0.0, 1.0, 5)
+
+
+def test_a_program_is_compiled_once_and_loaded_by_the_next_process(folder):
+    """The next process is a second `Program` of the same function here."""
+    program, traced = spied()
+    first = [program(X), program(2 * X)]
+    assert len(traced) == 1
+    (kept,) = folder.iterdir()
+    assert kept.stat().st_mode & 0o777 == 0o600
+    assert folder.stat().st_mode & 0o777 == 0o700
+    again, traced = spied()
+    for ours, theirs in zip(first, [again(X), again(2 * X)], strict=True):
+        np.testing.assert_array_equal(ours["both"], theirs["both"])
+    assert not traced
+    np.testing.assert_allclose(first[1]["both"], np.sin(4 * X) + 5.0, rtol=1e-15)
+
+
+@numerics.pytree
+@dataclass(frozen=True)
+class _Law:
+    gain: Any
+    order: int = field(default=2, metadata={"static": True})
+
+
+class _Other(_Law):
+    pass
+
+
+for _kind in (_Law, _Other):
+    _kind.__module__ = "ptsmc_jax.controllers"
+numerics.pytree(_Other)
+
+
+def test_another_structure_shape_type_static_argument_version_or_code_is_another_program(folder, monkeypatch):
+    def count(*args, **kwargs):
+        program, _ = spied()
+        program(*args, **kwargs)
+        return len(list(folder.iterdir()))
+
+    calls = [((X,), {}), ((X[:3],), {}), ((X.astype(np.float32),), {}), ((1.0,), {}), ((X, 1), {}),
+             ((X,), {"kind": "other"})]  # fmt: skip
+    assert [count(*args, **kwargs) for args, kwargs in calls] == [1, 2, 3, 4, 5, 6]
+    assert count(jnp.asarray(X)) == 6  # the same for JAX
+    with monkeypatch.context() as changed:
+        changed.setattr(programs.jax, "__version__", "0.0.1")
+        assert count(X) == 7
+    with monkeypatch.context() as changed:
+        changed.setattr(programs, "_code", lambda package: "edited")
+        assert count(X) == 8
+    with jax.debug_nans(True):
+        assert count(X) == 9
+
+
+def test_two_laws_with_the_same_numbers_are_two_programs(folder):
+    def function(law):
+        return law.gain * (3.0 if type(law) is _Other else 1.0)
+
+    function.__module__, function.__qualname__ = "ptsmc_jax.attitude", "function"
+    for _ in range(2):  # compiled, then loaded
+        program = programs.jit(function)
+        assert [float(program(law(2.0))) for law in (_Law, _Other)] == [2.0, 6.0]
+        assert float(program(_Law(2.0, order=3))) == 2.0
+        assert len(list(folder.iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ["cut short", "empty", "another's", "a bit", "open to the group", "a link", "an open folder"],
+)
+def test_a_file_that_is_not_as_we_left_it_is_not_loaded(folder, damage, tmp_path):
+    program, _ = spied()
+    program(X)
+    (kept,) = folder.iterdir()
+    content = kept.read_bytes()
+    if damage == "cut short":
+        kept.write_bytes(content[: len(content) // 2])
+    elif damage == "empty":
+        kept.write_bytes(b"")
+    elif damage == "another's":
+        other, _ = spied("other", factor=3.0)
+        other(X)
+        (theirs,) = set(folder.iterdir()) - {kept}
+        kept.write_bytes(theirs.read_bytes())
+    elif damage == "a bit":
+        kept.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    elif damage == "open to the group":
+        kept.chmod(0o620)
+    elif damage == "a link":
+        kept.rename(tmp_path / "elsewhere")
+        kept.symlink_to(tmp_path / "elsewhere")
+    else:
+        folder.chmod(0o777)
+    again, traced = spied()
+    np.testing.assert_allclose(again(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
+    assert len(traced) == 1
+
+
+def test_a_program_that_does_not_run_is_compiled_again(folder, monkeypatch):
+    program, _ = spied()
+    program(X)
+
+    def fails(given):
+        raise RuntimeError("Function fusion not found")
+
+    monkeypatch.setattr(programs, "_read", lambda *told: fails)
+    again, traced = spied()
+    np.testing.assert_allclose(again(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
+    assert len(traced) == 1
+
+
+def test_what_cannot_be_told_from_files_is_compiled_as_ever(folder):
+    """A user's own function or class, a tracer, arrays spread over devices."""
+
+    def own(x):
+        return 2.0 * x
+
+    np.testing.assert_array_equal(programs.jit(own)(X), 2 * X)
+    program, _ = spied()
+    np.testing.assert_allclose(jax.vmap(lambda x: program(x)["both"])(X), np.sin(2 * X) + 5.0, rtol=1e-15)
+    np.testing.assert_allclose(jax.grad(lambda x: program(x)["both"])(0.3), 2 * np.cos(0.6), rtol=1e-14)
+    elsewhere = jax.device_put(X, jax.local_devices()[-1])
+    assert program(elsewhere)["both"].devices() == {jax.local_devices()[-1]}
+    assert not folder.exists()
+
+
+def test_only_so_many_are_kept(folder, monkeypatch):
+    monkeypatch.setattr(programs, "KEPT", 2)
+    for k in range(4):
+        program, _ = spied(f"number_{k}")
+        program(X)
+    assert len(list(folder.iterdir())) == 2
+
+
+_SCRIPT = """
+import sys
+from ptsmc_jax.configure import configure
+configure(devices=2, cache=sys.argv[1], keep_programs=True)
+import jax, jax.numpy as jnp, numpy as np
+from ptsmc_jax import montecarlo, programs
+
+traced = []
+
+def poles(a):
+    traced.append(1)
+    values = jnp.linalg.eigvals(a)
+    spread = montecarlo.spread(lambda x: jnp.sin(3.0 * x) * x + 1.0, jnp.arange(4.0), 2)
+    return jnp.sort(jnp.abs(values)), spread
+
+poles.__module__, poles.__qualname__ = "ptsmc_jax.linear", "poles"
+
+def same(given):
+    return poles(**given)
+
+same.__name__ = "poles"
+a = np.array([[0.5, 1.0], [-1.0, 0.5]])
+if sys.argv[2] == "first":
+    jax.block_until_ready(jax.jit(same)({"a": a}))  # the compile cache has it then
+before = len(traced)
+found, spread = programs.jit(poles)(a)
+np.testing.assert_allclose(found, np.sqrt([1.25, 1.25]), rtol=1e-12)
+np.testing.assert_allclose(spread, np.sin(3.0 * np.arange(4)) * np.arange(4) + 1.0, rtol=1e-12)
+print(len(traced) - before)
+"""
+
+
+def test_processes_share_programs_with_lapack_and_several_devices_in_them(tmp_path):
+    """Two at once compile and write; the third loads, though LAPACK was never asked for before in it.
+
+    What the compile cache gives back could not be written again: it must be compiled anew for that.
+    """
+
+    def run(which):
+        call = [sys.executable, "-c", _SCRIPT, str(tmp_path), which]
+        environment = dict(os.environ, PYTHONPATH=str(ROOT))
+        done = subprocess.run(call, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+        return int(done.stdout)
+
+    with ThreadPoolExecutor(2) as both:
+        assert 1 in both.map(run, ["first", "first"])
+    assert run("last") == 0
+    assert len(list((tmp_path / "programs").iterdir())) == 1
