@@ -295,9 +295,9 @@ class Found(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def at(parts: Parts, left: Float[Array, " times"], run: linear.Nominal | None = None) -> Found:
+def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None = None) -> Found:
     """Margins of sampled parts at these times to go [s], (times,), and in hold."""
-    run = linear.nominal_jit(parts) if run is None else run
+    run: linear.Nominal = linear.nominal_jit(parts) if known is None else known
     indices = np.asarray(_moments(parts, run, left))
     loops = linear.opened_at_jit(parts, run, jnp.asarray(indices))
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.listed[0])

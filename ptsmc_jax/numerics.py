@@ -1,6 +1,6 @@
 """Numerical pieces that the equations are written with: smooth sign, guarded norm, phi functions, integrators."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from math import factorial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -40,7 +40,7 @@ def pytree(cls: _Class) -> _Class:
         children, fixed = flatten(x)
         return tuple(zip(keys, children, strict=True)), fixed
 
-    def unflatten(fixed: tuple, children: tuple) -> Any:
+    def unflatten(fixed: tuple, children: Iterable) -> Any:
         return cls(**dict(zip(names, children, strict=True)), **dict(zip(static, fixed, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)

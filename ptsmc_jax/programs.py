@@ -7,11 +7,11 @@ cut short among them, falls back to compiling.
 
 import functools
 import hashlib
-import importlib
 import inspect
 import os
 import pickle
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
+import jaxlib.version
 import numpy as np
 import scipy
+from jax.core import Tracer
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
@@ -123,7 +124,7 @@ def jit(
 
 def _shape(leaf: Any) -> tuple:
     """What of an array a program is compiled for."""
-    if isinstance(leaf, jax.core.Tracer):
+    if isinstance(leaf, Tracer):
         raise _UnknownError
     if isinstance(leaf, jax.Array):
         if leaf.devices() != {jax.local_devices()[0]}:
@@ -171,7 +172,7 @@ def _code(package: str) -> str:
     """Digest of a package's files, and of the library's."""
     digest = hashlib.sha256()
     for name in sorted({package, OURS[0]}):
-        folder = Path(str(importlib.import_module(name).__file__)).parent
+        folder = Path(str(sys.modules[name].__file__)).parent
         for path in sorted(folder.rglob("*.py")):
             digest.update(f"{path.relative_to(folder)} {path.stat().st_size}".encode())
             digest.update(path.read_bytes())
@@ -185,7 +186,7 @@ _ELSEWHERE = ("cache", "log", "dump", "profil", "traceback", "compil", "distribu
 def _surroundings() -> tuple:
     """What else a program hangs on; the cache's folder is one processor's own."""
     settings = {k: repr(v) for k, v in jax.config.values.items() if not any(word in k for word in _ELSEWHERE)}
-    versions = jax.__version__, jaxlib.__version__, np.__version__, scipy.__version__
+    versions = jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__
     devices = [f"{d.platform} {d.device_kind} {d.id}" for d in jax.local_devices()]
     return versions, devices, os.environ.get("XLA_FLAGS", ""), sorted(settings.items())
 
