@@ -195,7 +195,7 @@ class _Linear(NamedTuple):
 
 
 # runs for milliseconds: what the compiler saves by optimising is less than what that takes
-@programs.jit(compiler_options={"xla_backend_optimization_level": 0})
+@programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
     actuators = Actuators() if parts.actuators is None else parts.actuators

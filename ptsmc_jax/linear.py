@@ -242,11 +242,7 @@ def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
     return Opened(loop, error, s_command, s_direct)
 
 
-# run for a moment: what the compiler saves by optimising is less than what that takes
-_quickly = partial(programs.jit, compiler_options={"xla_backend_optimization_level": 0})
-
-
-@_quickly
+@programs.jit(compiler_options=programs.QUICKLY)
 def opened_all(parts: Parts, run: Nominal) -> Opened:
     """The loop opened in every control period of the nominal run: arrays over them first."""
     return jax.vmap(partial(opened, parts, run))(jnp.arange(run.command.shape[0]))
@@ -263,7 +259,7 @@ def opened_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
     return jax.tree.map(lambda v: jnp.mean(v.reshape(*several.shape, *v.shape[1:]), axis=1), loops)
 
 
-opened_at_jit = _quickly(opened_at)
+opened_at_jit = programs.jit(opened_at, compiler_options=programs.QUICKLY)
 
 
 def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:

@@ -311,7 +311,7 @@ def judged(parts: Parts) -> tuple[Margins, Array]:
     return of_each(linear.opened_at(parts, run, indices)), run.listed[0].hold[indices]
 
 
-judged_jit = programs.jit(judged)
+judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 
 
 def along(parts: Parts, times: int = 24) -> Course:

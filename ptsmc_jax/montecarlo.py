@@ -131,6 +131,13 @@ def run(
     return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
+def prepare(parts: Parts, dispersion: Dispersion) -> None:
+    """Begin to compile what flies many trials of such parts, beside what is being done."""
+    devices, block = len(jax.local_devices()), abreast()
+    numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
+    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, kernel=False)
+
+
 def _joined(v: np.ndarray, share: int) -> np.ndarray:
     """The trials that count of (devices, rows, block, ...)."""
     flat = v.reshape(v.shape[0], -1, *v.shape[3:])[:, :share]

@@ -10,10 +10,12 @@ import hashlib
 import inspect
 import os
 import pickle
+import secrets
 import stat
 import sys
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -25,11 +27,11 @@ import numpy as np
 import scipy
 from jax.core import Tracer
 from jax.experimental import serialize_executable
-from jax.experimental.compilation_cache import compilation_cache
 
 from ptsmc_jax import configure
 
 KEPT = 400  # programs; those not used for longest make room
+QUICKLY = {"xla_backend_optimization_level": 0}  # for what runs for a moment: optimising would take longer
 OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files
 PLAIN = (int, float, str, bool, bytes, type(None))
 
@@ -46,15 +48,44 @@ class Program:
         self._function, self._static, self._options = function, static, options
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self._signature = inspect.signature(function)
-        self._ready: dict[Any, Callable] = {}
+        self._ready: dict[Any, Any] = {}  # programs, or futures of them
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._jitted, name)  # lower, trace, clear_cache
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """As the jitted function."""
-        if configure.programs is None:
+        known = self._known(args, kwargs)
+        if known is None:
             return self._jitted(*args, **kwargs)
+        key, given = known
+        ready = self._ready.get(key)
+        if ready is None:
+            found = self._loaded(key, given)
+            if found is not None:
+                try:
+                    result = jax.block_until_ready(found(given))
+                except Exception:  # it was whole, and yet does not run here
+                    self._path(key).unlink(missing_ok=True)
+                else:
+                    self._ready[key] = found
+                    return result
+            ready = self._ready[key] = self._compiled(key, given)
+        elif isinstance(ready, Future):
+            ready = self._ready[key] = ready.result()
+        return ready(given)
+
+    def prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Begin to compile what such a call will need, beside what is being done; nothing where nothing is kept."""
+        known = self._known(args, kwargs)
+        if known is None or known[0] in self._ready or self._path(known[0]).exists():
+            return
+        self._ready[known[0]] = _beside().submit(self._compiled, *known)
+
+    def _known(self, args: tuple, kwargs: dict) -> tuple[tuple, dict] | None:
+        """What a program is known by, and the arguments that are not static; None: it cannot be kept."""
+        if configure.programs is None:
+            return None
         bound = self._signature.bind(*args, **kwargs)
         bound.apply_defaults()
         given = {name: v for name, v in bound.arguments.items() if name not in self._static}
@@ -62,45 +93,36 @@ class Program:
         leaves, structure = jax.tree.flatten(given)
         try:
             key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed)
-            ready = self._ready.get(key)
-            said = "" if ready else self._said(key)
+            if key not in self._ready:
+                self._said(key)
         except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
-            return self._jitted(*args, **kwargs)
-        if ready is not None:
-            return ready(given)
-        path = configure.programs / (hashlib.sha256(said.encode()).hexdigest() + ".program")
-        found = _read(path, said, jax.tree.structure(((given,), {})))
-        if found is not None:
-            try:
-                result = jax.block_until_ready(found(given))
-            except Exception:  # it was whole, and yet does not run here
-                path.unlink(missing_ok=True)
-            else:
-                self._ready[key] = found
-                return result
-        self._ready[key] = compiled = self._compiled(given, dict(fixed))
-        _write(path, said, compiled)
-        return compiled(given)
+            return None
+        return key, given
+
+    def _path(self, key: tuple) -> Path:
+        assert configure.programs is not None
+        return configure.programs / (hashlib.sha256(self._said(key).encode()).hexdigest() + ".program")
+
+    def _loaded(self, key: tuple, given: dict) -> Callable | None:
+        return _read(self._path(key), self._said(key), jax.tree.structure(((given,), {})))
 
     def _said(self, key: tuple) -> str:
         """All that the program hangs on, in words that mean the same in every process."""
         structure, shapes, fixed = key
         return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
 
-    def _compiled(self, given: dict, fixed: dict) -> Callable:
+    def _compiled(self, key: tuple, given: dict) -> Callable:
+        fixed = dict(key[2])
+
         def function(given: dict) -> Any:
             return self._function(**given, **fixed)
 
-        function.__name__ = self._function.__name__
-        lowered = jax.jit(function, compiler_options=self._options).lower(given)
-        # what the compile cache gives back cannot be written again: a loaded copy would lack its functions
-        jax.config.update("jax_enable_compilation_cache", False)
-        compilation_cache.reset_cache()
-        try:
-            return lowered.compile()
-        finally:
-            jax.config.update("jax_enable_compilation_cache", True)
-            compilation_cache.reset_cache()
+        # a name that the compile cache does not know: what it gives back cannot be written again, its copy would lack
+        # its functions
+        function.__name__ = f"{self._function.__name__}_{secrets.token_hex(4)}"
+        compiled = jax.jit(function, compiler_options=self._options).lower(given).compile()
+        _write(self._path(key), self._said(key), compiled)
+        return compiled
 
     def _origin(self) -> tuple[str, str, str]:
         package = self._function.__module__.split(".")[0]
@@ -165,6 +187,12 @@ def _plain(value: Any) -> Any:
     if is_dataclass(value):
         return where, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
     raise _UnknownError
+
+
+@functools.cache
+def _beside() -> ThreadPoolExecutor:
+    """Threads that compile beside the one that goes on."""
+    return ThreadPoolExecutor(max(1, len(jax.local_devices()) - 1), "compiling")
 
 
 @functools.cache

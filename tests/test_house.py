@@ -56,7 +56,7 @@ FLOORS = {
         slips
     """,
     "tuning": """
-        gains own_parts
+        gains own_parts abreast
         bounds design journal
         margin_rows
         objective

@@ -394,7 +394,7 @@ def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
         best, kept = descent.Best(first, 0, 0.0), []
         for steps in parts_of_it:
             kept.clear()
-            descent.descend(evaluate, problem(), best, first, steps, kept.append, seen=seen)
+            descent.descend(evaluate.slopes, problem(), best, first, steps, kept.append, seen=seen)
         ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
         counts.append(evaluate.gradients)
     assert ends[0] == ends[1]
@@ -439,7 +439,7 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     for steps, near in ((3, 1.0), (40, 1e-4)):
         evaluate, best, path = Bowl(limits), descent.Best(np.array([0.9, 0.1]), 0, 0.0), []
-        descent.descend(evaluate, problem(), best, np.array([0.9, 0.1]), steps, path.append, close=1e-12)
+        descent.descend(evaluate.slopes, problem(), best, np.array([0.9, 0.1]), steps, path.append, close=1e-12)
         assert evaluate.gradients <= steps
         assert best.f < near
         assert len(path) <= evaluate.gradients

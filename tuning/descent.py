@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import minimize
 
-from tuning.evaluate import Evaluator, Measured, Sloped
+from tuning.evaluate import Measured, Sloped
 from tuning.objective import Problem, ended, failures
 
 SLACK = 1e-4  # of a limit that an admissible point may use
@@ -54,7 +54,7 @@ class _EnoughError(Exception):
 
 
 def descend(
-    evaluate: Evaluator,
+    slopes: Callable[[Problem, np.ndarray], Sloped],
     problem: Problem,
     best: Best,
     share: np.ndarray,
@@ -71,7 +71,7 @@ def descend(
     At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
     slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the
     descent goes through, without those that it only tries. seen: the points that a shorter descent from here looked at,
-    which are not flown again: a longer one goes on where it stopped.
+    which are not flown again: a longer one goes on where it stopped. slopes: measures a problem at a point (1, gains).
     """
     seen = {} if seen is None else seen
 
@@ -80,7 +80,7 @@ def descend(
         if key not in seen:
             if len(seen) == steps:
                 raise _EnoughError
-            seen[key] = evaluate.slopes(problem, point)
+            seen[key] = slopes(problem, point)
         if seen[key].finite[0]:
             best.offer(point, seen[key])
         return seen[key]

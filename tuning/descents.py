@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.clock import Anchored
+from tuning.abreast import Ask, in_step
 from tuning.bounds import TIMES
 from tuning.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.evaluate import Evaluator, Measured, Sloped
@@ -121,6 +123,10 @@ class Descents:
         """In the order of the starts, and of each start's steps."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
+    def prepare(self, problem: Problem) -> None:
+        """Begin to compile what a search will need later, beside its first steps."""
+        self._evaluate.prepare(_few_trials(problem), problem)
+
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
         """From the scenario's own gains, (gains,), on a few trials."""
         self._own = self._evaluate.bounds.share(own)
@@ -164,15 +170,48 @@ class Descents:
         ranked, seen = list(starts), {k: dict[bytes, Sloped]() for k in starts}
         before = {k: list(self._history.get(k, ())) for k in starts}
         for count, steps in rungs:
-            for done, k in enumerate(ranked[:count]):
-                self._report(what, done, count, *self.best_so_far)
-                self._history[k] = list(before[k])  # it goes through the same points again, and on
-                scale = scales[k % len(scales)]
-                self._descend(problem, starts[k], k, steps, scale=scale, seen=seen[k], afresh=afresh)
-                afresh = False
+            # they go through the same points again, and on
+            self._history |= {k: list(before[k]) for k in ranked[:count]}
+            some = {k: (starts[k], scales[k % len(scales)], seen[k]) for k in ranked[:count]}
+            self._descend_abreast(problem, some, steps, what, afresh=afresh)
+            afresh = False
             known = [k for k in ranked if k in self._ends]
             ranked = sorted(known, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
         return ranked
+
+    def _descend_abreast(
+        self,
+        problem: Problem,
+        starts: Mapping[int, tuple[np.ndarray, float, dict[bytes, Sloped]]],
+        steps: int,
+        what: str,
+        *,
+        afresh: bool,
+    ) -> None:
+        """From each start's share, with its scale and what it has seen; as many at a time as there are devices."""
+        tightened, width = self.tightened(problem), len(jax.local_devices())
+        bests = {k: Best(share, len(problem.rows), self._margin) for k, (share, *_) in starts.items()}
+        begun = set[int]()
+
+        def from_start(k: int, ask: Ask) -> None:
+            begun.add(k)
+            (share, scale, seen), keep = starts[k], partial(self._keep, k)
+            descend(lambda _, point: ask(point), tightened, bests[k], share, steps, keep, scale=scale, seen=seen)
+
+        def flown(points: list[np.ndarray]) -> list[Sloped]:
+            known = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
+            best = min(known, key=lambda best: best.rank)
+            self._report(what, max(0, len(begun) - width), len(starts), best.value, best.over)
+            found = self._evaluate.slopes(tightened, np.concatenate(points))
+            return [found.at(k) for k in range(len(points))]
+
+        try:
+            in_step([partial(from_start, k) for k in starts], flown, width)
+        finally:  # interrupted too
+            for k in starts:
+                if k in begun:
+                    self._take(bests[k], tightened, k, afresh=afresh)
+                    afresh = False
 
     def again(self, problem: Problem) -> None:
         """On from where the best starts ended, with what has joined the problem."""
@@ -273,14 +312,12 @@ class Descents:
         close: float = CLOSE,
         fixed: Sequence[int] = (),
         afresh: bool = False,
-        seen: dict[bytes, Sloped] | None = None,
     ) -> None:
         best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
         keep = partial(self._keep, start)
         try:
-            descend(
-                self._evaluate, tightened, best, share, steps, keep, close=close, scale=scale, fixed=fixed, seen=seen
-            )
+            slopes = self._evaluate.slopes
+            descend(slopes, tightened, best, share, steps, keep, close=close, scale=scale, fixed=fixed)
         finally:  # interrupted too
             self._take(best, tightened, start, afresh=afresh)
 

@@ -1,6 +1,7 @@
 """Evaluates tuning problems at many gains: compiled once for each problem's shape, shared over devices, journaled."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import jax
 import numpy as np
@@ -28,10 +29,9 @@ class Measured:
         """(points,) largest c over the trials that end; -1 without a requirement."""
         return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
-    def at(self, point: int) -> "Measured":
+    def at(self, point: int) -> Self:
         """One of the points."""
-        one = slice(point, point + 1)
-        return Measured(self.gains[one], self.f[one], self.c[one], self.value[one])
+        return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,13 @@ class Evaluator:
         most = len(jax.local_devices())
         asked = _question(b"slopes", problem, share)
         return Sloped(**self._journal.get(asked, lambda: self._measured(_slopes, problem, share, most)))
+
+    def prepare(self, swept: Problem, *sloped: Problem) -> None:
+        """Begin to compile what flies one problem without slopes and others with them, beside what is being done."""
+        devices, gains = len(jax.local_devices()), len(self.bounds.names)
+        for compiled, problem, size in [(_fly, swept, FLOWN), *((_slopes, one, devices) for one in sloped)]:
+            shared = max(d for d in range(1, devices + 1) if size % d == 0)
+            compiled.prepare(replace(problem, margins=None), self.bounds, np.zeros((size, gains)), shared)
 
     def _measured(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
         found = self._in_calls(compiled, replace(problem, margins=None), share, size)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax import montecarlo
 from ptsmc_jax.requirements import Requirement
 from tuning import confirm, margin_rows
 from tuning import worst as worst_case
@@ -99,6 +100,9 @@ def search(
 
     try:
         if sloped:
+            if sure:
+                montecarlo.prepare(problem.parts, problem.dispersion)
+            run.prepare(problem)
             run.set_out(problem, own)
         else:
             run.sweep(problem, own)

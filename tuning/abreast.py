@@ -1,0 +1,82 @@
+"""Several works side by side, each in a thread of its own, whose questions are answered together."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+Ask = Callable[[Any], Any]
+
+
+class _Task:
+    """A work in its thread, and what it asks."""
+
+    def __init__(self, work: Callable[[Ask], None], turn: threading.Condition):
+        self._work, self._turn = work, turn
+        self.question: Any = None
+        self.waits = self.ended = False
+        self.error: BaseException | None = None
+        self._answer: Any = None
+
+    def start(self) -> None:
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            self._work(self._ask)
+        except BaseException as error:
+            self.error = error
+        with self._turn:
+            self.ended = True
+            self._turn.notify_all()
+
+    def _ask(self, question: Any) -> Any:
+        with self._turn:
+            self.question, self.waits = question, True
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: not self.waits)
+        if isinstance(self._answer, BaseException):
+            raise self._answer
+        return self._answer
+
+    def tell(self, answer: Any) -> None:
+        """Answer the question; an exception is raised where it was asked."""
+        self._answer, self.waits = answer, False
+
+
+def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int) -> None:
+    """Do all of the works, `width` at a time; each asks one question after the other by what it is called with.
+
+    answer: gets the questions of all that are at work, in the works' order, once each of them waits or has ended; it is
+    called in this thread. What a work raises is raised here, and what `answer` raises, an interrupt among it, in the
+    works that wait for it first: when this returns, or raises, none is at work any more.
+    """
+    turn = threading.Condition()
+    waiting, active, raised = [_Task(work, turn) for work in works], list[_Task](), None
+
+    def all_stopped() -> bool:
+        return all(task.waits or task.ended for task in active)
+
+    with turn:
+        while True:
+            raised = raised or next((task.error for task in active if task.error is not None), None)
+            active[:] = [task for task in active if not task.ended]
+            while waiting and raised is None and len(active) < width:
+                active.append(waiting.pop(0))
+                active[-1].start()
+            if not active:
+                break
+            try:
+                turn.wait_for(all_stopped)
+                if raised is not None:
+                    raise raised
+                if not any(task.ended for task in active):  # else another may begin, and ask with these
+                    for task, told in zip(active, answer([task.question for task in active]), strict=True):
+                        task.tell(told)
+            except BaseException as error:
+                raised = error
+                for task in active:
+                    if task.waits:
+                        task.tell(raised)
+            turn.notify_all()
+    if raised is not None:
+        raise raised
