@@ -1,5 +1,6 @@
 """Strictness for the tests alone: 64 bit, two host devices, no silent rank promotion, shapes checked at run time."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
 
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()  # most programs of tests fly once
 configure(devices=2)
 
 import jax  # noqa: E402

@@ -1,7 +1,7 @@
 """Evaluates tuning problems at many gains: compiled once for each problem's shape, shared over devices, journaled."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -13,6 +13,9 @@ from tuning.journal import Journal
 from tuning.objective import Problem, ended, measure
 
 FLOWN = 16  # points without slopes in one call of the compiled program
+
+
+M = TypeVar("M", bound="Measured")
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Measured:
         """(points,) largest c over the trials that end; -1 without a requirement."""
         return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
-    def at(self, point: int) -> Self:
+    def at(self: M, point: int) -> M:
         """One of the points."""
         return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})
 
