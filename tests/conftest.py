@@ -9,7 +9,8 @@ from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
 
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()  # most programs of tests fly once
+# most programs of tests fly once: what optimising saves is less than what it takes
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 configure(devices=2)
 
 import jax  # noqa: E402
