@@ -5,7 +5,7 @@ What a trial is does not depend on the parts, so that shards, clusters and inter
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -130,9 +130,8 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
     together = max(1, montecarlo.abreast() * len(jax.local_devices()) // PART)
     writing: deque[tuple[Any, int]] = deque()
     with ThreadPoolExecutor(1) as writer:
-        for k in range(0, len(wanted), together):
-            group = wanted[k : k + together]
-            made, begin = make(np.concatenate([np.arange(first, first + count) for first, count in group])), 0
+        for group, made in _made(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
+            begin = 0
             for first, count in group:
                 frame, begin = made.slice(begin, count), begin + count
                 bad = failures(frame) if "status" in frame.columns else 0
@@ -142,6 +141,28 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
                 yield done.result(), bad
         for done, bad in writing:
             yield done.result(), bad
+
+
+def _made(
+    make: Callable[[np.ndarray], pl.DataFrame], groups: Sequence[list[Wanted]]
+) -> Iterator[tuple[list[Wanted], pl.DataFrame]]:
+    """The rows of each group of parts, in order; two at a time, so that one is flown while rows are made of another."""
+
+    def of(group: list[Wanted]) -> pl.DataFrame:
+        return make(np.concatenate([np.arange(first, first + count) for first, count in group]))
+
+    flying: deque[tuple[list[Wanted], Future]] = deque()
+    with ThreadPoolExecutor(2) as makers:
+        for k, group in enumerate(groups):
+            if k == 0:
+                yield group, of(group)  # alone: it compiles
+                continue
+            flying.append((group, makers.submit(of, group)))
+            if len(flying) == 2:
+                first, made = flying.popleft()
+                yield first, made.result()
+        for group, made in flying:
+            yield group, made.result()
 
 
 def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:

@@ -84,6 +84,19 @@ def test_search_finds_the_last_crossing(power):
     )
 
 
+def test_a_guess_that_is_the_last_one_does_not_keep_the_search_where_it_is():
+    """Peaks like 1 / t^2: the second guess keeps the limit by 0.02 %, and the step from it led back to itself."""
+    asked = []
+
+    def peak(t):
+        asked.append(t)
+        return (30.0 / t) ** 2
+
+    found = design._smallest(peak, 1.0, 31.0, 1.0, 1e3, 1e-3, 60)
+    assert found == pytest.approx(30.0, rel=1e-3)
+    assert len(asked) == len(set(asked)) < 20
+
+
 def test_only_t_f_and_what_follows_it_is_changed():
     parts = scenario.study(scenario.from_tables(FLOWN)).parts
     moved = with_gains(parts, {"t_f": 15.0})

@@ -107,5 +107,6 @@ def _smallest(peak, limit: float, start: float, lowest: float, longest: float, c
             guess = min(max(step, 1.001 * over) * (1 + 0.2 * close), longest)
         else:
             inside = over + 0.02 * (kept - over), kept - 0.02 * (kept - over)
-            guess = step * (1 + 0.2 * close) if inside[0] < step < inside[1] else 0.5 * (over + kept)
+            step *= 1 + 0.2 * close
+            guess = step if inside[0] < step < inside[1] else 0.5 * (over + kept)
     return kept
