@@ -86,8 +86,7 @@ class Program:
         """What a program is known by, and the arguments that are not static; None: it cannot be kept."""
         if configure.programs is None:
             return None
-        bound = self._signature.bind(*args, **kwargs)
-        bound.apply_defaults()
+        bound = self._signature.bind(*args, **kwargs)  # without defaults: they are constants of the function
         given = {name: v for name, v in bound.arguments.items() if name not in self._static}
         fixed = tuple((name, v) for name, v in bound.arguments.items() if name in self._static)
         leaves, structure = jax.tree.flatten(given)

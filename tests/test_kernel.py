@@ -81,18 +81,19 @@ def test_interpreted_it_is_the_scan(tables):
 
 
 def test_slopes_taken_inside_are_those_of_the_scan():
-    agree(derivative(CHAIN), 1e-12)
+    """Rounding, which each compiler's order of operations makes another: the slopes are ten times the values."""
+    agree(derivative(CHAIN), 1e-11)
 
 
 def test_in_single_precision_it_is_the_scan_of_single_precision():
-    """To 1e-6 of what is rounded, states of 5 and the largest input; errors are small differences of these."""
+    """To 2e-6, 16 units, of what is rounded, states of 5 and the largest input; errors are small differences."""
     with jax.enable_x64(False):
         got, wanted = (flown.metrics._asdict() for flown in both(primal(CHAIN)))
     peak = float(wanted["peak_torque"].max())
     for name in metrics.STATE_CATALOGUE:
         assert got[name].dtype == jnp.float32
         size = peak if name in ("peak_torque", "peak_torque_delivered", "effort", "chattering") else 5.0
-        np.testing.assert_allclose(got[name], wanted[name], rtol=0.0, atol=1e-6 * size, err_msg=name)
+        np.testing.assert_allclose(got[name], wanted[name], rtol=0.0, atol=2e-6 * size, err_msg=name)
 
 
 @pytest.mark.parametrize("bits", [32, 64])

@@ -26,9 +26,9 @@ def spied(name="spied", factor=2.0):
     """A program that counts how often it is traced, as if it stood at the top of one of our files."""
     traced = []
 
-    def function(x, y=1.0, kind="plain"):
+    def function(x, y=1.0, kind="plain", points=2):
         traced.append(kind)
-        return {"both": jnp.sin(factor * x) + y * len(kind)}
+        return {"both": jnp.sin(factor * x) + y * len(kind), "grid": jnp.linspace(0.0, 1.0, points)}
 
     function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.attitude", name, name
     return programs.jit(function, static_argnames="kind"), traced
