@@ -72,10 +72,10 @@ class Evaluator:
         asked = _question(b"slopes", problem, share)
         return Sloped(**self._journal.get(asked, lambda: self._measured(_slopes, problem, share, most)))
 
-    def prepare(self, swept: Problem, *sloped: Problem) -> None:
-        """Begin to compile what flies one problem without slopes and others with them, beside what is being done."""
+    def prepare(self, few: Problem, whole: Problem) -> None:
+        """Begin to compile what a search needs after its first steps, in that order, beside what is being done."""
         devices, gains = len(jax.local_devices()), len(self.bounds.names)
-        for compiled, problem, size in [(_fly, swept, FLOWN), *((_slopes, one, devices) for one in sloped)]:
+        for compiled, problem, size in ((_fly, few, FLOWN), (_slopes, whole, devices), (_fly, whole, FLOWN)):
             shared = max(d for d in range(1, devices + 1) if size % d == 0)
             compiled.prepare(replace(problem, margins=None), self.bounds, np.zeros((size, gains)), shared)
 

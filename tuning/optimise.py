@@ -4,7 +4,7 @@ A small sweep chooses the starts, and sequential quadratic programming on the sl
 on from each of them. Gains flown with the exact sign have no slopes: they are looked for by evolution instead.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
@@ -71,6 +71,7 @@ def search(
     robust: bool = False,
     judged: bool = True,
     report: Report = lambda *told: None,
+    prepare: Callable[[], None] = lambda: None,
 ) -> Search:
     """Minimise F with every requirement met on the training trials.
 
@@ -79,7 +80,8 @@ def search(
     not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
     on others after each search: where more of them break it than may, the hardest of the rest join. own:
     (gains,) the scenario's gains, the first start. steps: points that may be looked at from each start. sloped: F has
-    slopes to go by. judged: say how hard the worst case is. report is called after every step. Interrupted, it returns
+    slopes to go by. judged: say how hard the worst case is. report is called after every step; prepare once the search's own programs are
+    being compiled, for what comes after it. Interrupted, it returns
     the best so far once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
@@ -103,6 +105,7 @@ def search(
             if sure:
                 montecarlo.prepare(problem.parts, problem.dispersion)
             run.prepare(problem)
+            prepare()
             run.set_out(problem, own)
         else:
             run.sweep(problem, own)

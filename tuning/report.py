@@ -3,11 +3,12 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ptsmc_jax import draws, margin_verdicts, montecarlo, runs, tables
+from ptsmc_jax import draws, margin_verdicts, margins, montecarlo, runs, tables
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.pace import Reach, reach_of
@@ -107,6 +108,7 @@ def tune(
         sloped=posed.sloped,
         robust=table.worst_case,
         report=report,
+        prepare=partial(_prepare, scenario),
     )
     seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
     check = None
@@ -163,6 +165,14 @@ def tune(
         gradients=gradients,
         seconds=seconds,
     )
+
+
+def _prepare(scenario: Scenario) -> None:
+    """Begin to compile what judges a scenario's gains."""
+    flown = study(as_flown(scenario))
+    montecarlo.prepare(flown.parts, flown.dispersion)
+    if scenario.loop.mode == "sampled":
+        margins.judged_jit.prepare(flown.parts)
 
 
 @dataclass(frozen=True)
