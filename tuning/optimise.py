@@ -80,9 +80,9 @@ def search(
     not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
     on others after each search: where more of them break it than may, the hardest of the rest join. own:
     (gains,) the scenario's gains, the first start. steps: points that may be looked at from each start. sloped: F has
-    slopes to go by. judged: say how hard the worst case is. report is called after every step; prepare once the search's own programs are
-    being compiled, for what comes after it. Interrupted, it returns
-    the best so far once there is one.
+    slopes to go by. judged: say how hard the worst case is. report is called after every step; prepare once the
+    search's own programs are being compiled, for those of what comes after it. Interrupted, it returns the best so far
+    once there is one.
     """
     sure = [r for r in requirements if r.quantile is None] if problem.dispersion.varies else []
     shares = [r for r in requirements if r.quantile is not None] if problem.trials.size > 1 else []
