@@ -194,6 +194,12 @@ def _beside() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, len(jax.local_devices()) - 1), "compiling")
 
 
+def stop() -> None:
+    """Compile nothing more beside: what has not begun is not needed any more."""
+    if _beside.cache_info().currsize:
+        _beside().shutdown(wait=False, cancel_futures=True)
+
+
 @functools.cache
 def _code(package: str) -> str:
     """Digest of a package's files, and of the library's."""

@@ -325,6 +325,9 @@ def main() -> None:
         sys.exit(INTERRUPTED)
     except OSError as error:
         _fail(f"{error.strerror or error}: {error.filename}")
+    finally:
+        if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
+            programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
 
 
