@@ -194,7 +194,6 @@ class _Linear(NamedTuple):
     seen_push: Array  # (periods, 3 m, m)
 
 
-# runs for milliseconds: what the compiler saves by optimising is less than what that takes
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""

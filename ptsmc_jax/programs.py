@@ -58,19 +58,19 @@ class Program:
         known = self._known(args, kwargs)
         if known is None:
             return self._jitted(*args, **kwargs)
-        key, given = known
+        key, said, given = known
         ready = self._ready.get(key)
         if ready is None:
-            found = self._loaded(key, given)
+            found = _read(_path(said), said, jax.tree.structure(((given,), {})))
             if found is not None:
                 try:
                     result = jax.block_until_ready(found(given))
                 except Exception:  # it was whole, and yet does not run here
-                    self._path(key).unlink(missing_ok=True)
+                    _path(said).unlink(missing_ok=True)
                 else:
                     self._ready[key] = found
                     return result
-            ready = self._ready[key] = self._compiled(key, given)
+            ready = self._ready[key] = self._compiled(key, said, given)
         elif isinstance(ready, Future):
             ready = self._ready[key] = ready.result()
         return ready(given)
@@ -78,12 +78,15 @@ class Program:
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Begin to compile what such a call will need, beside what is being done; nothing where nothing is kept."""
         known = self._known(args, kwargs)
-        if known is None or known[0] in self._ready or self._path(known[0]).exists():
+        if known is None or known[0] in self._ready or _path(known[1]).exists():
             return
         self._ready[known[0]] = _beside().submit(self._compiled, *known)
 
-    def _known(self, args: tuple, kwargs: dict) -> tuple[tuple, dict] | None:
-        """What a program is known by, and the arguments that are not static; None: it cannot be kept."""
+    def _known(self, args: tuple, kwargs: dict) -> tuple[tuple, str, dict] | None:
+        """What a program is known by here, in words too until it is ready, and the arguments that are not static.
+
+        None: it cannot be kept.
+        """
         if configure.programs is None:
             return None
         bound = self._signature.bind(*args, **kwargs)  # without defaults: they are constants of the function
@@ -92,25 +95,17 @@ class Program:
         leaves, structure = jax.tree.flatten(given)
         try:
             key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed)
-            if key not in self._ready:
-                self._said(key)
+            said = "" if key in self._ready else self._said(key)
         except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
             return None
-        return key, given
-
-    def _path(self, key: tuple) -> Path:
-        assert configure.programs is not None
-        return configure.programs / (hashlib.sha256(self._said(key).encode()).hexdigest() + ".program")
-
-    def _loaded(self, key: tuple, given: dict) -> Callable | None:
-        return _read(self._path(key), self._said(key), jax.tree.structure(((given,), {})))
+        return key, said, given
 
     def _said(self, key: tuple) -> str:
         """All that the program hangs on, in words that mean the same in every process."""
         structure, shapes, fixed = key
         return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
 
-    def _compiled(self, key: tuple, given: dict) -> Callable:
+    def _compiled(self, key: tuple, said: str, given: dict) -> Callable:
         fixed = dict(key[2])
 
         def function(given: dict) -> Any:
@@ -120,7 +115,7 @@ class Program:
         # its functions
         function.__name__ = f"{self._function.__name__}_{secrets.token_hex(4)}"
         compiled = jax.jit(function, compiler_options=self._options).lower(given).compile()
-        _write(self._path(key), self._said(key), compiled)
+        _write(_path(said), said, compiled)
         return compiled
 
     def _origin(self) -> tuple[str, str, str]:
@@ -222,6 +217,11 @@ def _surroundings() -> tuple:
     versions = jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__
     devices = [f"{d.platform} {d.device_kind} {d.id}" for d in jax.local_devices()]
     return versions, devices, os.environ.get("XLA_FLAGS", ""), sorted(settings.items())
+
+
+def _path(said: str) -> Path:
+    assert configure.programs is not None
+    return configure.programs / (hashlib.sha256(said.encode()).hexdigest() + ".program")
 
 
 def _read(path: Path, said: str, inside: Any) -> Callable | None:

@@ -44,6 +44,16 @@ class Step:
     worst: np.ndarray  # (requirements,) largest metric / limit, `FAILED` where a trial fails
 
 
+@dataclass(frozen=True)
+class _Start:
+    """Where a descent begins, or goes on."""
+
+    share: np.ndarray  # (gains,)
+    scale: float
+    seen: dict[bytes, Sloped]  # points that it looked at before
+    before: list[Step]  # of its history, those of earlier descents
+
+
 def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple[dict, dict]:
     """What each step of a search flies at most, in rollouts, and each of a further round; see `Work`."""
     trials = float(problem.trials.size)
@@ -170,9 +180,7 @@ class Descents:
         ranked, seen = list(starts), {k: dict[bytes, Sloped]() for k in starts}
         before = {k: list(self._history.get(k, ())) for k in starts}
         for count, steps in rungs:
-            # they go through the same points again, and on
-            self._history |= {k: list(before[k]) for k in ranked[:count]}
-            some = {k: (starts[k], scales[k % len(scales)], seen[k]) for k in ranked[:count]}
+            some = {k: _Start(starts[k], scales[k % len(scales)], seen[k], before[k]) for k in ranked[:count]}
             self._descend_abreast(problem, some, steps, what, afresh=afresh)
             afresh = False
             known = [k for k in ranked if k in self._ends]
@@ -182,34 +190,42 @@ class Descents:
     def _descend_abreast(
         self,
         problem: Problem,
-        starts: Mapping[int, tuple[np.ndarray, float, dict[bytes, Sloped]]],
+        starts: Mapping[int, _Start],
         steps: int,
         what: str,
         *,
         afresh: bool,
     ) -> None:
-        """From each start's share, with its scale and what it has seen; as many at a time as there are devices."""
-        tightened, width = self.tightened(problem), len(jax.local_devices())
-        bests = {k: Best(share, len(problem.rows), self._margin) for k, (share, *_) in starts.items()}
-        begun = set[int]()
+        """From each of these starts; as many at a time as there are devices."""
+        tightened, bests, told = self.tightened(problem), dict[int, Best](), 0
 
         def from_start(k: int, ask: Ask) -> None:
-            begun.add(k)
-            (share, scale, seen), keep = starts[k], partial(self._keep, k)
-            descend(lambda _, point: ask(point), tightened, bests[k], share, steps, keep, scale=scale, seen=seen)
+            one, keep = starts[k], partial(self._keep, k)
+            best = bests[k] = Best(one.share, len(problem.rows), self._margin)
+            self._history[k] = list(one.before)  # it goes through the same points again, and on
+            descend(
+                lambda _, point: ask(point), tightened, best, one.share, steps, keep, scale=one.scale, seen=one.seen
+            )
 
-        def flown(points: list[np.ndarray]) -> list[Sloped]:
+        def tell() -> None:
+            nonlocal told
             known = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
             best = min(known, key=lambda best: best.rank)
-            self._report(what, max(0, len(begun) - width), len(starts), best.value, best.over)
+            while told < len(bests):  # once for each that has begun
+                self._report(what, told, len(starts), best.value, best.over)
+                told += 1
+
+        def flown(points: list[np.ndarray]) -> list[Sloped]:
+            tell()
             found = self._evaluate.slopes(tightened, np.concatenate(points))
             return [found.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(from_start, k) for k in starts], flown, width)
+            in_step([partial(from_start, k) for k in starts], flown, len(jax.local_devices()))
+            tell()
         finally:  # interrupted too
             for k in starts:
-                if k in begun:
+                if k in bests:
                     self._take(bests[k], tightened, k, afresh=afresh)
                     afresh = False
 
