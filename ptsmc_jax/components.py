@@ -58,10 +58,10 @@ class Shared:
 
 def object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
     """An array of anything."""
-    array = np.empty(shape, dtype=object)
-    for index, item in zip(np.ndindex(*shape), items, strict=True):
-        array[index] = item
-    return array
+    flat = np.empty(math.prod(shape), dtype=object)
+    for k, item in zip(range(flat.size), items, strict=True):
+        flat[k] = item
+    return flat.reshape(shape)
 
 
 def entries(array: Any, leading: int = 0) -> np.ndarray:
@@ -114,15 +114,17 @@ def covers(name: str) -> bool:
 
 def _alike(parts: Sequence) -> list:
     """Components spread over the trials if any of them differs from trial to trial."""
-    shape = max((np.shape(part) for part in parts), key=len)
-    return [part if np.shape(part) == shape else lax.broadcast(part, shape) for part in parts]
+    shapes = [np.shape(part) for part in parts]
+    shape = max(shapes, key=len)
+    return [part if own == shape else lax.broadcast(part, shape) for part, own in zip(parts, shapes, strict=True)]
 
 
 def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
     shape = eqn.outvars[0].aval.shape
-    parts = [np.broadcast_to(parts_of(value), shape) for value in values]
+    parts, size = [parts_of(value) for value in values], math.prod(shape)
+    flat = [p.reshape(-1) if p.size == size else np.broadcast_to(p, shape).reshape(-1) for p in parts]
     params = eqn.primitive.get_bind_params(eqn.params)
-    items = (eqn.primitive.bind(*_alike([p[i] for p in parts]), **params) for i in np.ndindex(*shape))
+    items = (eqn.primitive.bind(*_alike(entry), **params) for entry in zip(*flat, strict=True))
     return [Lane(shape, object_array(shape, items))]
 
 

@@ -54,10 +54,10 @@ def _mean_width(width: float, sigma: float) -> float:
 
 def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     """Of z, the commands on their way, the sensor's own states and the random walk's torque, sample by sample."""
-    ticks = jax.tree.map(np.asarray, run.listed[0])
+    ticks = jax.tree.map(np.asarray, run.period.now)
     h = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * h)
-    rows: Any = jax.tree.map(lambda v: np.asarray(v)[lasting], linear.opened_all(parts, run))
+    rows: Any = linear.opened_in(parts, run, lasting)
     loops = rows.loop
     n, m, k = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2]
     none = Reading(np.eye(k), np.zeros(k), np.ones(k, int), np.zeros(0), np.zeros(0))

@@ -14,7 +14,6 @@ disturbance; of a star tracker that is slower than the loop the mean over its in
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,9 +22,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from ptsmc_jax import programs, rollout
+from ptsmc_jax import clock, programs, rollout
 from ptsmc_jax.assembly import Parts
-from ptsmc_jax.clock import Graded
 from ptsmc_jax.computer import Computer, Decision, Period, boot, decide, schedule, told
 from ptsmc_jax.hardware import Actuators, ActuatorState
 from ptsmc_jax.numerics import Leaf, pytree
@@ -68,9 +66,9 @@ class Loop:
 
 
 class Nominal(NamedTuple):
-    """The nominal run: arrays over the control periods first, of what `rollout.schedule` lists and of `Carry`."""
+    """The nominal run: arrays over the control periods first."""
 
-    listed: tuple
+    period: Period
     carry: Carry  # before the period
     after: Carry
     command: Array  # u that arrives in it
@@ -95,7 +93,7 @@ def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
 
 def nominal(parts: Parts) -> Nominal:
     """The nominal run of sampled parts."""
-    assert not isinstance(parts.clock, Graded)
+    assert not isinstance(parts.clock, clock.Graded)
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     listed, about, started = schedule(parts, ticks)
@@ -104,17 +102,16 @@ def nominal(parts: Parts) -> Nominal:
     model = actuators.begin(parts.plant.inputs)
     computer = boot(parts, np.uint32(0), np.uint32(0), x0, started)
 
-    def step(carry: Carry, tick: tuple) -> tuple[Carry, tuple[Carry, Carry, Array]]:
+    def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
         period = about(tick)
         decision, computer, model = _computed(parts, k2, period, carry, carry.x)
         wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
         x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
         after = Carry(x, acting, computer, model)
-        return after, (carry, after, wanted)
+        return after, Nominal(period, carry, after, wanted)
 
     first = Carry(x0, model._replace(queue=None), computer, model)
-    _, found = jax.lax.scan(step, first, listed)
-    return Nominal(listed, *found)
+    return jax.lax.scan(step, first, listed)[1]
 
 
 nominal_jit = programs.jit(nominal)
@@ -211,12 +208,11 @@ class Opened(NamedTuple):
     s_direct: Array  # (components, k) and by x_seen
 
 
-def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
-    """The loop opened in one control period of the nominal run, by its number; see `Loop`, h in [s]."""
+def opened(parts: Parts, during: Nominal) -> Opened:
+    """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock."""
     parts = quiet(parts)
-    listed, before, after, arriving = jax.tree.map(lambda v: v[index], run)
-    _, about, _ = schedule(parts, run.listed[0])
-    period, k2, plant, law = about(listed), parts.observer.error_bound(), parts.plant, parts.controller
+    period, before, after, arriving = during
+    k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
     here, there, now, dt = _Local(parts, before), _Local(parts, after), period.now, period.length
     z0, x0, u0 = jnp.zeros(sum(here.sizes)), jnp.zeros(here.sizes[0]), jnp.zeros(plant.inputs)
     target = parts.reference(now.t)
@@ -242,29 +238,56 @@ def opened(parts: Parts, run: Nominal, index: Array) -> Opened:
     return Opened(loop, error, s_command, s_direct)
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def opened_all(parts: Parts, run: Nominal) -> Opened:
-    """The loop opened in every control period of the nominal run: arrays over them first."""
-    return jax.vmap(partial(opened, parts, run))(jnp.arange(run.command.shape[0]))
+TOGETHER = 32  # periods that one call of the compiled program opens
 
 
-def opened_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
+def opened_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Opened:
+    """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s].
+
+    By one program, however many they are and however many the run has.
+    """
+    parts = replace(parts, clock=clock.flight(1.0, 1.0))
+    run = jax.tree.map(np.asarray, run)
+    calls = []
+    for k in range(0, len(indices), TOGETHER):
+        some = np.resize(indices[k : k + TOGETHER], TOGETHER)
+        calls.append(jax.tree.map(np.asarray, _opened(parts, jax.tree.map(lambda v, some=some: v[some], run))))
+    return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
+
+
+_opened = programs.jit(jax.vmap(opened, (None, 0)), compiler_options=programs.QUICKLY)
+
+
+def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
     """The loops opened in these periods, by their numbers (periods,), arrays over them first, h in [s].
 
     Of a star tracker that is slower than the loop means over its interval.
     """
+    several = _interval(parts, indices)
+    loops = jax.tree.map(jnp.asarray, opened_in(parts, run, several.reshape(-1)).loop)
+    return _means(loops, several.shape)
+
+
+def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
+    """The same `loops_in`, h in [s], of indices (periods,), for any transformation."""
+    several = _interval(parts, indices)
+    loops = jax.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
+    return _means(loops, several.shape)
+
+
+def _interval(parts: Parts, indices: Any) -> Any:
+    """(periods, every): those since the star tracker's sample before."""
     every = getattr(parts.sensors, "every", 1)
-    several = jnp.maximum(indices[:, None] - jnp.arange(every)[None], 0)
-    loops = jax.vmap(lambda index: opened(parts, run, index).loop)(several.reshape(-1))
-    return jax.tree.map(lambda v: jnp.mean(v.reshape(*several.shape, *v.shape[1:]), axis=1), loops)
+    return (indices[:, None] - np.arange(every)[None]).clip(0)
 
 
-opened_at_jit = programs.jit(opened_at, compiler_options=programs.QUICKLY)
+def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
+    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
 def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
-    ticks, period = run.listed[0], parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    ticks, period = run.period.now, parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
     whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
     return np.flatnonzero(whole & (np.asarray(ticks.hold) == hold))
 

@@ -270,7 +270,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
     it is no farther off than at the hand-over.
     """
-    ticks, law = run.listed[0], parts.controller
+    ticks, law = run.period.now, parts.controller
     whole = ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
     off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
@@ -299,8 +299,8 @@ def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None 
     """Margins of sampled parts at these times to go [s], (times,), and in hold."""
     run: linear.Nominal = linear.nominal_jit(parts) if known is None else known
     indices = np.asarray(_moments(parts, run, left))
-    loops = linear.opened_at_jit(parts, run, jnp.asarray(indices))
-    ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.listed[0])
+    loops = linear.loops_in(parts, run, indices)
+    ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
@@ -308,7 +308,7 @@ def judged(parts: Parts) -> tuple[Margins, Array]:
     """Margins where they are judged and in hold, (times + 1, m), and which are in hold; for any transformation."""
     run = linear.nominal(parts)
     indices = moments(parts, run, judged_times(parts))
-    return of_each(linear.opened_at(parts, run, indices)), run.listed[0].hold[indices]
+    return of_each(linear.loops_at(parts, run, indices)), run.period.now.hold[indices]
 
 
 judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
@@ -335,7 +335,7 @@ def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     """
     run = linear.nominal_jit(parts)
     before = linear.whole_periods(parts, run, hold=False)[-1:]
-    left = float(parts.controller.t_f) - np.asarray(run.listed[0].t)[before]
+    left = float(parts.controller.t_f) - np.asarray(run.period.now.t)[before]
     found = at(parts, jnp.asarray(left), run)
     ends = {"hand_over": 0, "hold": -1}
     each = {name: jax.tree.map(lambda v, k=k: v[k], (found.margins, found.loops)) for name, k in ends.items()}

@@ -15,7 +15,7 @@ from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.sensors import Sensors
 
-FEW = 64  # trials; fewer are flown at once, by a program for their number
+FEW = 64  # trials; fewer are flown at once, by a program for so many: a step costs nearly as much for one
 CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
 ABREAST = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
@@ -110,12 +110,12 @@ def run(
     """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
 
     block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
-    any number of trials from `FEW` on. own: see `one`. kernel: whole runs in one kernel, see `kernel`; on a processor
-    it is interpreted, slowly.
+    any number of trials below `FEW`, another any number from there on. own: see `one`. kernel: whole runs in one
+    kernel, see `kernel`; on a processor it is interpreted, slowly.
     """
     trials = np.asarray(trials, dtype=np.uint32)
     devices = len(jax.local_devices())
-    block = -(-trials.size // devices) if trials.size < FEW else abreast() if block is None else block
+    block = -(-FEW // devices) if trials.size < FEW else abreast() if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if trials.size >= FEW else 1
     calls = []
     for k in range(0, trials.size, devices * rows * block):
@@ -162,8 +162,8 @@ def _fly(
 
     def in_blocks(trials: jax.Array) -> Flown:
         flown, row = lanes.vmap(fly), trials[0]
-        rows = jax.eval_shape(flown, trials[0, 0])
-        empty = jax.tree.map(lambda v: jnp.zeros((row.shape[0], *v.shape), v.dtype), rows)
+        # of one trial: to trace the lanes a second time takes longer
+        empty = jax.tree.map(lambda v: jnp.zeros((*row.shape, *v.shape), v.dtype), jax.eval_shape(fly, row[0, 0]))
 
         def step(k: jax.Array, found: Flown) -> Flown:
             return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))

@@ -10,13 +10,14 @@ from jaxtyping import install_import_hook
 from ptsmc_jax.configure import configure
 
 # most programs of tests fly once: what optimising saves is less than what it takes; not so in processes of their own
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
+QUICKLY = " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"  # as in `helpers`
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + QUICKLY
 configure(devices=2)
 
 import jax  # noqa: E402
 
 jax.devices()  # reads the flags
-os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace("--xla_backend_optimization_level=0", "").strip()
+os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 ROOT = Path(__file__).parent.parent
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

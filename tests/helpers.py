@@ -9,12 +9,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import polars as pl
+import pytest
+from hypothesis import given, settings
 from polars.testing import assert_frame_equal
 
 from ptsmc_jax import clock, controllers, observers, plants, sensors, signals
 from ptsmc_jax.rollout import Parts
 
 ROOT = Path(__file__).parent.parent
+# what compiles in half the time and flies at a third of the speed: for programs that fly once
+QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 FIRST_FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 REFERENCE = json.loads((Path(__file__).parent / "spacecraft_continuous.json").read_text())
 
@@ -163,6 +167,18 @@ def finer(run: Parts, times: int) -> Parts:
         grid, before=grid.before * times, after=grid.after * times, max_step=grid.max_step / times
     )
     return dataclasses.replace(run, clock=grid)
+
+
+def short(cases: Any, kept: Any) -> list[Any]:
+    """Cases for `parametrize`, all but those kept marked `long`."""
+    many = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [case if case in kept else pytest.param(*one, marks=pytest.mark.long)
+            for case, one in zip(cases, many, strict=True)]  # fmt: skip
+
+
+def drawn(check: Any, count: int, **cases: Any) -> Any:
+    """A test of `check` on so many drawn cases, the same ones each time."""
+    return settings(max_examples=count, deadline=None, derandomize=True, database=None)(given(**cases)(check))
 
 
 def tree(folder):

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import campaign, montecarlo, rows, runs, scenario
-from tests.helpers import SHORT, same
+from tests.helpers import SHORT, same, short
 
 TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
 
@@ -43,7 +43,10 @@ def test_rows_do_not_depend_on_the_parts(flown, first, count):
     same(made.fly(range(first, first + count)), frame[first : first + count])
 
 
-@pytest.mark.parametrize(("block", "capacity", "devices"), [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)])
+BLOCKS = [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)]
+
+
+@pytest.mark.parametrize(("block", "capacity", "devices"), short(BLOCKS, BLOCKS[2:]))
 def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, capacity, devices):
     made, frame = flown
     monkeypatch.setattr(montecarlo, "CAPACITY", capacity)
@@ -111,7 +114,7 @@ def test_parts_are_written_while_others_are_flown(flown, tmp_path, monkeypatch):
     same(rows.read(kept.parts()[0]), frame)
 
 
-@pytest.mark.parametrize("together", [2, 3, 16])
+@pytest.mark.parametrize("together", short([2, 3, 16], [3]))
 def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, together):
     """As accelerators make them: some of a shard's, which do not follow one another, and the last one is short."""
     made, frame = flown

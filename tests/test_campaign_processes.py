@@ -7,27 +7,26 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
-from tests.helpers import SHORT, same
+from tests.helpers import ROOT, SHORT, same
 
 PTSMC = [sys.executable, "-c", "from tuning.cli import main; main()"]
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
-PARTS, TRIALS = 40, 40 * 4096 - 1000
+PARTS, TRIALS = 8, 8 * 4096 - 1000
 # as long as it takes to be killed in
 SLOW = (
     SHORT.replace("t_f = 5.0", "t_f = 15.0")
     .replace("t_end = 6.5", "t_end = 20.0")
-    .replace("period = 0.1", "period = 0.02")
+    .replace("period = 0.1", "period = 0.05")
 )
 
 
 def environment():
-    return dict(os.environ, PYTHONPATH=str(Path(__file__).parent.parent))
+    return dict(os.environ, PYTHONPATH=str(ROOT))
 
 
 def started(folder, *options, **others):
@@ -78,8 +77,9 @@ def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
     return False
 
 
-def test_killed_at_twenty_moments_it_ends_with_the_same_rows(folder, whole):
-    """kill -9 a random while after the first part that a run adds, then the same command again, 20 times over."""
+@pytest.mark.parametrize("times", [2, pytest.param(20, marks=pytest.mark.long)])
+def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, whole, times):
+    """kill -9 a random while after the first part that a run adds, then the same command again, so many times over."""
     rng, killed = np.random.default_rng(0), 0
     for _ in range(200):
         before = len(parts(folder))
@@ -89,12 +89,12 @@ def test_killed_at_twenty_moments_it_ends_with_the_same_rows(folder, whole):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)
         killed += ended(run)[0] == -signal.SIGKILL
-        if killed == 20:
+        if killed == times:
             break
-        if len(parts(folder)) > PARTS - 5:  # too few left to be killed in: one part is lost for each kill to come
-            for name in parts(folder)[: PARTS - 20]:
+        if len(parts(folder)) > PARTS - 3:  # too few left to be killed in: one part is lost for each kill to come
+            for name in parts(folder)[: PARTS // 2]:
                 (folder / "out/montecarlo-s/trials" / name).unlink()
-    assert killed == 20
+    assert killed == times
     run = started(folder, "--trials", str(TRIALS))
     assert ended(run) == (0, "")
     assert list((folder / "out/montecarlo-s/trials").glob(".making*")) == []
@@ -137,7 +137,7 @@ def test_on_a_full_disk_it_stops_with_a_sentence_and_goes_on_later(folder, whole
 
 @pytest.fixture
 def cluster(folder):
-    """A Dask scheduler and three workers on the loopback, as a user would start them; their processes."""
+    """A Dask scheduler and two workers on the loopback, as a user would start them; their processes."""
 
     def dask(*options):
         call = [sys.executable, "-m", "dask", *options, "--scheduler-file", "cluster.json"]
@@ -149,7 +149,7 @@ def cluster(folder):
     while not (folder / "cluster.json").exists():
         assert time.monotonic() - since < 60.0
         time.sleep(0.05)
-    workers = [dask("worker", "--no-nanny", "--nthreads", "1", "--no-dashboard") for _ in range(3)]
+    workers = [dask("worker", "--no-nanny", "--nthreads", "1", "--no-dashboard") for _ in range(2)]
     yield workers
     for process in (*workers, scheduler):
         process.kill()
@@ -164,7 +164,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluste
     rows = rows_of(folder)
     assert rows["trial"].to_list() == list(range(TRIALS))
     same(rows, whole)
-    assert [worker.poll() is None for worker in cluster] == [False, True, True]
+    assert [worker.poll() is None for worker in cluster] == [False, True]
 
 
 def test_a_cluster_that_is_not_there_is_refused(folder):

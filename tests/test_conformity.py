@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import dispersions, lanes, montecarlo, plants, rollout, scenario, signals
-from tests.helpers import FULL_INERTIA, ROOT
+from tests.helpers import FULL_INERTIA, ROOT, short
 from tuning.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
@@ -138,25 +138,61 @@ ROWS: dict[str, dict] = {
 }  # fmt: skip
 
 
-UNCOMPILED = ("raw samples, full inertia, other truth", "continuous", "chain of order 3")  # a loop of each kind
+# one of each kind of plant, loop, device and observer; the others are `long`
+KINDS = (
+    "raw samples, full inertia, other truth",
+    "filter, every axis device, random walk",
+    "wheels, flight clock, uniform attitudes",
+    "multiplicative error, prescribed-time observer",
+    "baseline terminal",
+    "sampled system with noise",
+    "chain, finite-time observer",
+)
 
 
-# a program that flies once: compiling it well takes three times as long, and its numbers are held to 1e-12 either way
-QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+IN_FULL = ("raw samples, full inertia, other truth", "chain, finite-time observer")  # with slopes, and in a loop
+CASES = [pytest.param(name, name in IN_FULL, id=name) for name in KINDS] + [
+    pytest.param(name, True, id=f"{name}, in full", marks=pytest.mark.long) for name in ROWS if name not in IN_FULL
+]
 
 
-@partial(jax.jit, static_argnames="vmap", compiler_options=QUICKLY)
-def batch(parts, dispersion, vmap):
-    """Metrics, status and bad times of some trials, and the metrics' slopes along the law's gains."""
+@partial(jax.jit, static_argnames=("vmap", "sloped"))
+def batch(parts, still, dispersion, vmap, sloped):
+    """Metrics, status and bad times of some trials, `still` the last, and the metrics' slopes along the law's gains."""
     names = [name for name in parts.controller.free if name not in ("sign_width", "t_f", "k1")]
     gains = {name: getattr(parts.controller, name) for name in names}
 
     def fly(gains):
-        run = with_gains(parts, gains)
-        return vmap(lambda trial: montecarlo.one(run, dispersion, SEED, trial)[:3])(NUMBERS)
+        def one(trial):
+            run = dispersion.apply(with_gains(parts, gains), SEED, trial)
 
+            def at_last(value, at):
+                return jax.tree.map(lambda v, at: jnp.where(trial == NUMBERS.size, at, v), value, at)
+
+            run = replace(run, initial=at_last(run.initial, still.initial))
+            if hasattr(run.controller, "sign_width"):
+                width = at_last(run.controller.sign_width, still.controller.sign_width)
+                run = replace(run, controller=replace(run.controller, sign_width=width))
+            return montecarlo.one(run, dispersions.Dispersion(), SEED, trial)[:3]
+
+        return vmap(one)(jnp.append(NUMBERS, np.uint32(NUMBERS.size)))
+
+    if not sloped:
+        metrics, status, bad = fly(gains)
+        return metrics._asdict(), status, bad, {}
     (metrics, status, bad), slopes = jax.jvp(fly, (gains,), (jax.tree.map(jnp.ones_like, gains),))
     return metrics._asdict(), status, bad, slopes[0]._asdict()
+
+
+def at_rest_on_the_target(parts):
+    """From the start, with the exact sign: every norm, root and sign at 0."""
+    target = parts.reference(jnp.zeros(()))
+    if isinstance(target, signals.Target):
+        initial = plants.AttitudeState(target.q, target.w)
+    else:
+        initial = jnp.zeros_like(parts.initial)
+    exact = {"sign_width": jnp.zeros(())} if hasattr(parts.controller, "sign_width") else {}
+    return replace(parts, initial=initial, controller=replace(parts.controller, **exact))
 
 
 def strict(function):
@@ -173,15 +209,19 @@ def agree(values, wanted, unit, name, skip=()):
         assert metric in skip or off <= unit * max(scale, 1e-3), (name, metric, off, scale)
 
 
-def compare(parts, dispersion, name):
-    got, expected = (batch(parts, dispersion, vmap) for vmap in (strict, jax.vmap))
+def compare(parts, dispersion, name, sloped):
+    """In lanes and under vmap: (metrics of the trials) and (status, metrics, slopes) of the awkward one."""
+    still = at_rest_on_the_target(parts)
+    both = [jax.tree.map(np.asarray, batch(parts, still, dispersion, vmap, sloped)) for vmap in (strict, jax.vmap)]
+    got, expected = (jax.tree.map(lambda v: v[:-1], one) for one in both)
+    last = jax.tree.map(lambda v: v[-1], both[1])
     np.testing.assert_array_equal(got[1], expected[1])
     np.testing.assert_array_equal(got[2], expected[2])
     assert np.any(np.isin(expected[1], [0, 4])), "some trial must fly to the end"
     agree(got[0], expected[0], 1e-12, name)
     # chattering is a sum of magnitudes: where a difference is 0 but for rounding, either slope is right
     agree(got[3], expected[3], 1e-9, name, skip=("chattering",))
-    return expected
+    return expected[0], (last[1], last[0], last[3])
 
 
 def singles(ready, fly):
@@ -191,19 +231,28 @@ def singles(ready, fly):
     return {metric: np.array([getattr(run, metric) for run in runs]) for metric in runs[0]._fields}
 
 
-@pytest.mark.parametrize("name", ROWS)
-def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop(name):
+@pytest.mark.parametrize(("name", "in_full"), CASES)
+def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_slopes(name, in_full):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
-    metrics, *_ = compare(ready.parts, ready.dispersion, name)
-    loop = singles(ready, rollout.simulate_jit)
-    agree(loop, metrics, 1e-12, name)
-    if name not in UNCOMPILED:
-        return
-    plain = rollout.simulate(ready.dispersion.apply(ready.parts, SEED, NUMBERS[0]), SEED, NUMBERS[0])  # no jit
-    agree(jax.tree.map(np.asarray, plain.metrics._asdict()), {k: v[0] for k, v in loop.items()}, 1e-12, name)
+    metrics, (status, values, slopes) = compare(ready.parts, ready.dispersion, name, in_full)
+    assert status in (0, 4)
+    for metric, slope in slopes.items():
+        assert np.isfinite(slope) or not np.isfinite(values[metric]), metric
+    if in_full:
+        agree(singles(ready, rollout.simulate_jit), metrics, 1e-12, name)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize(
+    "name", short(("chain, finite-time observer", "raw samples, full inertia, other truth"), KINDS[-1:])
+)
+def test_uncompiled_it_is_the_same(name):
+    ready = scenario.study(scenario.from_tables(ROWS[name]))
+    run = ready.dispersion.apply(ready.parts, SEED, NUMBERS[0])
+    one, other = (fly(run, SEED, NUMBERS[0]).metrics._asdict() for fly in (rollout.simulate, rollout.simulate_jit))
+    agree(jax.tree.map(np.asarray, one), other, 1e-12, name)
+
+
+@pytest.mark.parametrize("name", short(ROWS, KINDS[-1:]))
 def test_carries_keep_their_shapes_whatever_is_batched(name):
     """A run's result has the same shapes and types, alone and in a batch of one: nothing is broadcast on the way."""
     ready = scenario.study(scenario.from_tables(ROWS[name]))
@@ -216,26 +265,6 @@ def test_carries_keep_their_shapes_whatever_is_batched(name):
     rows = one.log.t.shape[0]
     assert all(leaf.shape[0] == rows for leaf in jax.tree.leaves(one.log))
     assert one.log.u.shape == (rows, ready.parts.plant.inputs)
-
-
-@pytest.mark.parametrize("name", ROWS)
-def test_slopes_are_finite_at_the_awkward_points(name):
-    """On the target at rest from the start, with the exact sign: every norm, root and sign at 0."""
-    ready = scenario.study(scenario.from_tables(ROWS[name]))
-    parts = ready.parts
-    target = parts.reference(jnp.zeros(()))
-    if isinstance(target, signals.Target):
-        initial = plants.AttitudeState(target.q, target.w)
-    else:
-        initial = jnp.zeros_like(parts.initial)
-    exact = {"sign_width": jnp.zeros(())} if hasattr(parts.controller, "sign_width") else {}
-    law = replace(parts.controller, **exact)
-    still = replace(parts, initial=initial, controller=law)
-    metrics, status, _, slopes = batch(still, dispersions.Dispersion(), jax.vmap)
-    assert np.all(np.isin(status, [0, 4]))
-    for metric, slope in slopes.items():
-        known = np.isfinite(metrics[metric])
-        assert np.all(np.isfinite(slope[known])), metric
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():
@@ -253,4 +282,4 @@ def test_lanes_equal_vmap_for_a_plant_from_python():
     ready = scenario.study(scenario.from_tables(ROWS["sampled chain with noise"]))
     model = plants.chain(2, f, g)
     parts = replace(ready.parts, plant=model, controller=replace(ready.parts.controller, model=model))
-    compare(parts, ready.dispersion, "own plant")
+    compare(parts, ready.dispersion, "own plant", False)

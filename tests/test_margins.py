@@ -9,7 +9,6 @@ import pytest
 from scipy import optimize, signal
 
 from ptsmc_jax import borders, linear, margins, plants, rollout, scenario
-from ptsmc_jax.computer import schedule
 from tuning.gains import with_gains
 
 CHAIN = {
@@ -31,8 +30,8 @@ def chain(**changes):
 
 def opened(parts, hold=True):
     run = linear.nominal_jit(parts)
-    index = linear.whole_periods(parts, run, hold=hold)[-1]
-    return jax.tree.map(lambda v: v[0], linear.opened_at_jit(parts, run, jnp.asarray([index])))
+    index = linear.whole_periods(parts, run, hold=hold)[-1:]
+    return jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, index))
 
 
 def of(loop):
@@ -95,7 +94,8 @@ def test_slopes_of_margins_are_those_of_central_differences():
     @jax.jit
     def values(at):
         changed = with_gains(parts, {"k1": at[0], "sign_width": at[1], "surface_rate": at[2]})
-        found = margins.of(linear.opened(changed, linear.nominal(changed), index).loop)
+        during = jax.tree.map(lambda v: v[index], linear.nominal(changed))
+        found = margins.of(linear.opened(changed, during).loop)
         return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.modulus[0]])
 
     at = jnp.asarray([3.0, 2e-2, 1.5])
@@ -119,9 +119,8 @@ def flown(parts, run, index, gain, late):
 
 @jax.jit
 def _flown(parts, run, index, gain, late):
-    listed, carry_0, base = jax.tree.map(lambda v: v[index], (run.listed, run.carry, run.command))
-    _, about, _ = schedule(parts, run.listed[0])
-    period, k2 = about(listed), parts.observer.error_bound()
+    period, carry_0, _, base = jax.tree.map(lambda v: v[index], run)
+    k2 = parts.observer.error_bound()
     actuators = parts.actuators
     delay = 0 if actuators is None else actuators.delay
     axes, now, dt = jnp.arange(base.size), period.now, period.length
@@ -201,7 +200,7 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
         parts = scenario.study(scenario.from_tables(table)).parts
         run = linear.nominal_jit(parts)
         index = linear.whole_periods(parts, run, hold=True)[-1]
-        loop = jax.tree.map(lambda v: v[0], linear.opened_at_jit(parts, run, jnp.asarray([index])))
+        loop = jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, np.asarray([index])))
         found, m = of(loop), loop.command.shape[0]
         axis = int(RNG.integers(m))
         only = np.arange(m) == axis

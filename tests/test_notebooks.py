@@ -4,12 +4,15 @@ import base64
 import importlib
 import re
 import sys
+import tomllib
 
 import jupytext
+import matplotlib.pyplot as plt
 import nbformat
 import pytest
 
-from tests.helpers import ROOT
+from ptsmc_jax import scenario
+from tests.helpers import ROOT, SHORT, small_search
 
 sys.path.insert(0, str(ROOT / "notebooks"))
 executed = importlib.import_module("execute").executed
@@ -22,6 +25,33 @@ def test_all_five_are_there():
     assert names == ["01_paper", "02_sampling_and_noise", "03_tuning", "04_monte_carlo", "05_your_own_plant"]
 
 
+# what makes a cell smaller, of the notebooks whose cells fly much
+SMALLER = {
+    "02_sampling_and_noise": {"count=300": "count=20", "0.05, 4.0, 9)": "0.1, 4.0, 3)"},
+    "03_tuning": {
+        'tune={"trials": 16, "starts": 3, "steps": 30}': "tune__steps=4",
+        "0, 4)": "0, 3)",
+        '"out/tune-first_flight"': '__import__("pathlib").Path("out")',
+    },
+    "04_monte_carlo": {"trials=20_000": "trials=200"},
+}
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
+def test_its_cells_run_at_a_small_size(source, monkeypatch):
+    """In this process, on a flight of five seconds; as they stand, in a kernel, see below."""
+    small_search(monkeypatch)
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    monkeypatch.setattr("ptsmc_jax.read", lambda path: scenario.from_tables(tomllib.loads(SHORT)))
+    code = "\n".join(cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code")
+    for of_the_notebook, small in SMALLER.get(source.stem, {}).items():
+        assert of_the_notebook in code
+        code = code.replace(of_the_notebook, small)
+    exec(compile(code, source.name, "exec"), {})
+    plt.close("all")
+
+
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # of the machinery that runs kernels
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 def test_it_runs(source):

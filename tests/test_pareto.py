@@ -11,7 +11,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.schema import ScenarioError
-from tests.helpers import SHORT, small_search, tree
+from tests.helpers import SHORT, short, small_search, tree
 from tests.pages import checked
 from tuning import pareto, report, show, told
 
@@ -168,24 +168,22 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
-def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch):
+@pytest.mark.parametrize("stage", short(["least torque: searching", "ladder"], ["ladder"]))
+def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
     """The front is that of a run without it."""
     small_search(monkeypatch, 60)
     run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
     whole = command(*run, "whole")[0]
 
-    for k, stage in enumerate(["least torque: searching", "ladder"]):
-        cut = f"cut-{k}"
+    def stop(self, what, *numbers):
+        if what.startswith(stage):
+            raise KeyboardInterrupt
 
-        def stop(self, what, *numbers, stage=stage):
-            if what.startswith(stage):
-                raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch:
-            patch.setattr(show.Progress, "__call__", stop)
-            status, _, err = command(*run, cut)
-        assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
-        assert not (tmp_path / cut / "front.csv").exists()
-        assert command(*run, cut)[0] == whole
-        assert (tmp_path / cut / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
-        assert "journal.bin" not in tree(tmp_path / cut)
+    with monkeypatch.context() as patch:
+        patch.setattr(show.Progress, "__call__", stop)
+        status, _, err = command(*run, "cut")
+    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
+    assert not (tmp_path / "cut" / "front.csv").exists()
+    assert command(*run, "cut")[0] == whole
+    assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
+    assert "journal.bin" not in tree(tmp_path / "cut")

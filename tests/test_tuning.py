@@ -152,7 +152,7 @@ def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
     np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)
 
 
-@pytest.mark.parametrize("tail", [1, 3, 8])
+@pytest.mark.parametrize("tail", helpers.short([1, 3, 8], [3]))
 def test_the_tail_is_the_mean_of_the_worst(tail):
     some = replace(problem(), tail=tail)
     f, _, _ = measure(some, vector([3.0, 0.7]))
@@ -161,7 +161,7 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
 
 
-@pytest.mark.parametrize("least", [1, 5, 8])
+@pytest.mark.parametrize("least", helpers.short([1, 5, 8], [5]))
 def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
     """The largest c is that order statistic of the averaged trials; of added trials those count that are said to."""
     some = replace(problem(peak_torque=0.7, effort=5.0), least=(least, None))
@@ -189,6 +189,7 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
             np.testing.assert_allclose(exact[row, k], numeric, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
     helpers.small_search(monkeypatch)
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
@@ -229,7 +230,7 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
     assert np.all(np.isfinite(slope))
 
 
-@pytest.mark.parametrize("tail", [None, 3])
+@pytest.mark.parametrize("tail", helpers.short([None, 3], [3]))
 def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
     """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
     turned = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(np.pi)))
