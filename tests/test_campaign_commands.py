@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import campaign
-from tests.helpers import same
+from tests.helpers import same, short
 from tests.pages import checked
 
 FOLDER = "out/montecarlo-s"
@@ -320,7 +320,7 @@ def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_pat
     assert command("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet", "--out", "b")[0] == 1
 
 
-@pytest.mark.parametrize("plant", ["chain", "continuous"])
+@pytest.mark.parametrize("plant", short(["chain", "continuous"], ["chain"]))
 def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
     (tmp_path / "o.toml").write_text({
         "chain": 'plant = { kind = "chain", order = 3 }\nloop = { mode = "sampled", period = 0.05 }\n'

@@ -359,6 +359,7 @@ def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, mo
     assert one == other
 
 
+@pytest.mark.long
 def test_a_killed_search_goes_on(tmp_path):
     """kill -9 while it searches, in a process of its own; then the same command to the end."""
     (tmp_path / "s.toml").write_text(SHORT)
@@ -386,6 +387,7 @@ def test_a_killed_search_goes_on(tmp_path):
     assert (tmp_path / "t" / "history.csv").read_text() == (tmp_path / "w" / "history.csv").read_text()
 
 
+@pytest.mark.long
 def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     small_search(monkeypatch)
     text = re.sub(r"peak_torque = .*", "peak_torque = 0.01", SHORT)
@@ -504,6 +506,7 @@ def test_a_chain_is_simulated(command, tmp_path):
     np.testing.assert_array_equal(rows_of(tmp_path / "n")[0, 1:4], [5.0, 3.0, 2.0])
 
 
+@pytest.mark.long
 def test_a_chain_is_tuned(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, _ = command("tune", "c.toml", "--seed", 2)

@@ -46,6 +46,7 @@ def test_too_few_trials_are_never_sure():
     assert confirm.allowed(SHOWN, 1000, 20) is None
 
 
+@pytest.mark.long
 def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch):
     """Eight easy training trials: gains that keep a limit in all of them break it in more than a tenth of others."""
     helpers.small_search(monkeypatch, fresh=200)

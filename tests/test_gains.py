@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import borders, free_gains, montecarlo, pace, rollout, scenario, sensors
 from ptsmc_jax.scenario import from_tables, study
 from ptsmc_jax.schema import ScenarioError
-from tests.helpers import FIRST_FLIGHT, SHORT, finer, vector
+from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, vector
 from tuning import bounds, gains, report
 
 BASE = {
@@ -51,7 +51,7 @@ def wide(tables=None):
     return scenario, report.pose(scenario, 0).ready
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", short(OTHERS, ["t_f"]))
 def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
     """The parts of a search, moved, against the parts that the changed scenario is built into."""
     scenario, ready = wide()

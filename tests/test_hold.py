@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import clock, controllers, hold, rollout, signals, theory
-from tests.helpers import FULL_INERTIA, chain_parts, parts, vector
+from tests.helpers import FULL_INERTIA, chain_parts, parts, short, vector
 
 QUIET = signals.Constant(jnp.zeros(3))
 AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
@@ -43,7 +43,7 @@ def exact(run, t):
     return jax.vmap(component, out_axes=1)(theory.starts(run))
 
 
-@pytest.mark.parametrize(("c", "k"), RATES)
+@pytest.mark.parametrize(("c", "k"), short(RATES, RATES[:1]))
 @pytest.mark.parametrize(
     "law", [controllers.PrescribedTime, controllers.PrescribedTimeMultiplicative, 2, 3],
     ids=["additive", "multiplicative", "chain of order 2", "chain of order 3"],

@@ -66,6 +66,7 @@ def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives():
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
 
 
+@pytest.mark.long
 def test_keys_of_every_kind_can_be_mapped():
     """One with a number for each axis, and one that counts."""
     _, _, _, cells = flown("observer.gain=5:20:2", "hardware.delay=0:1:2", trials=2)
@@ -101,6 +102,10 @@ def test_a_map_on_which_everything_fails_is_written(tmp_path):
     assert all(c.failures == 2 for c in cells)
     mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
     assert (tmp_path / "map.csv").exists()
+
+
+@pytest.mark.long
+def test_a_map_of_nothing_but_zeros_is_written(tmp_path):
     perfect = "initial.quat_xyzw = [0, 0, 0, 1]\ncontroller = { disturbance_rate_bound = 0, t_f = 5, delta = 0.5 }\n"
     perfect += "disturbance.kind = 'none'\nloop = { mode = 'sampled', period = 0.1 }"
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", perfect, trials=1)

@@ -77,13 +77,24 @@ def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
 
 
-def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes():
+@pytest.fixture(scope="module")
+def drawn():
+    """A problem whose inertias are drawn, of four loops the two hardest rows."""
+    tables = {**BODY, "dispersion": {"inertia": {"kind": "relative_normal", "std": 0.05}}}
+    tables["requirements"] = {**BODY["requirements"], "peak_torque": 5.0}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(margin_verdicts, "TRIALS", 4)
+        patch.setattr(margin_rows, "CASES", 2)
+        yield report.pose(scenario.from_tables(tables), 3)
+
+
+def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(drawn):
     """Slopes against central differences of order 4, over all axes and times; those of what has no limit are zero."""
-    posed = report.pose(scenario.from_tables(BODY), 0)
+    posed = drawn
     asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
     assert asked is not None
     found = margin_rows.sloped(asked, bounds, share)
-    verdicts = margin_verdicts.over_trials(posed.ready, 0)
+    verdicts = margin_verdicts.over_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step = 1e-4
@@ -97,12 +108,8 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes():
     np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
-def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_judged_by_the_worst(monkeypatch):
-    monkeypatch.setattr(margin_verdicts, "TRIALS", 4)
-    monkeypatch.setattr(margin_rows, "CASES", 2)
-    drawn = {**BODY, "dispersion": {"inertia": {"kind": "relative_normal", "std": 0.05}}}
-    drawn["requirements"] = {**BODY["requirements"], "peak_torque": 5.0}
-    posed = report.pose(scenario.from_tables(drawn), 3)
+def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_judged_by_the_worst(drawn):
+    posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "modulus_margin")
     share = posed.evaluate.bounds.share(posed.own)[None]
     c = posed.evaluate.fly(posed.problem, share).c[0]

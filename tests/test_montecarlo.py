@@ -193,6 +193,7 @@ def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, 
         np.testing.assert_allclose(np.mean(trials.metrics.peak_torque), peak, rtol=0.15)
 
 
+@pytest.mark.long
 def test_single_precision_keeps_what_its_documentation_says():
     """docs/python.md: statuses the same, pooled errors to three digits, torques to 1e-3, no error below 1e-7."""
     flight = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, controller__delta=0.5)

@@ -37,7 +37,13 @@ SMALLER = {
 }
 
 
-@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
+QUICK = ("02_sampling_and_noise", "05_your_own_plant")
+
+
+@pytest.mark.parametrize(
+    "source",
+    [pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.long, id=path.stem) for path in SOURCES],
+)
 def test_its_cells_run_at_a_small_size(source, monkeypatch):
     """In this process, on a flight of five seconds; as they stand, in a kernel, see below."""
     small_search(monkeypatch)

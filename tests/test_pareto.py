@@ -11,7 +11,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.metrics import Metrics
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.schema import ScenarioError
-from tests.helpers import SHORT, short, small_search, tree
+from tests.helpers import SHORT, small_search, tree
 from tests.pages import checked
 from tuning import pareto, report, show, told
 
@@ -168,7 +168,8 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
-@pytest.mark.parametrize("stage", short(["least torque: searching", "ladder"], ["ladder"]))
+@pytest.mark.long
+@pytest.mark.parametrize("stage", ["least torque: searching", "ladder"])
 def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
     """The front is that of a run without it."""
     small_search(monkeypatch, 60)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import clock, plants, rollout, runs, scenario, signals, theory
-from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, vector, with_controller
+from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, short, vector, with_controller
 
 fly = rollout.simulate_jit
 
@@ -70,7 +70,7 @@ MOVING = {
 }
 
 
-@pytest.mark.parametrize("kind", MOVING)
+@pytest.mark.parametrize("kind", short(MOVING, ["slew"]))
 def test_exact_solution_for_a_moving_reference(kind):
     moving = MOVING[kind]
     run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=moving, rate=(0.01, 0.0, -0.01))), 2)
@@ -279,6 +279,7 @@ def test_another_number_is_the_same_program():
     assert traced == 1
 
 
+@pytest.mark.long
 def test_simulate_without_jit_is_the_same():
     run = parts(5.0, 3.0, 0.5, period=0.5, noise=(2e-5, 1e-6), t_end=6.0)
     with jax.disable_jit():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import margins, scenario
-from tests.helpers import SHORT
+from tests.helpers import SHORT, short
 from tuning import page, stability, told_margins
 
 
@@ -86,7 +86,7 @@ def test_few_margins_are_warned_of():
     assert "the frozen loop is NOT stable in hold" in next(told_margins.tuned({"hold": lost}))
 
 
-@pytest.mark.parametrize("period", [0.1, 0.5])
+@pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
 def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
     """t_f - delta is half a period: no sample before the hand-over lasts a whole one."""
     law = {"t_f": 10.0, "delta": 10.0 - 0.5 * period}

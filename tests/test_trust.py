@@ -127,6 +127,7 @@ def test_what_cannot_be_resampled_has_no_interval():
     assert trust.interval(np.arange(5.0)) is None
 
 
+@pytest.mark.long
 def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     monkeypatch.setattr(evolution, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
