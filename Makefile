@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO := scenarios/first_flight.toml
 OUT := out/tune-first_flight
 
-.PHONY: tune test setup table docs notebooks notebooks-kept clean
+.PHONY: tune test test-long setup table docs notebooks notebooks-kept clean
 
 tune: $(VENV)/.installed
 	$(BIN)/ptsmc tune $(SCENARIO) --out $(OUT)
@@ -15,7 +15,11 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+
+# what `test` leaves out: more cases of each kind, and what takes minutes
+test-long: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m long
 
 table: $(VENV)/.installed
 	$(BIN)/python -m tuning.table

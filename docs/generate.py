@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
-from ptsmc_jax import keys, layouts, metrics, schema
+from ptsmc_jax import catalogues, keys, layouts, schema
 from ptsmc_jax.signal_tables import Attitude
 from ptsmc_jax.tables import Limit
 from ptsmc_jax.values import Table
@@ -74,8 +74,8 @@ def metric_list() -> str:
     """Reference of the metrics."""
     parts = ["# Metrics", MADE, METRICS]
     for title, known in (
-        ("A spacecraft's", metrics.CATALOGUE),
-        ("Those of chains and systems", metrics.STATE_CATALOGUE),
+        ("A spacecraft's", catalogues.CATALOGUE),
+        ("Those of chains and systems", catalogues.STATE_CATALOGUE),
     ):
         parts += [f"## {title}", _grid("metric unit meaning", [[f"`{key}`", *told] for key, told in known.items()])]
     return _page([*parts, ERRORS])

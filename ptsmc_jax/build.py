@@ -13,6 +13,7 @@ from ptsmc_jax import (
     device_tables,
     dispersion_tables,
     dispersions,
+    formulas,
     free_gains,
     hardware,
     law_tables,
@@ -154,7 +155,7 @@ def sensors(scenario: Scenario) -> sensing.Sensors | sensing.StateSensor | None:
         vector(star),
         vector(gyro),
         None if table.rate_bias is None else vector(table.rate_bias),
-        None if walk is None else vector(sensing.per_sample(walk, period)),
+        None if walk is None else vector(formulas.per_sample(walk, period)),
         estimator,
         every,
     )
@@ -170,7 +171,7 @@ def actuators(scenario: Scenario) -> hardware.Actuators | None:
     wheels = None
     if device is not None:
         raised = isinstance(device, device_tables.PyramidWheels)
-        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if raised else device.axes
+        axes = formulas.pyramid(np.deg2rad(device.cant_deg)) if raised else device.axes
         wheels = hardware.wheels(axes, device.momentum, device.torque_limit, device.momentum_limit)
     limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
     return hardware.Actuators(limit, rate_limit, lag, step, wheels, delay)

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ptsmc_jax.catalogues import CATALOGUES
 from ptsmc_jax.drawing import RC, STYLES, figure_of, plain_ticks
-from ptsmc_jax.metrics import CATALOGUES
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
 BEYOND = "beyond a limit"  # flown to the end, but a requirement is broken

@@ -1,7 +1,7 @@
 """What single keys of a scenario cannot tell: defaults that depend on other keys, keys against each other."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -10,21 +10,22 @@ from ptsmc_jax import (
     attitude_keys,
     device_tables,
     dispersion_tables,
+    formulas,
     free_gains,
-    hardware,
     law_tables,
     layouts,
     plant_tables,
-    plants,
     schema,
     signal_tables,
     systems,
     tables,
 )
-from ptsmc_jax.controllers import hurwitz
 from ptsmc_jax.free_gains import FINITE_TIME, MOST_STEPS
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
+
+if TYPE_CHECKING:
+    from ptsmc_jax.plants import System
 
 SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
 
@@ -106,12 +107,12 @@ def _check_plant(scenario: Scenario) -> None:
         assert scenario.initial is not None
         assert scenario.reference is not None
         try:
-            plants.check_inertia(scenario.spacecraft.inertia)
+            formulas.check_inertia(scenario.spacecraft.inertia)
         except ValueError as error:
             raise ScenarioError(f"spacecraft.inertia is {schema.brief(scenario.spacecraft.inertia)}: {error}") from None
         if scenario.spacecraft.true_inertia is not None:
             try:
-                plants.check_inertia(scenario.spacecraft.true_inertia)
+                formulas.check_inertia(scenario.spacecraft.true_inertia)
             except ValueError as error:
                 value = schema.brief(scenario.spacecraft.true_inertia)
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
@@ -157,12 +158,10 @@ def _check_system(plant: plant_tables.SystemPlant) -> None:
         raise ScenarioError(f"plant.system is {schema.brief(plant.system)}: {error}") from None
 
 
-def system(plant: plant_tables.SystemPlant) -> plants.System:
+def system(plant: plant_tables.SystemPlant) -> "System":
     """The system that a scenario holds, or names: that file is run. Raises ScenarioError where there is none."""
     try:
-        if not isinstance(plant.system, plants.System | str):
-            raise ValueError(f"allowed is {systems.ALLOWED}")
-        found = systems.load(plant.system) if isinstance(plant.system, str) else plant.system
+        found = systems.load(plant.system)
     except ValueError as error:
         raise ScenarioError(f"plant.system is {schema.brief(plant.system)}: {error}") from None
     if found.inputs * 2 != len(plant.x0):
@@ -180,7 +179,7 @@ def _check_chain(plant: plant_tables.ChainPlant, controller: Any) -> None:
         raise wrong("controller.eta", controller.eta, f"greater than plant.order, {n} ({theorem})")
     if len(controller.a) != n - 1:
         raise wrong("controller.a", controller.a, f"a list of plant.order - 1 = {n - 1} numbers")
-    if not hurwitz(controller.a):
+    if not formulas.hurwitz(controller.a):
         raise wrong(
             "controller.a", controller.a, "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
         )
@@ -244,9 +243,9 @@ def _check_devices(scenario: Scenario) -> None:
         )
     if device is not None:
         flat = isinstance(device, device_tables.PyramidWheels)
-        axes = hardware.pyramid(np.deg2rad(device.cant_deg)) if flat else np.asarray(device.axes)
+        axes = formulas.pyramid(np.deg2rad(device.cant_deg)) if flat else np.asarray(device.axes)
         try:
-            hardware.wheels(axes)
+            formulas.wheel_axes(axes)
         except ValueError as error:
             if flat:
                 enough = "far enough from 0 and 90 degrees for the wheels to span all directions"

@@ -9,11 +9,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import attitude, numerics
-from ptsmc_jax.laws import Motion, Prescribed, SecondOrder, surface_roots
+from ptsmc_jax.laws import Motion, Prescribed, SecondOrder
 from ptsmc_jax.numerics import Leaf, pytree
 from ptsmc_jax.plants import AttitudeState, Chain, Spacecraft, System
 from ptsmc_jax.signals import Target
@@ -293,8 +292,3 @@ class PrescribedTimeChain(Prescribed):
         """a_i c^(n-i) [1/s^(n-i)]: time runs c times as fast on the surface."""
         n = self.order
         return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])
-
-
-def hurwitz(a: Any) -> bool:
-    """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 left of the axis."""
-    return bool(np.all(np.real(surface_roots(a)) < 0.0))

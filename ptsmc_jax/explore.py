@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from ptsmc_jax import animation, campaign, margin_verdicts, metrics, plotting, runs, scenario
+from ptsmc_jax import animation, campaign, catalogues, margin_verdicts, plotting, runs, scenario
 from ptsmc_jax.estimation import Floor
 from ptsmc_jax.montecarlo import OwnMetrics
 from ptsmc_jax.requirements import Verdict
@@ -55,7 +55,7 @@ class Flight:
 
     @property
     def metrics(self) -> Quantities:
-        """What the run is judged by, see `metrics.CATALOGUE` for units; settling_time is NaN where it never settles."""
+        """What the run is judged by, see `catalogues`; settling_time is NaN where it never settles."""
         return Quantities(self.run.metrics, self.run.catalogue)
 
     @property
@@ -127,7 +127,7 @@ def trials(
 ) -> pl.DataFrame:
     """Rows of the first `count` trials of a scenario, as `ptsmc montecarlo` keeps them.
 
-    Number, status, reason, bad_time [s], the metrics in the units of `metrics.CATALOGUE`, what each trial flew with,
+    Number, status, reason, bad_time [s], the metrics in the units of `catalogues.CATALOGUE`, what each trial flew with,
     and metrics of one's own (see `montecarlo.one`).
     """
     _whole("seed", seed)
@@ -159,7 +159,7 @@ def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
     """The unit of each metric of this kind of plant."""
-    return {name: unit for name, (unit, _) in metrics.CATALOGUES[kind].items()}
+    return {name: unit for name, (unit, _) in catalogues.CATALOGUES[kind].items()}
 
 
 def _whole(name: str, value: object, least: int = 0) -> None:

@@ -5,7 +5,7 @@ import math
 import msgspec
 import numpy as np
 
-from ptsmc_jax import device_tables, law_tables, plant_tables, scales, schema, sensors, tables
+from ptsmc_jax import device_tables, formulas, law_tables, plant_tables, scales, schema, tables
 from ptsmc_jax.schema import ScenarioError, wrong
 from ptsmc_jax.tables import Scenario
 
@@ -39,7 +39,7 @@ def filter_bandwidth(scenario: Scenario) -> float:
         return scenario.filter.bandwidth
     table, period = scenario.hardware, scenario.loop.period
     assert isinstance(table, device_tables.Hardware)
-    return sensors.best_bandwidth(
+    return formulas.best_bandwidth(
         table.attitude_noise or 0.0, scales.gyro_noise(table, period), period, _interval(scenario)
     )
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import numerics
+from ptsmc_jax.formulas import wheel_axes
 from ptsmc_jax.numerics import Leaf, pytree
 
 Scalar = Float[Array, ""]
@@ -44,26 +45,10 @@ def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_li
 
     Raises ValueError where the axes do not span all directions.
     """
-    unit = np.asarray(axes, dtype=float)
-    if (
-        unit.ndim != 2
-        or unit.shape[1] != 3
-        or not np.all(np.isfinite(unit))
-        or np.any(np.linalg.norm(unit, axis=1) == 0)
-    ):
-        raise ValueError("allowed are rows of three numbers, a direction for each wheel")
-    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-    if np.linalg.svd(unit, compute_uv=False)[-1] < 1e-6 or len(unit) < 3:
-        raise ValueError("the wheels' axes must span all three directions")
+    unit = wheel_axes(axes)
     start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
     limits = (None if v is None else jnp.asarray(float(v)) for v in (torque_limit, momentum_limit))
     return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)
-
-
-def pyramid(cant: float = np.arctan(1.0 / np.sqrt(2.0))) -> np.ndarray:
-    """Spin axes (4, 3) of four wheels, `cant` [rad] above the x-y plane; by default all axes are equally strong."""
-    around = np.deg2rad([45.0, 135.0, 225.0, 315.0])
-    return np.stack([np.cos(cant) * np.cos(around), np.cos(cant) * np.sin(around), np.full(4, np.sin(cant))], axis=1)
 
 
 class ActuatorState(NamedTuple):

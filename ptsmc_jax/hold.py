@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import numerics, programs, theory
-from ptsmc_jax.laws import surface_roots
+from ptsmc_jax.formulas import surface_roots
 from ptsmc_jax.rollout import Parts
 from ptsmc_jax.theory import ChainMotion
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax import numerics
+from ptsmc_jax import formulas, numerics
 from ptsmc_jax.numerics import Leaf
 
 Scalar = Float[Array, ""]
@@ -21,11 +21,6 @@ class SurfaceGains(NamedTuple):
     e: Array  # [-] before the hand-over, [1/s] after
     a: Array  # [1/s]
     b: Array  # [1/s^2] before the hand-over, [1/s] after
-
-
-def surface_roots(a: Any) -> np.ndarray:
-    """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
-    return np.roots([1.0, *reversed([float(v) for v in a])])
 
 
 class Motion(NamedTuple):
@@ -124,7 +119,7 @@ class Prescribed(Law):
 
     def hold_rates(self) -> dict[str, float]:
         """Fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
-        on = float(np.max(np.abs(surface_roots(self.surface()))))
+        on = float(np.max(np.abs(formulas.surface_roots(self.surface()))))
         return {"k1": float(self.reaching_rate()), "surface_rate": on}
 
 

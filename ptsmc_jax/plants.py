@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import attitude, numerics
+from ptsmc_jax.formulas import check_inertia
 from ptsmc_jax.numerics import Leaf, pytree
 
 Scalar = Float[Array, ""]
@@ -369,32 +370,3 @@ def spacecraft(inertia: object) -> Spacecraft:
     """
     tensor = check_inertia(inertia)
     return Spacecraft(jnp.asarray(tensor), jnp.asarray(np.linalg.inv(tensor)))
-
-
-def check_inertia(inertia: object) -> np.ndarray:
-    """The (3, 3) inertia tensor [kg m^2] that `spacecraft` would use; raises ValueError as it does."""
-    try:
-        tensor = np.asarray(inertia)
-        if not np.issubdtype(tensor.dtype, np.number):
-            raise TypeError
-        tensor = tensor.astype(float)
-    except (ValueError, TypeError):  # rows of different lengths, or no numbers
-        tensor = np.zeros(0)
-    tensor = np.diag(tensor) if tensor.shape == (3,) else tensor
-    if tensor.shape != (3, 3):
-        raise ValueError("allowed are three principal moments or a symmetric 3x3 tensor [kg m^2]")
-    if not np.all(np.isfinite(tensor)):
-        raise ValueError("every entry must be a finite number")
-    scale = np.abs(tensor).max()
-    if np.abs(tensor - tensor.T).max() > 1e-9 * scale:
-        raise ValueError("the tensor must be symmetric")
-    tensor = (tensor + tensor.T) / 2
-    moments = np.linalg.eigvalsh(tensor)
-    if moments[0] <= 1e-12 * scale:
-        raise ValueError(f"the tensor must be positive definite (its smallest principal moment is {moments[0]:.6g})")
-    if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
-        raise ValueError(
-            "no rigid body has these principal moments: the largest, "
-            f"{moments[2]:.6g}, must not exceed the sum of the other two, {moments[0] + moments[1]:.6g}"
-        )
-    return tensor

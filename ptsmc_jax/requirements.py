@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.metrics import CATALOGUE
+from ptsmc_jax.catalogues import CATALOGUE
 
 
 def least_within(trials: int, quantile: float | None, confidence: float | None) -> int | None:

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from ptsmc_jax import borders, device_tables, law_tables, sensors
+from ptsmc_jax import borders, device_tables, formulas, law_tables
 from ptsmc_jax.tables import Scenario
 
 LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
@@ -20,7 +20,7 @@ QUIET = (1e-5, 1e-1)  # widths of the smooth sign without noise, in the units of
 
 def gyro_noise(table: device_tables.Hardware, period: float) -> float:
     """Noise of the gyro, 1 sigma a sample [rad/s]."""
-    return table.rate_noise or sensors.per_sample(table.rate_noise_density or 0.0, period)
+    return table.rate_noise or formulas.per_sample(table.rate_noise_density or 0.0, period)
 
 
 def dead_beat_gain(scenario: Scenario, left: float = LEFT) -> float:

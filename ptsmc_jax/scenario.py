@@ -1,28 +1,22 @@
-"""Scenarios: read, checked as a whole, changed, and turned into the parts that the rollout flies."""
+"""Scenarios: read, checked and changed by `reading`, and turned into the parts that the rollout flies."""
 
 import dataclasses
 import typing
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import (
     attitude_keys,
     build,
-    checks,
+    catalogues,
     clock,
     controllers,
     dispersions,
-    free_gains,
     layouts,
-    metrics,
     observers,
     pace,
     programs,
@@ -32,10 +26,13 @@ from ptsmc_jax import (
 from ptsmc_jax import tables as t
 from ptsmc_jax.laws import Prescribed
 from ptsmc_jax.plants import System
+from ptsmc_jax.reading import from_tables, read, replace
 from ptsmc_jax.requirements import Requirement
 from ptsmc_jax.rollout import SINGULAR_CLEARANCE, Parts
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.tables import Scenario
+
+__all__ = ["Scenario", "ScenarioError", "Study", "from_tables", "read", "replace", "study"]
 
 SINGULAR_CONDITION = 1e14  # of a matrix in double precision
 
@@ -63,13 +60,13 @@ class Study:
 
 def catalogue(scenario: Scenario) -> dict[str, tuple[str, str]]:
     """The metrics that a scenario's plant has: name -> (unit, what it is)."""
-    names = metrics.CATALOGUES[scenario.plant.kind]
+    names = catalogues.CATALOGUES[scenario.plant.kind]
     return names if scenario.wheels is not None else {k: v for k, v in names.items() if "wheel" not in k}
 
 
 def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """What a scenario asks of its runs."""
-    units = metrics.CATALOGUES[scenario.plant.kind]
+    units = catalogues.CATALOGUES[scenario.plant.kind]
     return tuple(
         Requirement(name, value.limit, units[name][0], value.quantile, value.confidence)
         if isinstance(value, t.Limit)
@@ -86,55 +83,6 @@ def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
         Requirement(name, float(typing.cast(float, value)), layouts.MARGINS[name][0], at_least=layouts.MARGINS[name][2])
         for name, value in asked.items()
     )
-
-
-def read(path: str | Path) -> Scenario:
-    """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
-    return from_tables(schema.load(path))
-
-
-def from_tables(raw: Mapping[str, Any]) -> Scenario:
-    """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence."""
-    scenario = checks.resolve(schema.parse(raw, metrics.CATALOGUES))
-    checks.check(scenario)
-    if scenario.tune is None:
-        return scenario
-    return msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
-
-
-def replace(scenario: Scenario, **changes: Any) -> Scenario:
-    """The scenario with other values, keys written table__key, checked again: replace(s, controller__eta=4.0).
-
-    None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one.
-
-    >>> faster = replace(from_tables({}), controller__t_f=20.0)
-    >>> faster.controller.t_f, faster.loop.t_end
-    (20.0, 40.0)
-    >>> replace(faster, controller__eta=1.0)
-    Traceback (most recent call last):
-    ptsmc_jax.schema.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
-    """
-    tables = schema.dump(scenario)
-    for name, value in changes.items():
-        table, _, key = name.partition("__")
-        if value is None and _is_known(scenario, table, key):
-            removed = tables if not key else tables.get(table, {})
-            removed.pop(key or table, None)
-        elif not key:
-            tables[table] = value
-        elif key == "kind" and tables.get(table, {}).get("kind") != value:
-            tables[table] = {"kind": value}
-        else:
-            tables[table] = {**tables.get(table, {}), key: value}
-    return from_tables(tables)
-
-
-def _is_known(scenario: Scenario, table: str, key: str) -> bool:
-    """Whether there is such a table or key; one that is not known is handed on, and refused as in a file."""
-    now = getattr(scenario, table) if table in scenario.__struct_fields__ else None
-    if not key or now is None:
-        return table in scenario.__struct_fields__
-    return key in now.__struct_fields__ if isinstance(now, msgspec.Struct) else True
 
 
 def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = None, *, drawn: bool = True) -> Study:

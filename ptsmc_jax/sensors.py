@@ -25,14 +25,6 @@ ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
 
 
-def per_sample(density: float, period: float) -> float:
-    """1 sigma of samples of white noise, each an average over a period [s]: density / sqrt(period).
-
-    density: of a rate in rad/s/sqrt(Hz), which is rad/sqrt(s), a gyro's angle random walk (IEEE Std 952).
-    """
-    return density / np.sqrt(period)
-
-
 class Sensor(Protocol):
     """What the rollout asks of a sensor."""
 
@@ -116,15 +108,6 @@ def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
     """
     pole = jnp.exp(-bandwidth * interval)
     return 1.0 - pole**2, (1.0 - pole) ** 2 / interval
-
-
-def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, interval: float) -> float:
-    """Bandwidth [rad/s] at which star tracker and gyro noise weigh the same: sigma_v / (sigma_n sqrt(interval)).
-
-    attitude_noise: 1 sigma a sample [rad]; rate_noise: 1 sigma a control period [rad/s]; sigma_v = rate_noise
-    sqrt(period) is the gyro's angle random walk.
-    """
-    return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))
 
 
 @programs.jit(static_argnames="every")  # one program, where each of its operations would be one

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from ptsmc_jax.catalogues import CATALOGUES
 from ptsmc_jax.drawing import RC, STYLES, edges, figure_of, plain_ticks
-from ptsmc_jax.metrics import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
 

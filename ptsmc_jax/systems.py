@@ -12,9 +12,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from ptsmc_jax import configure
-from ptsmc_jax.plants import System
+
+if TYPE_CHECKING:
+    from ptsmc_jax.plants import System
 
 WHERE = '"FILE.py:NAME" or "package.module:NAME"'
 
@@ -42,8 +45,14 @@ def location(where: str) -> str:
     return os.path.realpath(place) if place.endswith(".py") else f"the module {place}"
 
 
-def load(where: str) -> System:
-    """The system that stands there, the same object as long as its file stays the same; see `item`."""
+def load(where: object) -> "System":
+    """The system that stands there, the same object as long as its file stays the same, see `item`; or is there."""
+    from ptsmc_jax.plants import System  # scenarios without one are checked without JAX
+
+    if not isinstance(where, str):
+        if not isinstance(where, System):
+            raise ValueError(f"allowed is {ALLOWED}")
+        return where
     found = item(where, ALLOWED)
     if not isinstance(found, System):
         place = where.rpartition(":")[0]

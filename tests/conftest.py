@@ -30,14 +30,17 @@ hook = install_import_hook(checked, "beartype.beartype")
 MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
 
-# files that take minutes, which the workers are to begin with: the last ones would keep one of them waiting
-LONGEST = "notebooks campaign_processes cli tuning compare pareto campaign_commands conformity".split()
+# files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
+LONGEST = "cli compare pareto tuning notebooks campaign_processes conformity campaign_commands".split()
+TOGETHER = {"cli", "compare", "pareto"}  # which tune by the same programs, in one worker
 
 
-def pytest_collection_modifyitems(items):
-    """Files in the order of `LONGEST`, then the others."""
-    order = {f"test_{name}.py": k for k, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+def pytest_collection_modifyitems(config, items):
+    """Files in the order of `LONGEST`, then the others; a worker for each file, or for those of `TOGETHER`."""
+    names = {item: item.path.stem.removeprefix("test_") for item in items}
+    items.sort(key=lambda item: LONGEST.index(names[item]) if names[item] in LONGEST else len(LONGEST))
+    for item in items if config.pluginmanager.hasplugin("xdist") else ():
+        item.add_marker(pytest.mark.xdist_group("commands" if names[item] in TOGETHER else names[item]))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -254,6 +254,7 @@ def test_a_replay_that_differs_from_its_row_is_told(command, flown):
     assert (code, "off its row by 1.0e-09" in said) == (1, True)
 
 
+@pytest.mark.long
 def test_a_replay_is_its_row_to_the_last_digit_whatever_rounding_does(command, tmp_path):
     """Errors of 1e-6 of a body that turns: another program's rounding shows at 1e-11, the campaign's own does not."""
     (tmp_path / "h.toml").write_text(

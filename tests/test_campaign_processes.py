@@ -103,6 +103,7 @@ def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, whole, times)
     same(rows, whole)
 
 
+@pytest.mark.long
 def test_interrupted_it_keeps_what_is_flown(folder, whole):
     run = started(folder, "--trials", str(TRIALS))
     assert await_parts(folder, 2, run)
@@ -156,6 +157,7 @@ def cluster(folder):
         process.wait()
 
 
+@pytest.mark.long
 def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluster):
     run = started(folder, "--trials", str(TRIALS), "--cluster", "cluster.json")
     assert await_parts(folder, 4, run)
@@ -167,6 +169,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluste
     assert [worker.poll() is None for worker in cluster] == [False, True]
 
 
+@pytest.mark.long
 def test_a_cluster_that_is_not_there_is_refused(folder):
     run = started(folder, "--trials", "100", "--cluster", "tcp://127.0.0.1:1")
     code, error = ended(run)

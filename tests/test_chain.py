@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax import controllers, hold, lanes, observers, plants, rollout, signals, theory
+from ptsmc_jax import controllers, formulas, hold, lanes, observers, plants, rollout, signals, theory
 from tests.helpers import chain_parts, drawn, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -93,9 +93,9 @@ def test_motion_on_the_surface_is_stable_as_its_matrix_is(n):
         a = rng.normal(size=n - 1) + 1.0
         matrix = np.diag(np.ones(n - 2), 1)
         matrix[-1] = -a
-        assert controllers.hurwitz(a) == bool(np.all(np.linalg.eigvals(matrix).real < 0.0))
-    assert not controllers.hurwitz([0.0] * (n - 1))
-    assert controllers.hurwitz([math.comb(n - 1, i) for i in range(n - 1)])  # the default
+        assert formulas.hurwitz(a) == bool(np.all(np.linalg.eigvals(matrix).real < 0.0))
+    assert not formulas.hurwitz([0.0] * (n - 1))
+    assert formulas.hurwitz([math.comb(n - 1, i) for i in range(n - 1)])  # the default
 
 
 @pytest.mark.parametrize(("n", "t_f"), [(2, 5.0), (3, 5.0), (4, 5.0), (5, 5.0), (3, 30.0), (5, 0.7)])

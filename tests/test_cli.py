@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from ptsmc_jax import metrics, montecarlo, pace, runs, scenario, store
+from ptsmc_jax import catalogues, montecarlo, pace, runs, scenario, store
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
 from tests.pages import checked
@@ -35,7 +35,7 @@ def test_simulate_leaves_what_the_contract_says(command, tmp_path):
     assert np.all(np.diff(values[:, 0]) > 0)
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["status"] == "ok"
-    assert set(metrics.CATALOGUE) - {"peak_wheel_momentum"} <= set(summary)
+    assert set(catalogues.CATALOGUE) - {"peak_wheel_momentum"} <= set(summary)
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
     assert f"{summary['window_error'] / summary['floor']:.3g} times the floor {summary['floor']:.2e}" in out
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
@@ -496,7 +496,7 @@ def test_a_chain_is_simulated(command, tmp_path):
     names = {path.name for path in (folder / "figures").iterdir()}
     assert names == {"states.png", "error.png", "torque.png", "sliding.png", "convergence.png"}
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(metrics.STATE_CATALOGUE) <= set(summary)
+    assert set(catalogues.STATE_CATALOGUE) <= set(summary)
     assert "peak_momentum" not in summary
     rows = rows_of(folder)
     assert np.all(np.abs(rows[0, 1:4] - [5.0, 3.0, 2.0]) <= [1.0, 1.0, 0.5])

@@ -102,6 +102,7 @@ def test_settling_is_summed_up_by_where_trials_start():
     assert compare._rank_correlation(angle, -angle) == pytest.approx(-1.0)
 
 
+@pytest.mark.long
 def test_other_commands_take_a_baseline(command, tmp_path):
     text = SHORT.replace("[controller]\nt_f = 5.0\ndelta = 0.5\n", '[controller]\nkind = "pd"\nt_f = 5.0\n')
     (tmp_path / "pd.toml").write_text(text[: text.index("[tune]")])

@@ -24,7 +24,7 @@ CASES = {
 NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rate_bias_walk": 1e-16}
 
 
-SHORT = ("exact sign", "filter, slow star tracker, lag", "wheels, lag")
+SHORT = ("filter, slow star tracker, lag", "wheels, lag")
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ def largest(tables, t_f, trials):
     return montecarlo.run(ready.parts, ready.dispersion, 4, np.arange(trials)).metrics.peak_torque.max()
 
 
+@pytest.mark.long
 def test_shortest_time_is_where_flown_trials_cross_the_limit():
     limit, trials = 0.6, 32
     found = design.shortest_time(scenario.from_tables(FLOWN), limit, 4, np.arange(trials))

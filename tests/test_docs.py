@@ -15,7 +15,7 @@ import types
 import pytest
 from jaxtyping import Array
 
-from ptsmc_jax import layouts, metrics
+from ptsmc_jax import catalogues, layouts
 from ptsmc_jax.scenario import from_tables
 from tests.helpers import ROOT
 from tests.test_schema import COMPLETE
@@ -62,7 +62,7 @@ def test_the_references_name_everything():
             structs = table.values() if isinstance(table, dict) else [table]
             for struct in structs:
                 assert all(f"`{key}`" in scenarios for key in struct.__struct_fields__ if key != "kind"), struct
-    for catalogue in metrics.CATALOGUES.values():
+    for catalogue in catalogues.CATALOGUES.values():
         assert all(f"| `{metric}` | {unit} | " in metric_list for metric, (unit, _) in catalogue.items())
 
 

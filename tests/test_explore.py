@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ptsmc_jax
-from ptsmc_jax import animation, campaign, explore, metrics, runs, scenario
+from ptsmc_jax import animation, campaign, catalogues, explore, runs, scenario
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import SHORT
 
@@ -62,7 +62,7 @@ def test_tables_show_units_and_escape_what_they_show(flight):
     assert "<b>" not in hostile._repr_html_()
     assert "<script>" not in hostile._repr_html_()
     assert "&lt;script&gt;" in hostile._repr_html_()
-    assert explore.units()["effort"] == metrics.CATALOGUE["effort"][0]
+    assert explore.units()["effort"] == catalogues.CATALOGUE["effort"][0]
 
 
 def test_figures_by_name(flight):

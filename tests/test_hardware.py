@@ -10,13 +10,13 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import hardware, lanes, rollout, runs, scenario, sensors, signals
+from ptsmc_jax import formulas, hardware, lanes, rollout, runs, scenario, sensors, signals
 from ptsmc_jax.plants import AttitudeState
 from ptsmc_jax.schema import ScenarioError
 from tests.helpers import FULL_INERTIA, parts, vector, with_controller
 
 fly = rollout.simulate_jit
-PYRAMID = hardware.pyramid()
+PYRAMID = formulas.pyramid()
 
 
 def drive_of(device, v, c):
@@ -295,6 +295,7 @@ def test_gradients_with_every_device_on():
     assert all(np.isfinite(slope) for slope in forward)
 
 
+@pytest.mark.long
 def test_batches_with_every_device_on():
     trials, run = jnp.arange(5, dtype=jnp.uint32), everything()
 

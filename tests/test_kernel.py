@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import kernel, lanes, metrics, montecarlo, scenario
+from ptsmc_jax import catalogues, kernel, lanes, montecarlo, scenario
 from tests.helpers import short
 from tuning.gains import with_gains
 
@@ -96,7 +96,7 @@ def test_in_single_precision_it_is_the_scan_of_single_precision():
     with jax.enable_x64(False):
         got, wanted = (flown.metrics._asdict() for flown in both(primal(CHAIN)))
     peak = float(wanted["peak_torque"].max())
-    for name in metrics.STATE_CATALOGUE:
+    for name in catalogues.STATE_CATALOGUE:
         assert got[name].dtype == jnp.float32
         size = peak if name in ("peak_torque", "peak_torque_delivered", "effort", "chattering") else 5.0
         np.testing.assert_allclose(got[name], wanted[name], rtol=0.0, atol=1e-6 * size, err_msg=name)

@@ -3,6 +3,7 @@
 import csv
 import json
 import tomllib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,9 +74,13 @@ def test_keys_of_every_kind_can_be_mapped():
     assert all(c.status == "flown" for c in cells)
     assert len({c.window_error for c in cells}) == 4
     assert cells[2].delay_margin < cells[0].delay_margin
-    loaded, x, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
-    values = {key: mapping._with(loaded, {key: 0.1}) for key in (x.key, "hardware.attitude_noise")}
-    assert [values[x.key].hardware.torque_lag, values["hardware.attitude_noise"].hardware.attitude_noise] == [0.1, 0.1]
+
+
+def test_a_key_with_a_number_for_each_axis_gets_the_value_on_each_and_one_without_its_own():
+    loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
+    changed: Any = mapping._with(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
+    assert changed.observer.gain == (7.0, 7.0, 7.0)
+    assert (changed.hardware.torque_lag, changed.hardware.delay) == (0.2, 1)
 
 
 def test_a_map_without_an_allowed_pair_is_refused():
@@ -96,6 +101,7 @@ def test_a_random_walk_alone_makes_trials_differ():
     assert [scenario.study(one).drawn for one in (still, walking)] == [False, True]
 
 
+@pytest.mark.long
 def test_a_map_on_which_everything_fails_is_written(tmp_path):
     text = SHORT.replace("min_deg = 20.0, max_deg = 60.0", "min_deg = 180.0, max_deg = 180.0")
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text, trials=2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from ptsmc_jax import metrics, rollout
+from ptsmc_jax import catalogues, metrics, rollout
 from tests.helpers import parts, vector
 
 
@@ -128,7 +128,7 @@ def test_an_interval_of_length_zero_changes_nothing():
 
 
 def test_catalogue_names_every_metric():
-    assert tuple(metrics.CATALOGUE) == metrics.Metrics._fields
+    assert tuple(catalogues.CATALOGUE) == metrics.Metrics._fields
 
 
 @pytest.mark.parametrize("flight", [False, True])

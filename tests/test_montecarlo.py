@@ -46,7 +46,8 @@ def test_any_number_of_trials_is_flown(flown, count):
     run, trials = flown
     some = montecarlo.run(run, SPREAD, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
-    np.testing.assert_array_equal(some.vectors("initial_q"), trials.vectors("initial_q")[:count])
+    # one program below `FEW` and another from there on: roundings differ
+    np.testing.assert_allclose(some.vectors("initial_q"), trials.vectors("initial_q")[:count], rtol=0, atol=1e-15)
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
 
 

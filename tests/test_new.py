@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from ptsmc_jax import keys, layouts, metrics, schema
+from ptsmc_jax import catalogues, keys, layouts, schema
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.signal_tables import ATTITUDE_KEYS
@@ -81,7 +81,7 @@ def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
             wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
-    for metric in metrics.CATALOGUES[plant]:
+    for metric in catalogues.CATALOGUES[plant]:
         assert metric in text
 
 

@@ -37,7 +37,7 @@ SMALLER = {
 }
 
 
-QUICK = ("02_sampling_and_noise", "05_your_own_plant")
+QUICK = ("05_your_own_plant",)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from ptsmc_jax.metrics import CATALOGUE
+from ptsmc_jax.catalogues import CATALOGUE
 from ptsmc_jax.requirements import Requirement, fewest_trials, least_within
 
 LIMIT = 0.5

@@ -5,9 +5,9 @@ import re
 import pytest
 
 from ptsmc_jax import schema
+from ptsmc_jax.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
 from ptsmc_jax.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
 from ptsmc_jax.law_tables import Baseline, Prescribed
-from ptsmc_jax.metrics import CATALOGUE, CATALOGUES, STATE_CATALOGUE
 from ptsmc_jax.plant_tables import ChainPlant
 from ptsmc_jax.scenario import from_tables
 from ptsmc_jax.schema import ScenarioError

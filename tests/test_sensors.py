@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, clock, draws, plants, sensors
+from ptsmc_jax import attitude, clock, draws, formulas, plants, sensors
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
@@ -263,5 +263,5 @@ def test_bias_of_the_gyro_is_constant_and_has_its_size():
 def test_density_becomes_a_sigma_a_sample():
     """White noise of density N, averaged over T: its integral has the variance N^2 t, whatever T is."""
     for period in (0.01, 0.2):
-        sigma = sensors.per_sample(1e-5, period)
+        sigma = formulas.per_sample(1e-5, period)
         np.testing.assert_allclose(sigma * period * np.sqrt(100.0 / period), 1e-5 * np.sqrt(100.0), rtol=1e-12)

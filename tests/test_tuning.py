@@ -230,7 +230,8 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
     assert np.all(np.isfinite(slope))
 
 
-@pytest.mark.parametrize("tail", helpers.short([None, 3], [3]))
+@pytest.mark.long
+@pytest.mark.parametrize("tail", [None, 3])
 def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
     """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
     turned = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(np.pi)))
@@ -295,6 +296,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert np.asarray(c).max() <= 0.0
 
 
+@pytest.mark.long
 def test_starts_begin_with_the_first_one_and_differ():
     limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     share = starts.starting_points(Evaluator(limits), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)

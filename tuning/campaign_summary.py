@@ -11,7 +11,7 @@ import polars as pl
 
 from ptsmc_jax import campaign as flying
 from ptsmc_jax import campaign_plots as plots
-from ptsmc_jax import drawing, metrics, rows, runs, scenario, schema, statistics, store
+from ptsmc_jax import catalogues, drawing, rows, runs, scenario, schema, statistics, store
 from ptsmc_jax.requirements import Requirement, Verdict
 from ptsmc_jax.rollout import STATUS
 from ptsmc_jax.store import RefusedError
@@ -194,7 +194,7 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
             made["fan"] = plots.fan(
                 t, error[finished[: shown.size]], (hardest, course[0]), folder.scenario.controller.t_f, kind
             )
-        units = {name: metrics.CATALOGUES[kind].get(name, ("",))[0] for name in names}
+        units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
         made["distributions"] = plots.distributions(
             {
                 name: (units[name], np.where(finished, frame[name].to_numpy(), np.nan), limits.get(name))

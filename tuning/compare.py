@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from ptsmc_jax import drawing, law_tables, metrics, plant_tables, schema, store, study_plots, tables
+from ptsmc_jax import catalogues, drawing, law_tables, plant_tables, schema, store, study_plots, tables
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.requirements import Verdict
 from ptsmc_jax.scenario import replace, study
@@ -218,7 +218,7 @@ _SHARES = ("0.01", "0.5", "0.99")
 
 
 def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
-    unit = metrics.CATALOGUE["settling_time"][0]
+    unit = catalogues.CATALOGUE["settling_time"][0]
     sets = {law: one.trials for law, one in made.contenders.items()}
     t_f = made.contenders[OURS].flown.controller.t_f
     yield "settling", study_plots.settling_by_angle(

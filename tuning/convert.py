@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ptsmc_jax import attitude_keys, schema
-from ptsmc_jax.metrics import CATALOGUES
+from ptsmc_jax.catalogues import CATALOGUES
 from ptsmc_jax.schema import ScenarioError
 from ptsmc_jax.signal_tables import ATTITUDE_KEYS, Initial
 from tuning.options import UsageError

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax import checks, free_gains, keys, layouts, metrics, scenario, schema
+from ptsmc_jax import catalogues, checks, free_gains, keys, layouts, scenario, schema
 from ptsmc_jax.law_tables import Prescribed
 from ptsmc_jax.signal_tables import Attitude
 from ptsmc_jax.tables import Scenario, Tune
@@ -116,7 +116,7 @@ class _File:
 
     def requirements(self) -> Iterator[str]:
         """Those that are there, or two of the many."""
-        catalogue, live = metrics.CATALOGUES[self.plant], self.live.get("requirements")
+        catalogue, live = catalogues.CATALOGUES[self.plant], self.live.get("requirements")
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
             f"The metrics are {', '.join(catalogue)}. "
@@ -157,7 +157,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
     kind = plant or "spacecraft"
     given = raw or {"plant": {"kind": kind, **({"system": EXAMPLES["plant.system"]} if kind == "system" else {})}}
-    said = schema.parse(given, metrics.CATALOGUES)
+    said = schema.parse(given, catalogues.CATALOGUES)
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
     # a system stands in a file that its user has yet to write: it cannot be checked

@@ -69,18 +69,16 @@ def prepare(
     """
     if device != "cpu" and device != "gpu":
         raise UsageError(f"--device is {device}, but must be cpu or gpu")
-    from ptsmc_jax import schema
+    from ptsmc_jax import reading
 
-    raw = schema.load(scenario) if scenario is not None else {}
+    loaded = reading.from_tables({}) if scenario is None else reading.read(scenario)
     from ptsmc_jax.configure import NoDeviceError, configure
 
     try:
         configure(device=device, bits=bits, keep_programs=True)
     except NoDeviceError as error:
         raise UsageError(f"--device is {device}, but {error}") from None
-    from ptsmc_jax.scenario import from_tables
-
-    name, loaded = scenario.stem if scenario is not None else "default", from_tables(raw)
+    name = "default" if scenario is None else scenario.stem
     if scenario is not None:
         from tuning import own_parts
 

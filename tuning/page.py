@@ -240,7 +240,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
-    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.catalogues import CATALOGUES
 
     summary, units = result.summary, {name: unit for name, (unit, _) in CATALOGUES[result.kind].items()}
     known = result.scenario.get("requirements", {}).get("peak_torque")

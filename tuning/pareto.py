@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import drawing, metrics, schema, statistics, store, study_plots, systems
+from ptsmc_jax import catalogues, drawing, schema, statistics, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario import study
@@ -297,6 +297,6 @@ def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_b
     if figures:
         known = scenario.requirements.get(TORQUE)
         limit = None if known is None else _limited(scenario)[1]
-        units = tuple(metrics.CATALOGUES[scenario.plant.kind][name][0] for name in ("window_error", TORQUE))
+        units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name][0] for name in ("window_error", TORQUE))
         drawn = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
         drawing.save({"front": drawn}, folder / "figures")

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax import drawing, free_gains, metrics, schema, store, study_plots, systems
+from ptsmc_jax import catalogues, drawing, free_gains, schema, store, study_plots, systems
 from ptsmc_jax.montecarlo import Trials
 from ptsmc_jax.tables import Scenario
 from tuning import gains as gain_names
@@ -23,7 +23,7 @@ JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # sta
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
     summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
-    for name in metrics.CATALOGUES[kind]:
+    for name in catalogues.CATALOGUES[kind]:
         values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
         if known.size == 0:
@@ -173,7 +173,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
     limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
-    unit = "s" if scenario.tune.objective == "t_f" else metrics.CATALOGUES[kind]["window_error"][0]
+    unit = "s" if scenario.tune.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
     goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
     found = {

@@ -31,7 +31,7 @@ def verdict(told: Summary) -> str:
 
 def run(summary: Summary, kind: str) -> Table:
     """Metrics of one run; kind: of its plant."""
-    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.catalogues import CATALOGUES
 
     none = "never" if summary["status"] in ("ok", "missed") else "-"
     known = {name: said for name, said in CATALOGUES[kind].items() if name in summary}
@@ -54,8 +54,8 @@ def run_lines(summary: Summary) -> list[str]:
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
+    from ptsmc_jax.catalogues import CATALOGUES
     from ptsmc_jax.layouts import MARGINS
-    from ptsmc_jax.metrics import CATALOGUES
 
     units = {**CATALOGUES[kind], **MARGINS}
     return [
@@ -67,7 +67,7 @@ def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
 
 def tuning(summary: Summary) -> Table:
     """Gains and what they do, beside the paper's and those before."""
-    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.catalogues import CATALOGUES
     from tuning.gains import UNITS, base
 
     groups = {"paper": summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
@@ -265,7 +265,7 @@ def comparison_lines(summary: Summary) -> Iterator[str]:
 
 def front(summary: Summary) -> Table:
     """Points that no other one beats, and the paper's and the scenario's own gains."""
-    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.catalogues import CATALOGUES
     from tuning.gains import base
 
     units = CATALOGUES[summary["plant"]]
@@ -310,7 +310,7 @@ def front_heading(summary: Summary) -> str:
 
 def campaign(summary: Summary) -> Table:
     """Quantiles of every metric."""
-    from ptsmc_jax.metrics import CATALOGUES
+    from ptsmc_jax.catalogues import CATALOGUES
 
     rows: list[tuple[str, ...]] = []
     for name, told in summary["quantiles"].items():
