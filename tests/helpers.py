@@ -170,7 +170,7 @@ def finer(run: Parts, times: int) -> Parts:
 
 
 def short(cases: Any, kept: Any) -> list[Any]:
-    """Cases for `parametrize`, all but those kept marked `long`."""
+    """Cases for `parametrize`, a tuple being several arguments, all but those kept marked `long`."""
     many = [case if isinstance(case, tuple) else (case,) for case in cases]
     return [case if case in kept else pytest.param(*one, marks=pytest.mark.long)
             for case, one in zip(cases, many, strict=True)]  # fmt: skip

@@ -38,6 +38,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     # one axis alone bears at least as much as all at once
     assert found["together"]["gain_up"] <= min(one["gain_up"] for one in found["hold"].values()) * (1 + 1e-6)
     assert len(found["sensors"]) == 6
+    assert all({"gain_up", "phase", "modulus"} <= set(one) and "delay" not in one for one in found["sensors"].values())
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
     made = page.build(folder)
     assert "ptsmc margins scenario.toml" in made
