@@ -32,16 +32,19 @@ SHORT = ("filter, slow star tracker, lag", "wheels, lag")
     [(case, 500) for case in SHORT] + [pytest.param(case, 2000, marks=pytest.mark.long) for case in CASES],
 )
 def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials):
-    """RMS of 500 trials, 3 % of sampling error at most; the rest is what the law does beyond first order."""
+    """RMS of 500 trials, 3 % of sampling error at most; the rest is what the law does beyond first order.
+
+    What the law leaves without noise, in the same trials, is taken away.
+    """
     noisy = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **{**QUIET, **CASES[case]})
     given = {f"hardware__{k}": v for k, v in NOISES.items() if getattr(noisy.hardware, k)}
     still = scenario.replace(noisy, **given, disturbance={"kind": "none"})
     rms = []
-    for one, count in ((noisy, trials), (still, 200)):
+    for one in (noisy, still):
         ready = scenario.study(one)
-        flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(count))
+        flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials))
         assert np.all(flown.finished)
         rms.append(float(np.sqrt(np.mean(flown.metrics.window_error**2))))
     share = np.sqrt(rms[0] ** 2 - rms[1] ** 2)
-    assert share > 0.5 * rms[0]  # the noise can be told from the rest
+    assert share > 0.4 * rms[0]  # the noise can be told from the rest
     np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
