@@ -14,6 +14,7 @@ disturbance; of a star tracker that is slower than the loop the mean over its in
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -255,7 +256,9 @@ def opened_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Opened:
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
 
 
-_opened = programs.jit(jax.vmap(opened, (None, 0)), compiler_options=programs.QUICKLY)
+@programs.jit(compiler_options=programs.QUICKLY)
+def _opened(parts: Parts, during: Nominal) -> Opened:
+    return jax.vmap(partial(opened, parts))(during)
 
 
 def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
