@@ -1,5 +1,6 @@
 """Compiled programs that are kept: what is loaded, what is not, and that in any doubt the right numbers come out."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -217,3 +218,16 @@ def test_processes_share_programs_with_lapack_and_several_devices_in_them(tmp_pa
         assert 1 in both.map(run, ["first", "first"])
     assert run("last") == 0
     assert len(list((tmp_path / "programs").iterdir())) == 1
+
+
+def test_every_program_is_a_function_of_its_module():
+    """Called by keywords where it is kept, and known by its name: no function that another one wraps, as vmap does."""
+    found = 0
+    for path in sorted((ROOT / "ptsmc_jax").glob("*.py")) + sorted((ROOT / "tuning").glob("*.py")):
+        module = importlib.import_module(f"{path.parent.name}.{path.stem}")
+        for program in [v for v in vars(module).values() if isinstance(v, programs.Program)]:
+            home = sys.modules[program._function.__module__]
+            named = getattr(home, program._function.__name__)
+            assert named is program or named is program._function, program._function
+            found += 1
+    assert found > 20
