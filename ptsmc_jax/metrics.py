@@ -14,7 +14,7 @@ Scalar = Float[Array, ""]
 
 
 class Metrics(NamedTuple):
-    """Metrics of a run, scalars; units and meaning in `CATALOGUES`. settling_time is NaN where it never settles."""
+    """Metrics of a run, scalars; units and meaning in `catalogues`. settling_time is NaN where it never settles."""
 
     terminal_error: Array
     terminal_angle: Array
