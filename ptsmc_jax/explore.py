@@ -147,13 +147,14 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
     return runs.floor(what, seed)
 
 
-def verdicts(what: Scenario, rows: pl.DataFrame) -> list[Verdict]:
+def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
     """One for each requirement of the scenario over these rows; a failed trial breaks every one of its runs.
 
-    Margins are those of its loop, see `margin_verdicts`.
+    Margins are those of its loop, see `margin_verdicts`; where inertias are drawn, of the loops of this seed's trials.
     """
+    _whole("seed", seed)
     asked = scenario.margin_requirements(what)
-    judged = margin_verdicts.over_trials(scenario.study(what), 0) if asked else []
+    judged = margin_verdicts.over_trials(scenario.study(what), seed) if asked else []
     return [*campaign.verdicts(scenario.requirements(what), rows), *judged]
 
 

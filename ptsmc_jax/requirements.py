@@ -98,12 +98,14 @@ def verdict_text(
     *,
     at_least: bool = False,
 ) -> str:
-    """A verdict in one line; worst: None or NaN where a trial failed or has no value."""
+    """A verdict in one line; worst: None or NaN where a trial failed or has no value, or is infinite."""
     wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -")
     if quantile is not None:
         wanted += f" in {100 * quantile:g} % of trials"
         wanted += f" with {100 * confidence:g} % confidence" if confidence is not None else ""
-    if worst is None or worst != worst:
+    if at_least and not failures and (worst is None or math.isinf(worst)):
+        seen = "unlimited"  # an infinite margin, which JSON has no number for
+    elif worst is None or worst != worst:
         seen = "no value" if trials == 1 else "no worst value"
     else:
         seen = f"worst {worst:.4g}" if trials > 1 else f"{worst:.4g}"

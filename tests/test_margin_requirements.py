@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import layouts, margin_verdicts, margins, scenario
-from ptsmc_jax.requirements import Requirement, over
+from ptsmc_jax import explore, layouts, margin_verdicts, margins, scenario, store
+from ptsmc_jax.requirements import Requirement, over, verdict_text
 from tests.helpers import SHORT
 from tuning import margin_rows, report, stability
 from tuning.gains import with_gains
@@ -50,11 +50,16 @@ def test_every_margin_has_its_requirement():
 @pytest.mark.parametrize(
     ("value", "met", "over"), [(6.0, True, 1.0), (5.9, False, 1.0 + 0.1 / 6), (np.inf, True, 0.0), (-3.0, False, 2.5)]
 )
-def test_a_margin_is_to_be_at_least_its_limit(value, met, over):
+def test_a_margin_is_to_be_at_least_its_limit(value, met, over, tmp_path):
     verdict = Requirement("gain_margin", 6.0, "dB", at_least=True).verdict(np.asarray(value), np.asarray(True))
     assert verdict.met == met
     np.testing.assert_allclose(verdict.margin, over, rtol=1e-12)
     assert str(verdict).startswith("gain_margin at least 6 dB")
+    store.write_json(tmp_path / "kept.json", {"worst": verdict.worst})
+    kept = json.loads((tmp_path / "kept.json").read_text())["worst"]  # null where infinite
+    read = verdict_text(verdict.metric, verdict.limit, "dB", kept, verdict.failures, 1, at_least=True)
+    assert read == str(verdict)
+    assert ("unlimited" in read) == np.isinf(value)
 
 
 def test_of_many_loops_the_smallest_margin_counts_and_one_without_a_value_breaks_the_limit():
@@ -104,6 +109,8 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     numeric = (c[:, 0] - 8 * c[:, 1] + 8 * c[:, 2] - c[:, 3]) / (12 * step)
     exact = np.moveaxis(np.asarray(found["c_slope"]), -1, 0)
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8 * np.abs(exact).max())
+    told = explore.verdicts(posed.ready.scenario, explore.trials(posed.ready.scenario, 2, seed=3), seed=3)[-2:]
+    assert [v.worst for v in told] == [v.worst for v in verdicts]  # of the loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
     np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
