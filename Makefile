@@ -22,7 +22,7 @@ test-long: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m long
 
 table: $(VENV)/.installed
-	$(BIN)/python -m tuning.table
+	$(BIN)/python -m tuning.studies.table
 
 notebooks: $(VENV)/.installed-notebooks
 	$(BIN)/jupyter lab notebooks

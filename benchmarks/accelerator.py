@@ -24,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from common import medians, peak_rate, row, say, step_operations, steps, study
 
-from ptsmc_jax import kernel, lanes, montecarlo
-from tuning.gains import with_gains
+from ptsmc_jax.batching import kernel, lanes
+from ptsmc_jax.campaigns import montecarlo
+from tuning.search.gains import with_gains
 
 ATTAINABLE = 0.4  # of the rate of multiply-adds
 

@@ -182,7 +182,8 @@ def apart() -> None:
     from common import say
     from scipy.spatial.transform import Rotation
 
-    from ptsmc_jax import runs, scenario
+    from ptsmc_jax import scenario
+    from ptsmc_jax.campaigns import runs
 
     say("largest angle between the library's flight and Basilisk's of the same torques, 45 s [rad]")
     for name, table in FLIGHTS.items():
@@ -214,7 +215,7 @@ def main() -> None:
     executing, all_in = np.median(theirs, axis=0)
     from common import machine, medians, row, say, steps, study
 
-    from ptsmc_jax import montecarlo
+    from ptsmc_jax.campaigns import montecarlo
 
     trials, ready = np.arange(16_384), {"without noise": study(), "with noise": study(noise=True)}
 

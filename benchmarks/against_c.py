@@ -11,7 +11,8 @@ from functools import partial  # noqa: E402
 
 from common import C_METRICS, Program, machine, medians, row, say, steps, study  # noqa: E402
 
-from ptsmc_jax import montecarlo, rollout  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.simulation import rollout  # noqa: E402
 
 TRIALS = 16384
 

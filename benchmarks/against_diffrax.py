@@ -11,9 +11,9 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, row, say, steps, study  # noqa: E402
 
-from ptsmc_jax import montecarlo  # noqa: E402
-from ptsmc_jax.clock import Ticks  # noqa: E402
-from ptsmc_jax.plants import AttitudeState  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.devices.ticks import Ticks  # noqa: E402
+from ptsmc_jax.plants.rigid_body import AttitudeState  # noqa: E402
 
 TRIALS = 1024
 CLASSICAL = diffrax.ButcherTableau(

@@ -113,7 +113,7 @@ def main(python: str) -> None:
     configure()
     from common import machine, medians, row, say, steps, study
 
-    from ptsmc_jax import montecarlo
+    from ptsmc_jax.campaigns import montecarlo
 
     cores = len(os.sched_getaffinity(0))
     theirs = subprocess.Popen([python, __file__, "fly", str(cores)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,

@@ -12,7 +12,7 @@ from common import SCENARIO, machine, say
 # a process of its own, so that its largest memory is its own
 RUN = """
 import resource, sys
-from tuning.cli import main
+from tuning.cli.main import main
 try:
     main()
 finally:

@@ -17,10 +17,12 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from ptsmc_jax import kernel, montecarlo, scenario
-from ptsmc_jax.clock import Anchored
-from ptsmc_jax.rollout import Parts
+from ptsmc_jax import scenario
+from ptsmc_jax.batching import kernel
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario import Study
+from ptsmc_jax.simulation.clock import Anchored
+from ptsmc_jax.simulation.rollout import Parts
 
 HERE = Path(__file__).parent
 SCENARIO = HERE.parent / "scenarios" / "first_flight.toml"

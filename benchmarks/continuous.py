@@ -14,7 +14,8 @@ import numpy as np  # noqa: E402
 from common import machine, medians, say  # noqa: E402
 from scipy.integrate import solve_ivp  # noqa: E402
 
-from ptsmc_jax import rollout, scenario  # noqa: E402
+from ptsmc_jax import scenario  # noqa: E402
+from ptsmc_jax.simulation import rollout  # noqa: E402
 
 ERROR = 1e-9  # wanted in the attitude error vector at t_f
 

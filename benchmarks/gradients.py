@@ -10,10 +10,10 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
-from ptsmc_jax import montecarlo  # noqa: E402
-from ptsmc_jax.requirements import Requirement  # noqa: E402
-from tuning import objective  # noqa: E402
-from tuning.objective import Problem, measure  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.simulation.requirements import Requirement  # noqa: E402
+from tuning.search import objective  # noqa: E402
+from tuning.search.objective import Problem, measure  # noqa: E402
 
 GAINS = ("eta", "delta", "observer_gain")
 AT = jnp.asarray([2.9, 1.0, 100.0])

@@ -7,7 +7,8 @@ configure()
 import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
-from ptsmc_jax import montecarlo, scenario  # noqa: E402
+from ptsmc_jax import scenario  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 
 
 def chain(order: int):

@@ -13,7 +13,8 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 from common import SCENARIO, machine, say  # noqa: E402
 
-from ptsmc_jax import montecarlo, scenario  # noqa: E402
+from ptsmc_jax import scenario  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 
 FLIGHT = scenario.replace(scenario.read(SCENARIO), tune=None)
 AWAY = {"quat_xyzw": [0.5, 0.5, 0.5, 0.5]}

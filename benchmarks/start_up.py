@@ -43,7 +43,9 @@ def compiling() -> None:
     import jax.numpy as jnp
     from common import study
 
-    from ptsmc_jax import montecarlo, rollout, scenario
+    from ptsmc_jax import scenario
+    from ptsmc_jax.campaigns import montecarlo
+    from ptsmc_jax.simulation import rollout
 
     devices = {f"torque_{name}": value for name, value in (("limit", 0.5), ("rate_limit", 5.0), ("lag", 0.1))}
     every = {f"hardware__{k}": v for k, v in {**devices, "delay": 1, "torque_step": 1e-4, "rate_bias": 1e-6}.items()}

@@ -46,7 +46,7 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 def variants() -> dict[str, Callable]:
     """What is left out or changed, by name: a context to search in."""
-    from tuning import descents, optimise, refine, starts
+    from tuning.search import descents, optimise, refine, starts
 
     everything = descents.Descents
 
@@ -91,7 +91,8 @@ def main() -> None:
     """Print a line a search, and the table."""
     configure()
     from ptsmc_jax import scenario
-    from tuning import evolution, optimise, report
+    from tuning.search import evolution, optimise
+    from tuning.studies import tuner
 
     seeds, wanted = int(sys.argv[1]) if len(sys.argv) > 1 else 20, sys.argv[2:] or [*FILES, "chain"]
     KEPT.parent.mkdir(exist_ok=True)
@@ -108,7 +109,7 @@ def main() -> None:
         loaded = scenario.from_tables(CHAIN) if name == "chain" else scenario.read(SCENARIOS / f"{FILES[name]}.toml")
         table = loaded.tune
         assert table is not None
-        posed = report.pose(loaded, 0)
+        posed = tuner.pose(loaded, 0)
         evaluate = posed.evaluate
         for seed in range(seeds):
             for variant, inside in variants().items():

@@ -61,7 +61,7 @@ def main() -> None:
     """Print a line a run, and the shares."""
     configure()
     from ptsmc_jax import scenario
-    from tuning import report
+    from tuning.studies import tuner
 
     seeds, names = int(sys.argv[1]) if len(sys.argv) > 1 else 20, sys.argv[2:]
     said = kept = runs = 0
@@ -71,7 +71,7 @@ def main() -> None:
         loaded = scenario.from_tables({**tables, "tune": TUNE})
         for seed in range(seeds):
             started = time.monotonic()
-            found = report.tune(loaded, seed, trusted=False)
+            found = tuner.tune(loaded, seed, trusted=False)
             search = found.search
             training = bool((search.worst <= 1.0).all()) and all(one.held for one in search.counts)
             fresh = all(verdict.met for verdict in found.verdicts)

@@ -17,16 +17,17 @@ from ptsmc_jax.configure import configure
 
 def fresh_trials(loaded, names, values, requirements) -> str:
     """Tuned gains on fresh trials of three seeds: RMS, what it is beside the floor, and the largest peak torque."""
-    from tuning import gains, report
+    from tuning.search import gains
+    from tuning.studies import tuner
 
     made = gains.in_scenario(loaded, dict(zip(names, values.tolist(), strict=True)))
     rms, above, off, peaks = [], [], [], []
     for seed in range(3):
-        flown = report.judge(made, report.seed_of_judge(seed), requirements)
+        flown = tuner.judge(made, tuner.seed_of_judge(seed), requirements)
         squares = flown.metrics.window_error[flown.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
-        floor = report.floor_of(made, report.seed_of_judge(seed))
+        floor = tuner.floor_of(made, tuner.seed_of_judge(seed))
         if floor:
             above.append(rms[-1] / floor)
             off.append((rms[-1] - floor) / error)
@@ -41,7 +42,8 @@ def main() -> None:
     """Print a line a seed."""
     configure()
     from ptsmc_jax import scenario
-    from tuning import evolution, gains, optimise, report
+    from tuning.search import evolution, gains, optimise
+    from tuning.studies import tuner
 
     path, (first, end) = sys.argv[1], (0, 20)
     if len(sys.argv) > 2:
@@ -53,7 +55,7 @@ def main() -> None:
         loaded = scenario.replace(loaded, tune__free=sys.argv[3].split(","), tune__bounds=None)
     table = loaded.tune
     assert table is not None
-    posed = report.pose(loaded, 0)
+    posed = tuner.pose(loaded, 0)
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
@@ -79,13 +81,13 @@ def main() -> None:
         near = [one.value <= 1.01 * reference for one in found]
         print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
               f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
-    fresh = report.seed_of_judge(0)
-    paper = report.judge(gains.papers(loaded), fresh, ready.requirements)
+    fresh = tuner.seed_of_judge(0)
+    paper = tuner.judge(gains.papers(loaded), fresh, ready.requirements)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
-    tuned = report.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
+    tuned = tuner.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]
     peak = [float(np.mean(one.metrics.peak_torque[one.finished])) for one in (paper, tuned)]
-    floor = report.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
+    floor = tuner.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
     print(f"on {tuned.status.size} fresh trials: {rms[1]:.4e}, {rms[1] / floor:.3f} times the floor; "
           f"{rms[0] / rms[1]:.2f} times the paper's accuracy at {peak[1] / peak[0]:.3f} of its mean peak torque, "
           f"largest {np.max(tuned.metrics.peak_torque[tuned.finished]):.4f} N m")  # fmt: skip

@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
-from ptsmc_jax import catalogues, keys, layouts, schema
-from ptsmc_jax.signal_tables import Attitude
-from ptsmc_jax.tables import Limit
-from ptsmc_jax.values import Table
-from tuning.cli import app
+from ptsmc_jax.scenario import errors, keys, layouts
+from ptsmc_jax.scenario.signal_tables import Attitude
+from ptsmc_jax.scenario.tables import Limit
+from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.simulation import catalogues
+from tuning.cli.main import app
 
 HERE = Path(__file__).parent
 MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
@@ -127,7 +128,7 @@ def _dispersion(struct: type[Table]) -> Iterator[str]:
 
 def _default(value: object) -> str:
     shown = isinstance(value, bool | int | float | str | tuple | list) and value != ()
-    return f"`{schema.show(value)}`" if shown else ""
+    return f"`{errors.show(value)}`" if shown else ""
 
 
 def _grid(header: str, rows: list[list[str]]) -> str:

@@ -72,7 +72,7 @@ run.animate()
 # column says by how much. `ptsmc reproduce` makes this table, gives the reasons and draws every figure of the paper.
 
 # %%
-from tuning import reproduction
+from tuning.studies import reproduction
 
 made = reproduction.reproduce()
 with pl.Config(tbl_rows=20, fmt_str_lengths=220, tbl_width_chars=220, tbl_hide_dataframe_shape=True):

@@ -20,9 +20,10 @@ from ptsmc_jax.configure import configure
 configure()
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import study_plots
 from ptsmc_jax.explore import Figures
-from tuning import pareto, report, results, show
+from ptsmc_jax.figures import study_plots
+from tuning.output import terminal
+from tuning.studies import pareto, tune_files, tuner
 
 flight = ptsmc.read("../scenarios/first_flight.toml")
 small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
@@ -34,15 +35,15 @@ small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # 
 # `worst_case = true` if that must not be), and whether the slopes were right.
 
 # %%
-tuned = report.tune(small, seed=0)
-show.tuning(results.summary(tuned), "out/tune-first_flight", "done")
+tuned = tuner.tune(small, seed=0)
+terminal.tuning(tune_files.summary(tuned), "out/tune-first_flight", "done")
 
 # %% [markdown]
 # Each line is a start on its way to the optimum next to it. Grey is beyond a limit, blue keeps it; the gains below the
 # goal show into which valley each start went. From the best end the search goes on to more digits.
 
 # %%
-made = results.figures_of(small, tuned)
+made = tune_files.figures_of(small, tuned)
 Figures({"history": made["history"]})
 
 # %% [markdown]

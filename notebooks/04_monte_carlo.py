@@ -21,7 +21,8 @@ import tempfile
 from pathlib import Path
 
 import ptsmc_jax as ptsmc
-from tuning import campaign_folder, campaign_summary, show_campaign
+from tuning.output import campaign_terminal
+from tuning.studies import campaign_folder, campaign_summary
 
 # %% [markdown]
 # The gains of `ptsmc tune scenarios/first_flight.toml` (its `tuned.toml`, so with the flight clock on which they were
@@ -61,7 +62,7 @@ folder = campaign_folder.Folder(place, flight, seed=1, trials=20_000)
 campaign_folder.begin(folder, force=False)
 campaign_folder.fly(folder, (1, 1), lambda standing: None)
 found = campaign_summary.summarise(folder)
-show_campaign.campaign(found, Path("campaign"))
+campaign_terminal.campaign(found, Path("campaign"))
 
 # %% [markdown]
 # The fan shows where 50, 90 and 99.7 % of a thousand trials lie at each time, with the run of the largest window error;

@@ -76,7 +76,7 @@ axes.legend()
 # %%
 from dataclasses import replace
 
-from ptsmc_jax import rollout
+from ptsmc_jax.simulation import rollout
 
 parts = scenario.study(swing).parts
 

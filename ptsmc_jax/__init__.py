@@ -10,89 +10,89 @@ __version__ = "0.1.0"
 
 # name: module
 _EXPORTS = {
-    "AttitudeState": "plants",
-    "Spacecraft": "plants",
-    "spacecraft": "plants",
-    "Constant": "signals",
-    "Fixed": "signals",
-    "Sinusoid": "signals",
-    "Slew": "signals",
-    "Spin": "signals",
-    "Swing": "signals",
-    "Target": "signals",
-    "Chain": "plants",
-    "chain": "plants",
-    "PrescribedTime": "controllers",
-    "PrescribedTimeChain": "controllers",
-    "NoObserver": "observers",
-    "NonlinearObserver": "observers",
-    "Sensors": "sensors",
-    "Parts": "rollout",
-    "Result": "rollout",
-    "STATUS": "rollout",
+    "AttitudeState": "plants.rigid_body",
+    "Spacecraft": "plants.rigid_body",
+    "spacecraft": "plants.rigid_body",
+    "Constant": "signals.disturbances",
+    "Fixed": "signals.references",
+    "Sinusoid": "signals.disturbances",
+    "Slew": "signals.references",
+    "Spin": "signals.references",
+    "Swing": "signals.references",
+    "Target": "signals.references",
+    "Chain": "plants.integrator_chain",
+    "chain": "plants.integrator_chain",
+    "PrescribedTime": "laws.prescribed_time",
+    "PrescribedTimeChain": "laws.prescribed_time",
+    "NoObserver": "observers.none",
+    "NonlinearObserver": "observers.nonlinear",
+    "Sensors": "devices.sensors",
+    "Parts": "simulation.rollout",
+    "Result": "simulation.rollout",
+    "STATUS": "simulation.rollout",
     "simulate": "explore",
     "floor": "explore",
     "trials": "explore",
     "verdicts": "explore",
     "read": "scenario",
     "replace": "scenario",
-    "simulate_jit": "rollout",
-    "Metrics": "metrics",
-    "Dispersion": "dispersions",
-    "Requirement": "requirements",
-    "Scenario": "tables",
-    "ScenarioError": "schema",
-    "PrescribedTimeMultiplicative": "controllers",
-    "PrescribedTimeSystem": "controllers",
-    "FiniteTimeObserver": "observers",
-    "PrescribedTimeObserver": "observers",
-    "System": "plants",
-    "system": "plants",
+    "simulate_jit": "simulation.rollout",
+    "Metrics": "simulation.metrics",
+    "Dispersion": "dispersions.variation",
+    "Requirement": "simulation.requirements",
+    "Scenario": "scenario.tables",
+    "ScenarioError": "scenario.errors",
+    "PrescribedTimeMultiplicative": "laws.prescribed_time",
+    "PrescribedTimeSystem": "laws.prescribed_time",
+    "FiniteTimeObserver": "observers.finite_time",
+    "PrescribedTimeObserver": "observers.prescribed_time",
+    "System": "plants.second_order",
+    "system": "plants.second_order",
     "Study": "scenario",
     "study": "scenario",
 }
 
 if TYPE_CHECKING:
-    from ptsmc_jax.controllers import PrescribedTime as PrescribedTime
-    from ptsmc_jax.controllers import PrescribedTimeChain as PrescribedTimeChain
-    from ptsmc_jax.controllers import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
-    from ptsmc_jax.controllers import PrescribedTimeSystem as PrescribedTimeSystem
-    from ptsmc_jax.dispersions import Dispersion as Dispersion
+    from ptsmc_jax.devices.sensors import Sensors as Sensors
+    from ptsmc_jax.dispersions.variation import Dispersion as Dispersion
     from ptsmc_jax.explore import floor as floor
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
-    from ptsmc_jax.metrics import Metrics as Metrics
-    from ptsmc_jax.observers import FiniteTimeObserver as FiniteTimeObserver
-    from ptsmc_jax.observers import NonlinearObserver as NonlinearObserver
-    from ptsmc_jax.observers import NoObserver as NoObserver
-    from ptsmc_jax.observers import PrescribedTimeObserver as PrescribedTimeObserver
-    from ptsmc_jax.plants import AttitudeState as AttitudeState
-    from ptsmc_jax.plants import Chain as Chain
-    from ptsmc_jax.plants import Spacecraft as Spacecraft
-    from ptsmc_jax.plants import System as System
-    from ptsmc_jax.plants import chain as chain
-    from ptsmc_jax.plants import spacecraft as spacecraft
-    from ptsmc_jax.plants import system as system
-    from ptsmc_jax.requirements import Requirement as Requirement
-    from ptsmc_jax.rollout import STATUS as STATUS
-    from ptsmc_jax.rollout import Parts as Parts
-    from ptsmc_jax.rollout import Result as Result
-    from ptsmc_jax.rollout import simulate_jit as simulate_jit
+    from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
+    from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
+    from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
+    from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem as PrescribedTimeSystem
+    from ptsmc_jax.observers.finite_time import FiniteTimeObserver as FiniteTimeObserver
+    from ptsmc_jax.observers.none import NoObserver as NoObserver
+    from ptsmc_jax.observers.nonlinear import NonlinearObserver as NonlinearObserver
+    from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver as PrescribedTimeObserver
+    from ptsmc_jax.plants.integrator_chain import Chain as Chain
+    from ptsmc_jax.plants.integrator_chain import chain as chain
+    from ptsmc_jax.plants.rigid_body import AttitudeState as AttitudeState
+    from ptsmc_jax.plants.rigid_body import Spacecraft as Spacecraft
+    from ptsmc_jax.plants.rigid_body import spacecraft as spacecraft
+    from ptsmc_jax.plants.second_order import System as System
+    from ptsmc_jax.plants.second_order import system as system
     from ptsmc_jax.scenario import Study as Study
     from ptsmc_jax.scenario import read as read
     from ptsmc_jax.scenario import replace as replace
     from ptsmc_jax.scenario import study as study
-    from ptsmc_jax.schema import ScenarioError as ScenarioError
-    from ptsmc_jax.sensors import Sensors as Sensors
-    from ptsmc_jax.signals import Constant as Constant
-    from ptsmc_jax.signals import Fixed as Fixed
-    from ptsmc_jax.signals import Sinusoid as Sinusoid
-    from ptsmc_jax.signals import Slew as Slew
-    from ptsmc_jax.signals import Spin as Spin
-    from ptsmc_jax.signals import Swing as Swing
-    from ptsmc_jax.signals import Target as Target
-    from ptsmc_jax.tables import Scenario as Scenario
+    from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
+    from ptsmc_jax.scenario.tables import Scenario as Scenario
+    from ptsmc_jax.signals.disturbances import Constant as Constant
+    from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid
+    from ptsmc_jax.signals.references import Fixed as Fixed
+    from ptsmc_jax.signals.references import Slew as Slew
+    from ptsmc_jax.signals.references import Spin as Spin
+    from ptsmc_jax.signals.references import Swing as Swing
+    from ptsmc_jax.signals.references import Target as Target
+    from ptsmc_jax.simulation.metrics import Metrics as Metrics
+    from ptsmc_jax.simulation.requirements import Requirement as Requirement
+    from ptsmc_jax.simulation.rollout import STATUS as STATUS
+    from ptsmc_jax.simulation.rollout import Parts as Parts
+    from ptsmc_jax.simulation.rollout import Result as Result
+    from ptsmc_jax.simulation.rollout import simulate_jit as simulate_jit
 
 
 def __getattr__(name: str) -> Any:

@@ -9,13 +9,16 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from ptsmc_jax import animation, campaign, catalogues, margin_verdicts, plotting, runs, scenario
-from ptsmc_jax.estimation import Floor
-from ptsmc_jax.montecarlo import OwnMetrics
-from ptsmc_jax.requirements import Verdict
-from ptsmc_jax.runs import Run
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign, margin_verdicts, runs
+from ptsmc_jax.campaigns.montecarlo import OwnMetrics
+from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.figures import animation, run_plots
 from ptsmc_jax.scenario import Study
-from ptsmc_jax.tables import Scenario
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Verdict
+from ptsmc_jax.theory.error_floor import Floor
 
 
 class Quantities(Mapping[str, float]):
@@ -70,7 +73,7 @@ class Flight:
 
     def plot(self, *names: str) -> "Figures":
         """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
-        made = plotting.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
+        made = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
         unknown = [name for name in names if name not in made]
         if unknown:
             raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(made)}")
@@ -139,7 +142,7 @@ def trials(
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
     """RMS window error that no controller can beat in a scenario, in the unit of the metric; 0: nothing is unknown.
 
-    Pooled over a few trials, see `runs.floor`; what is taken as known: `estimation`. None: none of them flies.
+    Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies.
     """
     _whole("seed", seed)
     if not isinstance(what, Study):

@@ -8,7 +8,7 @@ q_d(t) = (0.6 sin 0.8 t, 0.9 + 0.5 cos t) [rad]: x_1 = q - q_d is the error, x_2
 import jax
 import jax.numpy as jnp
 
-from ptsmc_jax.numerics import solve
+from ptsmc_jax.numerics.matrices import solve
 from ptsmc_jax.plants import system
 
 L1, LC1, LC2 = 0.26, 0.0983, 0.0229  # length of link 1, distances to the centres of mass [m]

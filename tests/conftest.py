@@ -8,24 +8,21 @@ import pytest
 from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
+from tests.tree import QUICKLY, modules
 
 # most programs of tests fly once: what optimising saves is less than what it takes; not so in processes of their own
-QUICKLY = " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"  # as in `helpers`
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + QUICKLY
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}"
 configure(devices=2)
 
 import jax  # noqa: E402
 
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
-ROOT = Path(__file__).parent.parent
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # not what walks through programs, equation by equation: it took longer to check every call than to compile
-UNCHECKED = {"lanes", "components", "kernel"}
-modules = [path for name in ("ptsmc_jax", "tuning") for path in (ROOT / name).glob("*.py")]
-checked = [f"{path.parent.name}.{path.stem}" for path in modules if path.stem not in UNCHECKED]
-hook = install_import_hook(checked, "beartype.beartype")
+UNCHECKED = {"ptsmc_jax", "tuning", *(f"ptsmc_jax.batching.{name}" for name in ("lanes", "components", "kernel"))}
+hook = install_import_hook([name for name in modules() if name not in UNCHECKED], "beartype.beartype")
 
 MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
@@ -56,7 +53,7 @@ def _room_for_compiled_programs():
 def command(tmp_path, monkeypatch, capsys):
     """Runs `ptsmc ...` in an empty folder with the scenario `SHORT` as s.toml: exit status, output, errors."""
     from tests.helpers import SHORT
-    from tuning import cli
+    from tuning.cli import main
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
@@ -65,7 +62,7 @@ def command(tmp_path, monkeypatch, capsys):
     def run(*args):
         monkeypatch.setattr(sys, "argv", ["ptsmc", *map(str, args)])
         with pytest.raises(SystemExit) as done:
-            cli.main()
+            main.main()
         told = capsys.readouterr()
         return done.value.code, told.out, told.err
 

@@ -13,12 +13,16 @@ import pytest
 from hypothesis import given, settings
 from polars.testing import assert_frame_equal
 
-from ptsmc_jax import clock, controllers, observers, plants, sensors, signals
-from ptsmc_jax.rollout import Parts
+from ptsmc_jax.devices import sensors
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.observers import none, nonlinear
+from ptsmc_jax.plants import integrator_chain, rigid_body
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation.rollout import Parts
+from tests.tree import QUICKLY as QUICKLY
+from tests.tree import ROOT as ROOT
 
-ROOT = Path(__file__).parent.parent
-# what compiles in half the time and flies at a third of the speed: for programs that fly once
-QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 FIRST_FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 REFERENCE = json.loads((Path(__file__).parent / "spacecraft_continuous.json").read_text())
 
@@ -78,10 +82,10 @@ def parts(
     surface_rate=1.0,
     saves: Any = (),
     reach: tuple[float, float] | None = None,
-    law: Any = controllers.PrescribedTime,
+    law: Any = prescribed_time.PrescribedTime,
 ) -> Parts:
     """Parts of the paper's Case I with changes; continuous unless a period is given; reach: largest (t_f, delta)."""
-    body = plants.spacecraft(inertia)
+    body = rigid_body.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
         timing: Any = clock.graded(t_f, delta, t_end, 1.0, max(k1 / 2, surface_rate), 0.1, (0.2 * t_f, 0.2), saves)
@@ -93,13 +97,13 @@ def parts(
     return Parts(
         plant=body,
         disturbance=disturbance
-        or signals.Sinusoid(vector([0.01] * 3), vector([0.1] * 3), vector([0.0] * 3), vector([0.0] * 3)),
-        reference=reference or signals.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
+        or disturbances.Sinusoid(vector([0.01] * 3), vector([0.1] * 3), vector([0.0] * 3), vector([0.0] * 3)),
+        reference=reference or references.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
         controller=law(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))),
-        observer=observers.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
+        observer=nonlinear.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
         sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,
-        initial=plants.AttitudeState(vector(q), vector(rate)),
+        initial=rigid_body.AttitudeState(vector(q), vector(rate)),
         t_end=vector(t_end),
         window=vector(1.0),
         settling_angle=vector(1e-3),
@@ -127,11 +131,11 @@ def chain_parts(
 ) -> Parts:
     """An integrator chain as long as x0, without disturbance; steps: of a grid of its own, before and after t_s."""
     n, t_end = len(x0), t_f + 2.0
-    model = plants.chain(n, f, g)
+    model = integrator_chain.chain(n, f, g)
     eta = n + 1.0 if eta is None else eta
     a = [float(math.comb(n - 1, i)) for i in range(n - 1)] if a is None else a
     gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
-    law = controllers.PrescribedTimeChain(model, *gains, a=vector(a))
+    law = prescribed_time.PrescribedTimeChain(model, *gains, a=vector(a))
     if period is not None:
         timing: Any = clock.anchored(period, t_end, t_f, 2.0 + delta)
     elif steps is not None:
@@ -141,10 +145,10 @@ def chain_parts(
         timing = clock.graded(t_f, delta, t_end, 1.0, max(law.hold_rates().values()), 0.0, (0.0, 0.0), (), n)
     return Parts(
         plant=model,
-        disturbance=disturbance or signals.Constant(jnp.zeros(1)),
-        reference=signals.Origin(),
+        disturbance=disturbance or disturbances.Constant(jnp.zeros(1)),
+        reference=references.Origin(),
         controller=law,
-        observer=observer or observers.NoObserver(model, vector(bound)),
+        observer=observer or none.NoObserver(model, vector(bound)),
         sensors=None if noise is None else sensors.StateSensor(vector(noise)),
         clock=timing,
         initial=vector(x0),
@@ -188,7 +192,7 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning import confirm, descents, refine, starts, worst
+    from tuning.search import confirm, descents, refine, starts, worst
 
     for module, name, value in (
         (worst, "SCREENED", 64),

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import matplotlib.image
 
-from tuning import page
+from tuning.output import page
 
 ELEMENTS = {
     "html", "head", "meta", "title", "link", "style", "body", "header", "p", "h1", "h2", "main", "section", "div",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude
+from ptsmc_jax.numerics import attitude
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps

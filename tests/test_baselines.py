@@ -9,26 +9,30 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, baselines, clock, numerics, plants, rollout, signals
+from ptsmc_jax.laws import fixed_time, pd, terminal
+from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import clock, rollout
 from tests import helpers
 from tests.helpers import FULL_INERTIA, vector
 
-BODY = plants.spacecraft(FULL_INERTIA)
+BODY = rigid_body.spacecraft(FULL_INERTIA)
 COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
 LAWS = {
-    "pd": baselines.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
-    "terminal": baselines.Terminal(
+    "pd": pd.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
+    "terminal": terminal.Terminal(
         **COMMON, p=vector(1.3), b=vector(0.6), k=vector(0.5), sign_width=vector(1e-3)
     ),
-    "fixed_time": baselines.FixedTime(
+    "fixed_time": fixed_time.FixedTime(
         **COMMON, a1=vector(0.3), b1=vector(0.5), a2=vector(1.2), b2=vector(0.7), p=vector(1.25), gamma=vector(2.0),
         m=vector(1.5), n=vector(0.5), sign_width=vector(1e-3),
     ),
 }  # fmt: skip
 SLIDING = ("terminal", "fixed_time")
 T = vector(1.3)
-TARGET = signals.Spin(vector(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()), vector([0.02, -0.01, 0.03]))(T)
-X = plants.AttitudeState(vector(Rotation.from_rotvec([1.1, 0.4, -0.8]).as_quat()), vector([0.05, -0.11, 0.07]))
+TARGET = references.Spin(vector(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()), vector([0.02, -0.01, 0.03]))(T)
+X = rigid_body.AttitudeState(vector(Rotation.from_rotvec([1.1, 0.4, -0.8]).as_quat()), vector([0.05, -0.11, 0.07]))
 D = vector([0.02, -0.01, 0.015])
 
 
@@ -41,7 +45,7 @@ def accelerated(law, k2=0.0):
         later = jax.tree.map(lambda x, rate: x + t * rate, X, motion)
         rate = TARGET.w
         q = TARGET.q + t * 0.5 * attitude.multiply(TARGET.q, jnp.concatenate([rate, jnp.zeros(1)]))
-        return law.errors(later, signals.Target(q, rate + t * TARGET.w_dot, TARGET.w_dot))[1]
+        return law.errors(later, references.Target(q, rate + t * TARGET.w_dot, TARGET.w_dot))[1]
 
     return jax.jvp(v_dot, (vector(0.0),), (vector(1.0),))[1], s
 
@@ -91,10 +95,10 @@ def test_the_surfaces_draw_near_as_their_papers_say(name, trial):
 def flown(law, angle, rate, t_end, period=0.005):
     """History of the angle about the z axis of a body with no disturbance, sampled quickly."""
     q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
-    body = plants.spacecraft((10.0, 12.0, 14.0))
+    body = rigid_body.spacecraft((10.0, 12.0, 14.0))
     law = replace(law, model=body, t_f=vector(t_end - 1.0), delta=vector(period))
     run = helpers.parts(t_end - 1.0, 3.0, period, inertia=(10.0, 12.0, 14.0), q=q, rate=(0.0, 0.0, rate), period=period,
-                        t_end=t_end, disturbance=signals.Constant(jnp.zeros(3)))  # fmt: skip
+                        t_end=t_end, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
     run = replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))
     log = rollout.simulate_jit(run, record=True).log
     kept = np.asarray(log.lasts)
@@ -138,12 +142,12 @@ def test_on_their_surfaces_they_arrive_when_their_papers_say(name, v):
 def test_signed_powers():
     x = vector([-2.0, -1e-9, 0.0, 0.5, 3.0])
     for a in (0.3, 1.0, 1.7):
-        np.testing.assert_allclose(numerics.signed_power(x, vector(a)), np.sign(x) * np.abs(x) ** a, rtol=1e-14)
-        slope = jax.vmap(jax.grad(lambda v, a=a: numerics.signed_power(v, vector(a))))(x)
+        np.testing.assert_allclose(guards.signed_power(x, vector(a)), np.sign(x) * np.abs(x) ** a, rtol=1e-14)
+        slope = jax.vmap(jax.grad(lambda v, a=a: guards.signed_power(v, vector(a))))(x)
         known = np.asarray(x) != 0.0
         np.testing.assert_allclose(slope[known], a * np.abs(x[known]) ** (a - 1.0), rtol=1e-12)
         assert slope[~known] == 0.0
-    by_power = jax.jvp(lambda a: numerics.signed_power(x, a), (vector(0.7),), (vector(1.0),))[1]
+    by_power = jax.jvp(lambda a: guards.signed_power(x, a), (vector(0.7),), (vector(1.0),))[1]
     assert np.all(np.isfinite(by_power))
 
 
@@ -152,7 +156,7 @@ def test_pd_tells_what_it_drives_to_zero_and_knows_no_singularity():
     q_e, w_e, *_ = law.relative(X, TARGET)
     s = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]
     np.testing.assert_allclose(s, q_e[:3] + 0.9 / 0.4 * w_e, rtol=1e-12)
-    turned = plants.AttitudeState(half, X.w)
+    turned = rigid_body.AttitudeState(half, X.w)
     assert law.clearance(turned, TARGET) == 1.0
     for name in SLIDING:
         np.testing.assert_allclose(LAWS[name].clearance(turned, TARGET), 0.0, atol=1e-15)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import borders
-from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.theory import borders
 from tests.helpers import parts, vector
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax import campaign, montecarlo, rows, runs, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
 from tests.helpers import SHORT, same, short
 
 TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}

@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax import campaign
+from ptsmc_jax.campaigns import campaign
 from tests.helpers import same, short
 from tests.pages import checked
 
@@ -243,7 +243,7 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
 
 def test_a_replay_that_differs_from_its_row_is_told(command, flown):
     """As if a row had been made by another version: the digest is right, the number is not."""
-    from tuning import campaign_folder
+    from tuning.studies import campaign_folder
 
     opened = campaign_folder.opened(flown)
     first = opened.whole_parts()[0]

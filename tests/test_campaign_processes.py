@@ -14,7 +14,7 @@ import pytest
 
 from tests.helpers import ROOT, SHORT, same
 
-PTSMC = [sys.executable, "-c", "from tuning.cli import main; main()"]
+PTSMC = [sys.executable, "-c", "from tuning.cli.main import main; main()"]
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
 PARTS, TRIALS = 8, 8 * 4096 - 1000
 # as long as it takes to be killed in
@@ -124,7 +124,14 @@ def test_on_a_full_disk_it_stops_with_a_sentence_and_goes_on_later(folder, whole
     """A limit on the size of a file stands for the disk: no part fits."""
     limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000)); "
     # the compile cache would not fit either
-    call = [sys.executable, "-c", limited + "from tuning.cli import main; main()", *COMMAND, "--trials", str(TRIALS)]
+    call = [
+        sys.executable,
+        "-c",
+        limited + "from tuning.cli.main import main; main()",
+        *COMMAND,
+        "--trials",
+        str(TRIALS),
+    ]
     full = subprocess.run(call, cwd=folder, env=environment(), text=True, capture_output=True, check=False, timeout=300)
     assert full.returncode == 2, full.stderr
     last = full.stderr.strip().splitlines()[-1]

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax import controllers, formulas, hold, lanes, observers, plants, rollout, signals, theory
+from ptsmc_jax import formulas
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.plants import integrator_chain
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import envelopes, hold, solutions
 from tests.helpers import chain_parts, drawn, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -61,8 +68,8 @@ def test_surface_is_the_derivative_that_defines_it(n):
     at = jnp.stack([state(t) for state in states])
     _, s = law.torque(vector(t), BEFORE, at, None, jnp.zeros(1), vector(0.0))
     np.testing.assert_allclose(s[0], derivative(t) * (t_f - t) ** (eta + n - 1), rtol=1e-11)
-    assert [float(c) for c in controllers.expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
-    assert [float(c) for c in controllers.expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
+    assert [float(c) for c in prescribed_time.expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
+    assert [float(c) for c in prescribed_time.expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
@@ -117,7 +124,7 @@ def test_chain_meets_the_exact_solution(n, t_f):
 @jax.jit
 def motion(run, t):
     law = run.controller
-    return jax.vmap(lambda time: theory.exact_chain(time, law.t_f, law.eta, run.initial))(t)
+    return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
@@ -172,7 +179,7 @@ def stays_inside_the_corrected_envelopes(n, case):
     # the boundary layer's rate, tau^(n-1) K / width, times the largest step stays below 1.2
     width = max(bound * t_f ** (n - 1) * 1.5 * t_f / 800 / 1.2 / case["layer"], 1e-9)
     sine = (case["share"] * bound, case["frequency"] / t_f, case["phase"], 0.0)
-    wave = signals.Sinusoid(*(vector([v]) for v in sine))
+    wave = disturbances.Sinusoid(*(vector([v]) for v in sine))
     run = chain_parts(
         case["x0"][:n], t_f, n + case["above"], case["delta"] * t_f, bound=bound, sign_width=width, disturbance=wave,
         k1=case["k1"], surface_rate=case["surface_rate"], a=SURFACES[n](case["damping"]), steps=(800, 1200),
@@ -183,8 +190,8 @@ def stays_inside_the_corrected_envelopes(n, case):
     before = np.flatnonzero(log.t < float(run.controller.hand_over))
     t = log.t[: before[-1] + 1]
     rounding = 1e-9 * max(1.0, np.abs(log.s).max())
-    assert np.all(np.abs(log.s[: t.size, 0]) <= theory.sliding_bound(run, t) * (1 + 1e-6) + rounding)
-    found = envelope(run, vector(t), *(vector(v) for v in theory.sliding_envelope(run)))
+    assert np.all(np.abs(log.s[: t.size, 0]) <= envelopes.sliding_bound(run, t) * (1 + 1e-6) + rounding)
+    found = envelope(run, vector(t), *(vector(v) for v in envelopes.sliding_envelope(run)))
     centre, half = (np.asarray(v) for v in found)
     largest = 1e-7 * np.abs(log.x).max(axis=0) + 1e-12
     assert np.all(np.abs(log.x[: t.size] - centre) <= half * (1 + 1e-6) + largest)
@@ -202,7 +209,7 @@ test_many_stay_inside = pytest.mark.long(
 @jax.jit
 def envelope(run, t, s0, floor):
     law = run.controller
-    return jax.vmap(lambda time: theory.state_envelope(time, law.t_f, law.eta, run.initial, s0, floor))(t)
+    return jax.vmap(lambda time: solutions.state_envelope(time, law.t_f, law.eta, run.initial, s0, floor))(t)
 
 
 def test_envelopes_are_not_empty():
@@ -212,16 +219,16 @@ def test_envelopes_are_not_empty():
     assert log is not None
     before = np.asarray(log.t) < 4.9
     t = log.t[before]
-    np.testing.assert_allclose(np.abs(log.s[before, 0]), theory.sliding_bound(run, t), rtol=1e-5)
-    flown = theory.error_bound(run, t)
+    np.testing.assert_allclose(np.abs(log.s[before, 0]), envelopes.sliding_bound(run, t), rtol=1e-5)
+    flown = envelopes.error_bound(run, t)
     assert np.all(np.abs(log.x[before, 0]) <= flown * (1 + 1e-6))
     assert np.max(np.abs(np.asarray(log.x)[before, 0]) / flown) > 0.99
 
 
 def test_exact_chain_of_order_two_is_the_exact_error():
     for t in (0.0, 1.0, 6.9):
-        both = theory.exact_error(vector(t), vector(7.0), vector(2.7), vector([0.7]), vector([-0.3]))
-        chain = theory.exact_chain(vector(t), vector(7.0), vector(2.7), vector([0.7, -0.3]))
+        both = solutions.exact_error(vector(t), vector(7.0), vector(2.7), vector([0.7]), vector([-0.3]))
+        chain = solutions.exact_chain(vector(t), vector(7.0), vector(2.7), vector([0.7, -0.3]))
         np.testing.assert_allclose(chain.x, [both.error[0], both.error_rate[0]], rtol=1e-12)
         np.testing.assert_allclose((chain.s, chain.acceleration), (both.s[0], both.acceleration[0]), rtol=1e-11)
 
@@ -233,7 +240,7 @@ def test_exact_chain_is_a_motion_of_the_chain(n):
     law = run.controller
     for t in (0.0, 2.0, 6.5):
         at, slope = jax.jvp(
-            lambda time: theory.exact_chain(time, law.t_f, law.eta, run.initial), (vector(t),), (vector(1.0),)
+            lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial), (vector(t),), (vector(1.0),)
         )
         size = np.abs(np.append(at.x, at.acceleration)).max()
         np.testing.assert_allclose(slope.x, np.append(at.x[1:], at.acceleration), rtol=0, atol=1e-11 * size)
@@ -254,13 +261,13 @@ def test_exact_chain_of_order_three_against_an_adaptive_integrator():
     times = np.array([0.5, 3.0, 5.9])
     truth = solve_ivp(rate, (0.0, 5.9), [1.0, -0.5, 2.0], t_eval=times, rtol=1e-12, atol=1e-13).y
     for k, t in enumerate(times):
-        found = theory.exact_chain(vector(t), vector(t_f), vector(eta), vector([1.0, -0.5, 2.0]))
+        found = solutions.exact_chain(vector(t), vector(t_f), vector(eta), vector([1.0, -0.5, 2.0]))
         np.testing.assert_allclose(found.x, truth[:, k], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("x0", [[5.0, 3.0], [5.0, 3.0, 2.0]])
 def test_sampled_chain_converges_to_the_continuous_one(x0):
-    wave = signals.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
+    wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
     changes = {"bound": 0.01, "disturbance": wave, "delta": 0.5, "sign_width": 0.05}
     truth = fly(chain_parts(x0, **changes, steps=(4000, 200))).metrics.window_error
     gaps = [
@@ -272,9 +279,9 @@ def test_sampled_chain_converges_to_the_continuous_one(x0):
 
 
 def test_observer_on_a_chain_finds_the_disturbance_within_its_bound():
-    wave = signals.Sinusoid(*(vector([v]) for v in (0.05, 1.0, 0.0, 0.02)))
-    model = plants.chain(3)
-    observer = observers.NonlinearObserver(model, vector([20.0]), vector(0.05), vector(0.02))
+    wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 1.0, 0.0, 0.02)))
+    model = integrator_chain.chain(3)
+    observer = nonlinear.NonlinearObserver(model, vector([20.0]), vector(0.05), vector(0.02))
     for period in (None, 0.02):
         seen = chain_parts([1.0, 0.0, 0.0], disturbance=wave, observer=observer, period=period, delta=0.3)
         log = jax.tree.map(np.asarray, fly(seen, record=True).log)
@@ -324,9 +331,9 @@ def test_batches_of_chains_and_their_gradients():
 
 def test_chain_is_built_with_an_order_and_functions():
     with pytest.raises(ValueError, match="order is 1, but must be at least 2"):
-        plants.chain(1)
+        integrator_chain.chain(1)
     stiff = jax.tree_util.Partial(lambda k, x: -k * x[0], vector(2.0))
-    found = plants.chain(3, stiff)
+    found = integrator_chain.chain(3, stiff)
     assert found.f is stiff
     assert len(jax.tree.leaves(found)) == 1  # its parameter is a leaf: it can be traced
     x = vector([0.5, 0.0, 1.0])

@@ -11,12 +11,16 @@ import time
 import numpy as np
 import pytest
 
-from ptsmc_jax import catalogues, montecarlo, pace, runs, scenario, store
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo, runs, store
+from ptsmc_jax.scenario import pace
+from ptsmc_jax.simulation import catalogues
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
 from tests.pages import checked
 from tests.test_scenario import check_sentence
-from tuning import cli, single, stability
+from tuning.cli import main
+from tuning.studies import single, stability
 
 
 def test_simulate_leaves_what_the_contract_says(command, tmp_path):
@@ -149,8 +153,8 @@ def test_help_and_version_do_not_load_jax():
     for option in ("--help", "--version"):
         code = (
             f"import sys; sys.argv = ['ptsmc', '{option}']\n"
-            "import tuning.cli\n"
-            "try: tuning.cli.main()\n"
+            "import tuning.cli.main\n"
+            "try: tuning.cli.main.main()\n"
             "except SystemExit: pass\n"
             "assert 'jax' not in sys.modules"
         )
@@ -295,8 +299,8 @@ def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
 
 def stop_at(monkeypatch, call):
     """Ctrl-C at this evaluation of the search; returns how many were computed, not read back."""
-    from tuning.evaluate import Evaluator
-    from tuning.journal import Journal
+    from tuning.search.evaluate import Evaluator
+    from tuning.search.journal import Journal
 
     calls, computed = [], []
     slopes, get = Evaluator.slopes, Journal.get
@@ -364,9 +368,9 @@ def test_a_killed_search_goes_on(tmp_path):
     """kill -9 while it searches, in a process of its own; then the same command to the end."""
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
-        "import sys; from tuning import cli, confirm, descents, refine, starts, worst; "
+        "import sys; from tuning.cli import main; from tuning.search import confirm, descents, refine, starts, worst; "
         "starts.SWEPT = 16; descents.MANY = 16; refine.GENERATIONS = 3; "
-        "worst.SCREENED = 64; confirm.FRESH = 40; cli.main()"
+        "worst.SCREENED = 64; confirm.FRESH = 40; main.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
     journal = tmp_path / "t" / "journal.bin"
@@ -424,7 +428,7 @@ def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "fly", broken)
     monkeypatch.setattr(sys, "argv", ["ptsmc", "simulate"])
     with pytest.raises(ValueError, match="ours"):
-        cli.main()
+        main.main()
 
 
 def test_figures_only_where_wanted_and_force_keeps_what_is_not_ours(command, tmp_path):
@@ -458,7 +462,7 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
 
 def in_a_process(*args, then=""):
     """`ptsmc ...` as a user runs it; `then` is checked at its end."""
-    code = f"import sys\nfrom tuning.cli import main\ntry: main()\nfinally:\n    {then or 'pass'}"
+    code = f"import sys\nfrom tuning.cli.main import main\ntry: main()\nfinally:\n    {then or 'pass'}"
     command = [sys.executable, "-c", code, *map(str, args)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
 
@@ -591,6 +595,6 @@ def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, mon
     steps = pace.steps(parts)
     assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
     assert "integration steps" not in command(*run)[1]
-    monkeypatch.setattr("tuning.cli.LONG", steps - 1)
+    monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)
     assert command(*run)[1].startswith(f"flying {steps} integration steps, with their history\n")
     assert command(*run, "--quiet")[1] == ""

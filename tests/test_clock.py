@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ptsmc_jax import clock
+from ptsmc_jax.simulation import clock
 from tests.helpers import vector
 
 

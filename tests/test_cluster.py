@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import distributed
 import pytest
 
-from ptsmc_jax import cluster, store
-from ptsmc_jax.rows import Rows
-from ptsmc_jax.store import RefusedError
+from ptsmc_jax.campaigns import cluster, store
+from ptsmc_jax.campaigns.rows import Rows
+from ptsmc_jax.campaigns.store import RefusedError
 
 
 class FakeClient:

@@ -9,11 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, rollout, scenario
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
 from tests.helpers import FIRST_FLIGHT, SHORT, short, small_search
 from tests.pages import checked
-from tuning import compare, gains, report
+from tuning.search import gains
+from tuning.studies import compare, tuner
 
 TABLES = tomllib.loads(SHORT)
 
@@ -151,7 +154,7 @@ def eight():
 
 def contender(trials, **changes):
     base = scenario.from_tables(TABLES)
-    verdicts = report.verdicts_of(base, trials, 0)
+    verdicts = tuner.verdicts_of(base, trials, 0)
     return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts), None)
 
 
@@ -193,15 +196,15 @@ def rivals(monkeypatch, eight, interrupt=None):
         asked.append(("judge", "paper", seed))
         return eight
 
-    monkeypatch.setattr(report, "tune", tune)
-    monkeypatch.setattr(report, "judge", judge)
+    monkeypatch.setattr(tuner, "tune", tune)
+    monkeypatch.setattr(tuner, "judge", judge)
     return asked
 
 
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
-    assert asked == [("judge", "paper", report.seed_of_judge(5)),
+    assert asked == [("judge", "paper", tuner.seed_of_judge(5)),
                      *(("tune", law, 5) for law in ("prescribed_time", "pd", "terminal", "fixed_time"))]  # fmt: skip
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}

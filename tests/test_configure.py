@@ -90,7 +90,7 @@ def test_the_trial_run_refuses_other_numbers(monkeypatch):
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
     """In a process of its own, as a user's first call."""
-    call = [sys.executable, "-c", "from tuning.cli import main; main()", "montecarlo", "--device", "gpu"]
+    call = [sys.executable, "-c", "from tuning.cli.main import main; main()", "montecarlo", "--device", "gpu"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": ""}
     done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")

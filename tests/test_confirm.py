@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ptsmc_jax import montecarlo
-from ptsmc_jax.requirements import Requirement, least_within
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation.requirements import Requirement, least_within
 from tests import helpers
 from tests.test_tuning import SPREAD, problem
-from tuning import bounds, confirm, gains, objective, optimise
-from tuning.evaluate import Evaluator
+from tuning.search import bounds, confirm, gains, objective, optimise
+from tuning.search.evaluate import Evaluator
 
 SHOWN = Requirement("window_error", 1e-4, None, 0.99, 0.95)
 SEEN = Requirement("window_error", 1e-4, None, 0.9, None)

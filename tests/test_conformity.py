@@ -11,9 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import dispersions, lanes, montecarlo, plants, rollout, scenario, signals
+from ptsmc_jax import scenario
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.dispersions import variation
+from ptsmc_jax.plants import integrator_chain, rigid_body
+from ptsmc_jax.signals import references
+from ptsmc_jax.simulation import rollout
 from tests.helpers import FULL_INERTIA, ROOT, short
-from tuning.gains import with_gains
+from tuning.search.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
@@ -173,7 +179,7 @@ def batch(parts, still, dispersion, vmap, sloped):
             if hasattr(run.controller, "sign_width"):
                 width = at_last(run.controller.sign_width, still.controller.sign_width)
                 run = replace(run, controller=replace(run.controller, sign_width=width))
-            return montecarlo.one(run, dispersions.Dispersion(), SEED, trial)[:3]
+            return montecarlo.one(run, variation.Dispersion(), SEED, trial)[:3]
 
         return vmap(one)(jnp.append(NUMBERS, np.uint32(NUMBERS.size)))
 
@@ -187,8 +193,8 @@ def batch(parts, still, dispersion, vmap, sloped):
 def at_rest_on_the_target(parts):
     """From the start, with the exact sign: every norm, root and sign at 0."""
     target = parts.reference(jnp.zeros(()))
-    if isinstance(target, signals.Target):
-        initial = plants.AttitudeState(target.q, target.w)
+    if isinstance(target, references.Target):
+        initial = rigid_body.AttitudeState(target.q, target.w)
     else:
         initial = jnp.zeros_like(parts.initial)
     exact = {"sign_width": jnp.zeros(())} if hasattr(parts.controller, "sign_width") else {}
@@ -280,6 +286,6 @@ def test_lanes_equal_vmap_for_a_plant_from_python():
         return 1.0 + 0.2 * jnp.cos(x[0]) ** 2
 
     ready = scenario.study(scenario.from_tables(ROWS["sampled chain with noise"]))
-    model = plants.chain(2, f, g)
+    model = integrator_chain.chain(2, f, g)
     parts = replace(ready.parts, plant=model, controller=replace(ready.parts.controller, model=model))
     compare(parts, ready.dispersion, "own plant", False)

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, controllers, plants, rollout, signals, theory
-from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import solutions
 from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, vector, with_controller
 
-SWING = signals.Swing(
+SWING = references.Swing(
     vector(0.5, -0.2, 0.4, np.sqrt(1 - 0.45)), vector(0.3, -0.5, 0.2), vector(0.2, 0.1, 0.3), vector(0.1, 0.5, 0.2)
 )
-LAWS = [controllers.PrescribedTime, controllers.PrescribedTimeMultiplicative]
-SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
+LAWS = [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative]
+SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
 
 
 def state(seed: int) -> AttitudeState:
@@ -86,7 +91,7 @@ def test_align_chooses_the_sign_of_the_reference_and_clearance_counts_from_its_s
     x = state(4)
     for flip_x in (1.0, -1.0):
         for flip_f in (1.0, -1.0):
-            target = signals.Fixed(flip_f * vector(0.0, 0.6, 0.0, 0.8))(vector(0.0))
+            target = references.Fixed(flip_f * vector(0.0, 0.6, 0.0, 0.8))(vector(0.0))
             aligned = law.align(AttitudeState(flip_x * x.q, x.w), target)
             assert float(aligned.q[3] * target.q[3]) > 0
             np.testing.assert_allclose(law.clearance(aligned, target), x.q[3])
@@ -110,7 +115,7 @@ def test_gradients_are_finite_at_the_awkward_points(hold):
 
 
 def test_the_norm_in_the_switching_term_is_not_below_the_spectral_one():
-    body = plants.spacecraft(FULL_INERTIA)
+    body = rigid_body.spacecraft(FULL_INERTIA)
     for seed in range(20):
         matrix = np.asarray(attitude.t_matrix(state(seed).q) @ body.inertia_inverse)
         assert np.linalg.norm(matrix) >= np.linalg.norm(matrix, 2)
@@ -134,7 +139,7 @@ def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its
 
 def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
     """A finely stepped run without a disturbance, or with the default one."""
-    none = {"disturbance": signals.Constant(jnp.zeros(3)), "rate_bound": 0.0} if quiet else {}
+    none = {"disturbance": disturbances.Constant(jnp.zeros(3)), "rate_bound": 0.0} if quiet else {}
     run = parts(
         20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, law=law, **none, **others
     )
@@ -146,7 +151,7 @@ def fly(run):
 
 
 # through 180 degrees from the inertial identity, where q_f4 changes its sign
-CROSSING = signals.Spin(vector(Rotation.from_rotvec([2.9, 0.2, 0.1]).as_quat()), vector(0.04, 0.01, -0.02))
+CROSSING = references.Spin(vector(Rotation.from_rotvec([2.9, 0.2, 0.1]).as_quat()), vector(0.04, 0.01, -0.02))
 AWAY = vector((Rotation.from_rotvec([2.9, 0.2, 0.1]) * Rotation.from_rotvec([0.5, -1.2, 0.8])).as_quat())
 
 
@@ -158,10 +163,12 @@ def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_ad
     assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # it does cross
     target = run.reference(vector(0.0))
     start = run.controller.errors(run.controller.align(run.initial, target), target)
-    exact = jax.vmap(lambda t: theory.exact_error(t, vector(20.0), vector(3.5), *start))(vector(result.log.t[before]))
+    exact = jax.vmap(lambda t: solutions.exact_error(t, vector(20.0), vector(3.5), *start))(
+        vector(result.log.t[before])
+    )
     np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-10)
     # the torque of the exact motion, from the inverse map of `theory`, is the one that was flown
-    u = jax.vmap(lambda t: theory.exact_input(run, t)[0])(vector(result.log.t[before]))
+    u = jax.vmap(lambda t: solutions.exact_input(run, t)[0])(vector(result.log.t[before]))
     feedback = 2 * 14 * 3.5**2 / (20.0 - result.log.t[before]) ** 2  # what an error of 1e-10 costs in torque
     assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
 
@@ -209,7 +216,7 @@ def test_signs_and_ways_round():
     turned = {}
     for law in LAWS:
         for sign in (1.0, -1.0):
-            result = fly(flown(law, signals.Fixed(end), sign * start))
+            result = fly(flown(law, references.Fixed(end), sign * start))
             assert result.status == rollout.OK
             assert result.metrics.terminal_angle < 1e-4
             speed = np.linalg.norm(result.log.x.w, axis=1)
@@ -223,15 +230,15 @@ def test_signs_and_ways_round():
 
 def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
     law = parts(law=LAWS[1]).controller
-    opposite = signals.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
+    opposite = references.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
     x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
     assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
     # too fast a start away from the reference: |v| passes 1
-    run = flown(LAWS[1], signals.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
+    run = flown(LAWS[1], references.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
     assert fly(run).status == rollout.SINGULAR
     # |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough
-    calm = flown(LAWS[1], signals.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
+    calm = flown(LAWS[1], references.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
     error, error_rate = calm.controller.errors(calm.initial, calm.reference(vector(0.0)))
     assert np.linalg.norm(error) + 20.0 * np.linalg.norm(error_rate) / (np.e * 3.5) < 1.0
     assert fly(calm).status == rollout.OK

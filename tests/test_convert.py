@@ -5,9 +5,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from ptsmc_jax import attitude_keys, scenario
-from ptsmc_jax.signal_tables import ATTITUDE_KEYS
-from tuning import convert
+from ptsmc_jax import scenario
+from ptsmc_jax.scenario import attitude_keys
+from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
+from tuning.cli import convert
 
 
 def pasted(line, sequence):

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from ptsmc_jax import covariance, montecarlo, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.theory import covariance
 from tests.helpers import FIRST_FLIGHT
 
 FILTER = {"filter": {"kind": "steady_state", "bandwidth": 0.1}}

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
 from tests.helpers import vector
-from tuning import design
-from tuning.gains import with_gains
+from tuning.search import design
+from tuning.search.gains import with_gains
 
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 120.0}}
 FLOWN = {

@@ -1,4 +1,5 @@
 import ast
+import importlib
 import math
 import zlib
 from functools import partial
@@ -10,8 +11,9 @@ import pytest
 from jax.extend.random import threefry_2x32
 from scipy import stats
 
-from ptsmc_jax import draws, lanes
-from tests.helpers import ROOT
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.numerics import draws
+from tests.tree import modules
 
 # False alarms: with other seeds a check would fail once in a million; they are fixed, so it either does or not.
 ALARM = 1e-6
@@ -138,18 +140,12 @@ def test_uniforms_stay_inside_the_interval_and_normals_finite_in_32_bits():
 
 
 def stream_names():
-    """Names given to `stream` and `derive` anywhere in the source, constants of the same file looked up."""
+    """Names given to `stream` and `derive` anywhere in the source, constants of the module looked up."""
     names = []
-    for path in [*(ROOT / "ptsmc_jax").glob("*.py"), *(ROOT / "tuning").glob("*.py")]:
-        tree, constants = ast.parse(path.read_text()), {}
-        for node in tree.body:
-            if isinstance(node, ast.Assign):
-                for target in node.targets:
-                    pairs = [(target, node.value)]
-                    if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
-                        pairs = list(zip(target.elts, node.value.elts, strict=True))
-                    constants |= {t.id: v.value for t, v in pairs
-                                  if isinstance(t, ast.Name) and isinstance(v, ast.Constant)}  # fmt: skip
+    for module, path in modules().items():
+        known = vars(importlib.import_module(module))
+        constants = {k: v for k, v in known.items() if k.isupper() and isinstance(v, str)}
+        tree = ast.parse(path.read_text())
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("draws.stream", "draws.derive"):
                 name = node.args[-1]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import elementary
+from ptsmc_jax.numerics import elementary
 
 WIDE = np.longdouble
 EPS = 2.0**-52

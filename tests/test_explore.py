@@ -7,8 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ptsmc_jax
-from ptsmc_jax import animation, campaign, catalogues, explore, runs, scenario
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax import explore, scenario
+from ptsmc_jax.campaigns import campaign, runs
+from ptsmc_jax.figures import animation
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT
 
 TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}

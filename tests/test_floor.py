@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax import clock, estimation, hardware, rollout, sensors, signals
-from ptsmc_jax.estimation import Model
+from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.theory import error_floor
+from ptsmc_jax.theory.error_floor import Model
 from tests.helpers import chain_parts, parts, vector
-from tuning import told
+from tuning.output import sentences
 
 PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
 
@@ -38,7 +41,7 @@ def flown_at(made, **changes):
 
 
 def delayed(periods):
-    return hardware.Actuators(delay=periods)
+    return actuators.Actuators(delay=periods)
 
 
 def by_least_squares(move, push, rows, noise, prior, output, delay):
@@ -97,7 +100,7 @@ def test_farrenkopfs_steady_state():
     first, last = np.array([[1.0, 0.0]]), move[:1]
     output = np.stack([np.vstack([first, last])] * periods)
     model = Model(np.diag([1.0, 1e-3]), first, np.full((periods, 1), star), kicks, moves, output)
-    found = estimation.deviations(model)
+    found = error_floor.deviations(model)
     np.testing.assert_allclose(found[-2, 1], before, rtol=1e-9)
     np.testing.assert_allclose(found[-1, 0], after, rtol=1e-9)  # nothing moves in this last period
 
@@ -109,7 +112,7 @@ def test_a_chain_as_by_a_brute_force_estimator(order, delay):
     made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
     density = 3e-3
     made = flown_at(made, walk_rate=vector([density]), actuators=delayed(delay))
-    found = estimation.along(made, still(made))
+    found = error_floor.along(made, still(made))
     periods, n = len(found.t), order
 
     def motion(t):
@@ -137,7 +140,7 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
     """Each axis on its own: angle, rate, the gyro's bias and its walk, the torque's walk."""
     star, gyro, bias, drift, every = 2e-5, 1e-6, 3e-6, 4e-7, 4
     walk = np.array([1e-5, 2e-5, 0.0])
-    held: Any = sensors.attitude_filter(0.2, star, gyro, drift * math.sqrt(PERIOD), PERIOD, every)
+    held: Any = attitude_filter.attitude_filter(0.2, star, gyro, drift * math.sqrt(PERIOD), PERIOD, every)
     own: tuple[Any, Any] = vector(bias), vector(drift)
     if kind != "filter":
         every, held = 1, None
@@ -145,7 +148,7 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
         bias, drift, own = 0.0, 0.0, (None, None)
     sensor = sensors.Sensors(vector(star), vector(gyro), *own, held, every)
     made = flown_at(parts(**AT_REST), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1))
-    found = estimation.along(made, still(made))
+    found = error_floor.along(made, still(made))
     periods = len(found.t)
     squares = np.zeros((periods, 3))
     noise = np.array([[star if k % every == 0 else np.inf, gyro] for k in range(periods)])
@@ -170,7 +173,7 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
 def test_a_state_that_is_measured_without_noise_is_known():
     """With the rate known the position does not move: it is known as the mean of all samples."""
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
-    found = estimation.along(made, still(made))
+    found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
 
@@ -178,16 +181,16 @@ def test_without_noise_only_what_pushes_is_unknown():
     """Every state is seen exactly: what a step of the walk does within a period is all that is left."""
     density = 0.2
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
-    found = estimation.along(made, still(made))
+    found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
 
 
 def test_without_noise_there_is_no_floor():
     continuous = parts(t_f=3.0)
-    assert estimation.along(continuous, still(continuous)).window_error == 0.0
+    assert error_floor.along(continuous, still(continuous)).window_error == 0.0
     for noise in (None, [0.0, 0.0]):
         made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
-        found = estimation.along(made, still(made))
+        found = error_floor.along(made, still(made))
         assert found.window_error == 0.0
         np.testing.assert_array_equal(found.error, 0.0)
 
@@ -195,11 +198,11 @@ def test_without_noise_there_is_no_floor():
 def test_momentum_stored_in_wheels_couples_the_axes():
     """At rest with momentum h in the wheels the rate moves by J dw' = h x dw."""
     momentum = np.array([3.0, -2.0, 1.0])
-    device = hardware.wheels(np.eye(3), momentum)
-    calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=signals.Constant(jnp.zeros(3)))
-    made = flown_at(calm, actuators=hardware.Actuators(wheels=device))
-    ticks, log = estimation._lasting(made, still(made))
-    linear = estimation._linear(made, log, ticks)
+    device = reaction_wheels.wheels(np.eye(3), momentum)
+    calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
+    made = flown_at(calm, actuators=actuators.Actuators(wheels=device))
+    ticks, log = error_floor._lasting(made, still(made))
+    linear = error_floor._linear(made, log, ticks)
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
     # RK4: 0.3 rad/s over a period, 0.04^5 / 120
     np.testing.assert_allclose(linear.move[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
@@ -223,12 +226,12 @@ def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
         p = move @ (p - gain @ read @ p) @ move.T + spread
     k1, k2 = float(gain[0, 0]), -float(gain[1, 0])
     own = p - gain @ read @ p
-    held = sensors.AttitudeFilter(vector(k1), vector(k2), vector(np.tile(np.linalg.cholesky(p), (every, 1, 1))))
+    held = attitude_filter.AttitudeFilter(vector(k1), vector(k2), vector(np.tile(np.linalg.cholesky(p), (every, 1, 1))))
     sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
     made = parts(**{**AT_REST, "t_end": 40.0})
     made = flown_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
-    ticks, log = estimation._lasting(made, still(made))
-    at_start = estimation.deviations(estimation._model(made, log, ticks))[:, :3]
+    ticks, log = error_floor._lasting(made, still(made))
+    at_start = error_floor.deviations(error_floor._model(made, log, ticks))[:, :3]
     after_star = at_start[::every]
     assert len(after_star) > 50
     # the error is half an angle
@@ -244,9 +247,9 @@ def test_where_there_is_no_floor_nothing_is_said(least):
     run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
     flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
     for known in ({}, {"floor": least}):
-        assert told.run_lines({**run, **known}) == ["status: ok"]
-        assert list(told.campaign_error({**flown, **known})) == []
-        assert list(told.front_lines({**front, **known})) == []
-        assert "times the floor" not in told.front({**front, **known}).head
-    assert told.front({**front, "floor": 5e-6}).head[5] == "times the floor"
-    assert told.front({**front, "floor": 5e-6}).rows[0][5] == "2"
+        assert sentences.run_lines({**run, **known}) == ["status: ok"]
+        assert list(sentences.campaign_error({**flown, **known})) == []
+        assert list(sentences.front_lines({**front, **known})) == []
+        assert "times the floor" not in sentences.front({**front, **known}).head
+    assert sentences.front({**front, "floor": 5e-6}).head[5] == "times the floor"
+    assert sentences.front({**front, "floor": 5e-6}).rows[0][5] == "2"

@@ -8,11 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import borders, free_gains, montecarlo, pace, rollout, scenario, sensors
-from ptsmc_jax.scenario import from_tables, study
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.devices import attitude_filter
+from ptsmc_jax.scenario import free_gains, from_tables, pace, study
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, vector
-from tuning import bounds, gains, report
+from tuning.search import bounds, gains
+from tuning.studies import tuner
 
 BASE = {
     "spacecraft": {"inertia": [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]},
@@ -48,7 +53,7 @@ OTHERS = {
 def wide(tables=None):
     """The scenario and its parts with room for all gains."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
-    return scenario, report.pose(scenario, 0).ready
+    return scenario, tuner.pose(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", short(OTHERS, ["t_f"]))
@@ -89,7 +94,7 @@ def test_names_and_bounds_axis_by_axis():
 
 def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
     def sizes(bandwidth):
-        found = sensors.attitude_filter(bandwidth, 2e-5, 1e-6, 1e-8, 0.1, 2)
+        found = attitude_filter.attitude_filter(bandwidth, 2e-5, 1e-6, 1e-8, 0.1, 2)
         spread = found.spread.reshape(-1, 4)[:, jnp.array([0, 2, 3])]  # the factors' lower left half
         return jnp.log(jnp.abs(jnp.append(spread, jnp.stack([found.attitude_gain, found.bias_gain]))))
 
@@ -98,7 +103,9 @@ def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
     numeric = (sizes(at + step) - sizes(at - step)) / (2 * step)
     np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # step^2 times a third derivative of some 10
     for star, gyro in ((2e-5, 0.0), (0.0, 1e-6), (0.0, 0.0)):
-        spread = jax.jacfwd(lambda b, star=star, gyro=gyro: sensors.attitude_filter(b, star, gyro, 0.0, 0.1, 2).spread)
+        spread = jax.jacfwd(
+            lambda b, star=star, gyro=gyro: attitude_filter.attitude_filter(b, star, gyro, 0.0, 0.1, 2).spread
+        )
         assert np.all(np.isfinite(spread(at)))
 
 
@@ -112,7 +119,7 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
         "tune": {"free": ["t_f", "eta", "observer_gain"]},
     }
     scenario = from_tables(tables)
-    ready = report.pose(scenario, 0).ready
+    ready = tuner.pose(scenario, 0).ready
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))
@@ -209,7 +216,7 @@ def test_delta_is_looked_for_from_one_period_on_and_that_is_said_where_it_ends_t
 
 
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
-    from tuning import bounds, gains
+    from tuning.search import bounds, gains
 
     for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
         base = scenario.replace(
@@ -243,7 +250,7 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
     own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
-    found, refused = report.beside(own)
+    found, refused = tuner.beside(own)
     assert found == {"before": own}
     assert refused is not None
     assert refused.startswith("initial.rotvec_deg is")
@@ -251,7 +258,7 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     tiny = from_tables(
         {"controller": quick, "loop": {"mode": "sampled", "period": 0.001, "t_end": 0.05, "window": 0.01}}
     )
-    found, refused = report.beside(tiny)
+    found, refused = tuner.beside(tiny)
     assert refused is None
     assert found["paper"].controller.delta == 0.02
-    assert list(report.beside(found["paper"])[0]) == ["paper"]
+    assert list(tuner.beside(found["paper"])[0]) == ["paper"]

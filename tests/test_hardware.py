@@ -10,9 +10,14 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import formulas, hardware, lanes, rollout, runs, scenario, sensors, signals
-from ptsmc_jax.plants import AttitudeState
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax import formulas, scenario
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.campaigns import runs
+from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import rollout
 from tests.helpers import FULL_INERTIA, parts, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -20,14 +25,14 @@ PYRAMID = formulas.pyramid()
 
 
 def drive_of(device, v, c):
-    return hardware.Drive(vector(v), vector(c), None, jnp.asarray(False))
+    return actuators.Drive(vector(v), vector(c), None, jnp.asarray(False))
 
 
 @pytest.mark.parametrize("lag", [None, 0.03, 0.5])
 @pytest.mark.parametrize("rate_limit", [None, 0.4, 20.0])
 def test_channels_follow_their_differential_equation(lag, rate_limit):
     """v' = clip((c - v)/lag, -R, R); without a lag v' = R sign(c - v) until c is met."""
-    device = hardware.Actuators(
+    device = actuators.Actuators(
         rate_limit=None if rate_limit is None else vector(rate_limit), lag=None if lag is None else vector(lag)
     )
     for start, target in ((0.2, -0.3), (-0.1, 0.4), (0.1, 0.1)):
@@ -54,8 +59,8 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
 
 def test_quantisation_rounds_and_lets_the_slope_through():
     u = vector([0.024, -0.036, 0.0])
-    np.testing.assert_allclose(hardware.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)
-    np.testing.assert_array_equal(jax.jacfwd(lambda u: hardware.quantise(u, vector(0.01)))(u), np.eye(3))
+    np.testing.assert_allclose(actuators.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)
+    np.testing.assert_array_equal(jax.jacfwd(lambda u: actuators.quantise(u, vector(0.01)))(u), np.eye(3))
 
 
 def with_device(device, **changes):
@@ -65,14 +70,14 @@ def with_device(device, **changes):
 
 def test_perfect_actuators_change_nothing():
     plain = fly(with_device(None), np.uint32(1), np.uint32(2))
-    through = fly(with_device(hardware.Actuators()), np.uint32(1), np.uint32(2))
+    through = fly(with_device(actuators.Actuators()), np.uint32(1), np.uint32(2))
     for a, b in zip(plain.metrics, through.metrics, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("delay", [1, 3])
 def test_commands_arrive_whole_periods_later(delay):
-    log = fly(with_device(hardware.Actuators(delay=delay)), np.uint32(1), np.uint32(2), record=True).log
+    log = fly(with_device(actuators.Actuators(delay=delay)), np.uint32(1), np.uint32(2), record=True).log
     assert log is not None
     np.testing.assert_array_equal(log.u[:delay], np.zeros((delay, 3)))
     np.testing.assert_array_equal(log.u[delay:-1], log.commanded[: -1 - delay])
@@ -81,7 +86,7 @@ def test_commands_arrive_whole_periods_later(delay):
 @pytest.mark.parametrize("step", [0.01, 0.03])
 def test_limits_and_steps_as_delivered(step):
     """The step next to what is cut off at 0.11 N m may lie beyond it."""
-    device = hardware.Actuators(torque_limit=vector(0.11), step=vector(step))
+    device = actuators.Actuators(torque_limit=vector(0.11), step=vector(step))
     result = fly(with_device(device), np.uint32(1), np.uint32(2), record=True)
     log = jax.tree.map(np.asarray, result.log)
     expected = np.clip(np.round(np.clip(log.commanded, -0.11, 0.11) / step) * step, -0.11, 0.11)
@@ -93,7 +98,7 @@ def test_limits_and_steps_as_delivered(step):
 
 
 def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
-    device = hardware.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
+    device = actuators.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
     log = jax.tree.map(
         np.asarray, fly(with_device(device, inertia=FULL_INERTIA), np.uint32(1), np.uint32(2), record=True).log
     )
@@ -217,18 +222,18 @@ def test_too_much_momentum_for_the_period_is_refused(changes, said):
 
 def test_peak_wheel_momentum_counts_from_the_start():
     """A wheel that first speeds the body up, and not quite takes that back: its largest momentum is that at t = 0."""
-    spinning = hardware.wheels(np.eye(3), [5.0, 0.0, 0.0])
+    spinning = reaction_wheels.wheels(np.eye(3), [5.0, 0.0, 0.0])
     turned = {"q": Rotation.from_rotvec([-1.0, 0.0, 0.0]).as_quat(), "rate": (-0.1, 0.0, 0.0)}
     run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, t_end=23.0, **turned)
-    run = dataclasses.replace(run, actuators=hardware.Actuators(wheels=spinning))
+    run = dataclasses.replace(run, actuators=actuators.Actuators(wheels=spinning))
     log = jax.tree.map(np.asarray, fly(run, record=True).log)
     assert np.all(np.abs(log.wheels[0][1:]) < 5.0)
     assert float(fly(run, record=True).metrics.peak_wheel_momentum) == 5.0
 
 
 def test_wheels_keep_their_limits():
-    limits = hardware.wheels(PYRAMID, None, torque_limit=0.08, momentum_limit=0.6)
-    result = fly(with_device(hardware.Actuators(wheels=limits)), np.uint32(1), np.uint32(2), record=True)
+    limits = reaction_wheels.wheels(PYRAMID, None, torque_limit=0.08, momentum_limit=0.6)
+    result = fly(with_device(actuators.Actuators(wheels=limits)), np.uint32(1), np.uint32(2), record=True)
     assert result.log is not None
     assert np.all(np.abs(result.log.u) <= 0.08 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
     assert float(result.metrics.peak_wheel_momentum) <= 0.6 * (1 + 1e-9)
@@ -240,13 +245,13 @@ def test_wheels_keep_their_limits():
 def test_allocation_gives_the_wanted_torque_for_any_geometry():
     rng = np.random.default_rng(0)
     for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):
-        found = hardware.wheels(axes)
+        found = reaction_wheels.wheels(axes)
         np.testing.assert_allclose(found.axes @ found.allocation, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(found.axes, axis=0), 1.0)
     flat = [[1, 0, 0], [0, 1, 0], [1, 1, 0]]
     for bad, said in ((flat, "span"), (flat[:2], "span"), ([1, 2, 3], "rows"), ([[0, 0, 0]] * 3, "rows")):
         with pytest.raises(ValueError, match=said):
-            hardware.wheels(bad)
+            reaction_wheels.wheels(bad)
     strength = np.abs(PYRAMID).sum(axis=0)
     np.testing.assert_allclose(strength, strength[0])  # the default cant
 
@@ -265,14 +270,14 @@ def everything(delta=0.93, **changes):
         inertia=FULL_INERTIA,
         **changes,
     )
-    filtered = sensors.attitude_filter(0.5, 2e-5, 1e-6, 1e-8, 0.1, 2)
+    filtered = attitude_filter.attitude_filter(0.5, 2e-5, 1e-6, 1e-8, 0.1, 2)
     sensing = sensors.Sensors(vector(2e-5), vector(1e-6), vector(1e-5), vector(1e-8), filtered, 2)
-    device = hardware.Actuators(
+    device = actuators.Actuators(
         torque_limit=vector(3.0), rate_limit=vector(4.0), lag=vector(0.03), step=vector(1e-13),
-        wheels=hardware.wheels(PYRAMID, [0.1, 0.0, 0.0, 0.0], 2.0, 5.0), delay=1,
+        wheels=reaction_wheels.wheels(PYRAMID, [0.1, 0.0, 0.0, 0.0], 2.0, 5.0), delay=1,
     )  # fmt: skip
-    gravity = signals.GravityGradient(run.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.4))
-    total = signals.Sum((run.disturbance, gravity))
+    gravity = disturbances.GravityGradient(run.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.4))
+    total = disturbances.Sum((run.disturbance, gravity))
     return dataclasses.replace(run, sensors=sensing, actuators=device, disturbance=total, walk_rate=vector([1e-4] * 3))
 
 
@@ -319,7 +324,7 @@ def test_nothing_jumps_where_delta_is_a_multiple_of_the_period():
 
 def test_gravity_gradient_is_the_textbook_torque():
     inertia, rate = np.diag([10.0, 12.0, 14.0]), 1.1e-3
-    whole = signals.GravityGradient(vector(inertia), vector([0.0, 0.0, 0.0, 1.0]), vector(rate), vector(0.0))
+    whole = disturbances.GravityGradient(vector(inertia), vector([0.0, 0.0, 0.0, 1.0]), vector(rate), vector(0.0))
     for angle in (0.0, 0.3, 1.0):
         # pitched about z by an angle from the radial direction x
         q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
@@ -332,7 +337,7 @@ def test_gravity_gradient_is_the_textbook_torque():
 
 
 def test_random_walk_grows_like_the_square_root_of_time():
-    run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=signals.Constant(vector([0.0] * 3)))
+    run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=disturbances.Constant(vector([0.0] * 3)))
     density = 1e-3
     run = dataclasses.replace(run, walk_rate=vector([density / np.sqrt(0.1)] * 3))
 
@@ -355,13 +360,13 @@ def test_random_walk_grows_like_the_square_root_of_time():
 
 def test_gradients_are_finite_at_the_corners():
     """On a limit, at rest, with nothing to do: where clip, sign and the end of a ramp have no slope of their own."""
-    device = hardware.Actuators(
+    device = actuators.Actuators(
         torque_limit=vector(0.3), rate_limit=vector(0.5), lag=vector(0.1), step=vector(0.1),
-        wheels=hardware.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
+        wheels=reaction_wheels.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
     )  # fmt: skip
 
     def outcome(u, v, h, dt):
-        state = hardware.ActuatorState(u[None], v, h)
+        state = actuators.ActuatorState(u[None], v, h)
         drive, queue = device.command(state, u, vector([0.0] * 3), dt, vector(1.0))
         end = device.end(state, drive, queue, dt)
         return device.torque(drive, dt), device.over(drive, 0.0 * dt, dt), end.v, end.h
@@ -375,7 +380,7 @@ def test_gradients_are_finite_at_the_corners():
 
 
 def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
-    device = hardware.Actuators(torque_limit=vector(0.1))
+    device = actuators.Actuators(torque_limit=vector(0.1))
     run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, t_end=120.0)
     result = fly(dataclasses.replace(run, actuators=device), record=True)
     assert result.log is not None
@@ -391,8 +396,8 @@ def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
 
 @pytest.mark.parametrize("lag", [None, 0.08])
 def test_momentum_limit_is_kept_and_never_at_the_cost_of_the_torque_limit(lag):
-    limits = hardware.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
-    device = hardware.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
+    limits = reaction_wheels.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
+    device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
     run = dataclasses.replace(with_device(device), substeps=4)
     result = fly(run, np.uint32(1), np.uint32(2), record=True)
     assert result.log is not None
@@ -404,10 +409,10 @@ def test_momentum_limit_is_kept_and_never_at_the_cost_of_the_torque_limit(lag):
 
 def test_observer_invents_no_disturbance_from_the_wheels():
     """20 N m s in one wheel and no disturbance: w x A h is known at both ends of the period, like the rest."""
-    spinning = hardware.wheels(np.eye(3), [20.0, 0.0, 0.0])
-    quiet = signals.Constant(vector([0.0] * 3))
+    spinning = reaction_wheels.wheels(np.eye(3), [20.0, 0.0, 0.0])
+    quiet = disturbances.Constant(vector([0.0] * 3))
     run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, disturbance=quiet)
-    run = dataclasses.replace(run, actuators=hardware.Actuators(wheels=spinning))
+    run = dataclasses.replace(run, actuators=actuators.Actuators(wheels=spinning))
     log = fly(run, record=True).log
     assert log is not None
     # the trapezium rule of w x A h over a period: h^2/12 w'' H, 0.05 rad/s^3 at the end of the slew

@@ -7,12 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, controllers, formulas, hold, rollout, signals, theory
+from ptsmc_jax import formulas
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.theory import hold, solutions
 from tests.helpers import FULL_INERTIA, chain_parts, parts, short, vector
 
-QUIET = signals.Constant(jnp.zeros(3))
+QUIET = disturbances.Constant(jnp.zeros(3))
 AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
-SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
+SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
 # c, and the rate toward the surface: slower, the same (the root repeats), faster
 RATES = [(0.3, 1.1), (1.0, 1.0), (1.0, 0.5), (2.5, 2.5), (2.5, 0.7)]
 GRID = (4000, 800)
@@ -36,16 +40,16 @@ def exact(run, t):
     law = run.controller
 
     def component(x0):
-        at = theory.exact_chain(law.hand_over, law.t_f, law.eta, x0).x
+        at = solutions.exact_chain(law.hand_over, law.t_f, law.eta, x0).x
         moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate(), at))(t - law.hand_over)
         return moved.x[:, 0], moved.s, moved.acceleration
 
-    return jax.vmap(component, out_axes=1)(theory.starts(run))
+    return jax.vmap(component, out_axes=1)(solutions.starts(run))
 
 
 @pytest.mark.parametrize(("c", "k"), short(RATES, RATES[:1]))
 @pytest.mark.parametrize(
-    "law", [controllers.PrescribedTime, controllers.PrescribedTimeMultiplicative, 2, 3],
+    "law", [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative, 2, 3],
     ids=["additive", "multiplicative", "chain of order 2", "chain of order 3"],
 )  # fmt: skip
 def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
@@ -100,7 +104,7 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
 
     value, slope = jax.jit(measured), jax.jit(jax.jacfwd(measured, 1))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
-        run, at, h = flown(controllers.PrescribedTime, c, k), vector(c), 1e-3
+        run, at, h = flown(prescribed_time.PrescribedTime, c, k), vector(c), 1e-3
         forward = float(slope(run, at))
         # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)

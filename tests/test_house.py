@@ -3,6 +3,7 @@
 import ast
 import importlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,164 +11,167 @@ from pathlib import Path
 import pytest
 
 import ptsmc_jax
-from tests.helpers import ROOT
+from tests.tree import ROOT, modules
 
-# Ground floor first; what shares a line are siblings, which do not see each other. A new file goes into its place here.
-FLOORS = {
-    "ptsmc_jax": """
-        configure formulas catalogues
-        programs numerics elementary
-        draws
-        attitude
-        plants
-        signals hardware
-        observers laws clock
-        controllers
-        sensors baselines
-        metrics assembly
-        computer
-        rollout
-        components
-        lanes
-        kernel
-        theory estimation borders
-        hold linear
-        margins covariance
-        requirements
-        dispersions
-        values systems
-        plant_tables signal_tables law_tables device_tables dispersion_tables keys
-        tables
-        layouts
-        schema
-        attitude_keys scales
-        free_gains
-        checks
-        reading build
-        pace
-        scenario
-        montecarlo margin_verdicts
-        runs
-        store remark_2 drawing rows statistics
-        plotting study_plots campaign_plots margin_plots campaign
-        cluster animation
-        explore
-        paper
-        slips
-    """,
-    "tuning": """
-        gains own_parts abreast
-        bounds design journal
-        margin_rows
-        objective
-        evaluate
-        worst trust descent starts confirm
-        refine work
-        descents
-        optimise
-        evolution stability
-        report single reproduction mapping
-        results pareto compare campaign_folder
-        campaign_summary
-        cells
-        told_margins options
-        told
-        show
-        show_campaign page_charts convert new
-        page
-        campaign_commands writing_commands
-        cli table
-    """,
+# Rooms in their order, the lowest first; in each the floors of its files: what shares a line are siblings, which do not
+# see each other. A file sees the rooms and floors below its own; "." is the package's own folder. A new file goes here.
+HOUSE = {
+    "ptsmc_jax": {
+        ".": "configure formulas | programs",
+        "numerics": "elementary guards pytrees statistics | attitude draws matrices | integrators",
+        "batching": "components | lanes | kernel",
+        "plants": "base | integrator_chain rigid_body second_order",
+        "signals": "disturbances references",
+        "laws": "base error_quaternion | comparison prescribed_time | fixed_time pd terminal",
+        "observers": "base | finite_time none nonlinear prescribed_time",
+        "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
+        "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
+        "dispersions": "base | attitudes inertias numbers | variation",
+        "theory": "borders error_floor linear rules solutions | covariance envelopes margins | hold",
+        "scenario": """
+            errors systems values
+            device_tables dispersion_tables keys law_tables plant_tables signal_tables
+            tables
+            layouts scales
+            schema
+            attitude_keys free_gains
+            checks
+            build reading
+            pace
+            flyable
+        """,
+        "campaigns": "margin_verdicts montecarlo rows store | campaign runs | cluster",
+        "paper": "claims remark_2 | slips",
+        "figures": "style | animation campaign_plots margin_plots run_plots study_plots",
+        "explore": "",
+    },
+    "tuning": {
+        ".": "errors",
+        "search": """
+            abreast gains journal own_parts
+            bounds design
+            margin_rows
+            objective
+            confirm evaluate worst
+            descent starts trust
+            refine work
+            descents
+            optimise
+            evolution
+        """,
+        "studies": """
+            campaign_folder mapping reproduction single stability table
+            campaign_summary tuner
+            compare pareto tune_files
+        """,
+        "output": "cells page_charts | margin_sentences | sentences | page terminal | campaign_terminal",
+        "cli": "options | campaign_commands convert new | writing_commands | main",
+    },
 }
-FLOOR = {
-    (package, name): floor
-    for package, floors in FLOORS.items()
-    for floor, names in enumerate(floors.strip().splitlines())
-    for name in names.split()
-}
+
+
+def floors(package):
+    """Module without the package's name -> (room, floor), both counted from below."""
+    found = {}
+    for number, (room, lines) in enumerate(HOUSE[package].items()):
+        inside = {name: k for k, line in enumerate(re.split(r"[|\n]", lines.strip())) for name in line.split()}
+        if room != ".":
+            found[room] = (number, len(inside) if inside else 0)  # a file, or the folder's own `__init__`
+        found |= {name if room == "." else f"{room}.{name}": (number, k) for name, k in inside.items()}
+    return found
+
+
+FLOOR = {package: floors(package) for package in HOUSE}
 LONGEST = {"ptsmc_jax": 400, "tuning": 400, "tests": 800}
 
 
 def allowed(package, name, other_package, other):
-    """May a file import another? `__init__` as the other file is the package itself."""
+    """May a module import another? "" as the other is the package itself."""
     if package != other_package:
         return package == "tuning"  # ptsmc_jax never imports tuning
-    return other == "__init__" or FLOOR[other_package, other] < FLOOR[package, name]
+    return not other or FLOOR[package][other] < FLOOR[package][name]
 
 
-def modules(package):
-    return sorted(path.stem for path in (ROOT / package).glob("**/*.py") if path.stem != "__init__")
+def names(package):
+    """Modules of a package without its name, the package itself apart."""
+    return sorted(name.partition(".")[2] for name in modules(package) if name != package)
 
 
-def imported(source, package):
+def imported(source):
     """(package, module) of every import of ours, wherever it stands: in functions and under TYPE_CHECKING too."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names = [alias.name.split(".") for alias in node.names]
+            found = [alias.name.split(".") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = (node.module or "").split(".") if node.level == 0 else [package, *(node.module or "").split(".")]
-            base = [part for part in base if part]
-            # `from package import module` names the module; `from package import name` the package itself
-            names = [[*base, alias.name] if len(base) == 1 else base for alias in node.names]
-        elif ast.unparse(node) == "importlib.import_module(place)":
-            continue  # `systems`, what a user names
+            assert node.module  # relative imports are refused by ruff
+            found = [[*node.module.split("."), alias.name] for alias in node.names]
+        elif ast.unparse(node) in LAZY:
+            continue
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
             assert isinstance(node.args[0], ast.Constant), "an import that cannot be read"
-            names = [str(node.args[0].value).split(".")]
+            found = [str(node.args[0].value).split(".")]
         else:
             continue
-        for parts in names:
-            if parts[0] in FLOORS:
-                known = len(parts) > 1 and (parts[0], parts[1]) in FLOOR
-                yield parts[0], parts[1] if known else "__init__"
+        for first, *parts in found:
+            if first in HOUSE:
+                while parts and ".".join(parts) not in FLOOR[first]:
+                    parts.pop()
+                yield first, ".".join(parts)
 
 
-@pytest.mark.parametrize("package", FLOORS)
+LAZY = (  # imports by names that cannot be read here
+    "importlib.import_module(place)",  # `systems`: what a user names
+    "importlib.import_module(f'ptsmc_jax.scenario.{_EXPORTS[name]}')",  # what `scenario` offers, read below
+)
+
+
+@pytest.mark.parametrize("package", HOUSE)
 def test_every_file_has_its_floor(package):
-    assert modules(package) == sorted(name for owner, name in FLOOR if owner == package)
+    assert names(package) == sorted(FLOOR[package])
 
 
-@pytest.mark.parametrize(("package", "name"), FLOOR)
+@pytest.mark.parametrize(("package", "name"), [(package, name) for package in HOUSE for name in FLOOR[package]])
 def test_files_import_from_floors_below_only(package, name):
-    upward = [
+    source = modules(package)[f"{package}.{name}"].read_text()
+    assert not [
         f"{other_package}.{other}"
-        for other_package, other in imported((ROOT / package / f"{name}.py").read_text(), package)
+        for other_package, other in imported(source)
         if not allowed(package, name, other_package, other)
     ]
-    assert not upward
 
 
 def test_the_package_itself_is_imported_for_its_version_at_most():
     """Its lazy names would hide what floor they come from."""
-    for package, name in FLOOR:
-        tree = ast.parse((ROOT / package / f"{name}.py").read_text())
+    for name, path in modules().items():
+        tree = ast.parse(path.read_text())
         for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module in FLOORS:
-                assert not {alias.name for alias in node.names} & set(ptsmc_jax._EXPORTS), (package, name)
+            if isinstance(node, ast.ImportFrom) and node.module in HOUSE:
+                assert not {alias.name for alias in node.names} & set(ptsmc_jax._EXPORTS), name
             if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "ptsmc_jax":
-                assert node.attr == "__version__", (package, name)
+                assert node.attr == "__version__", name
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "from ptsmc_jax import lanes",
-        "from ptsmc_jax.lanes import vmap",
-        "import ptsmc_jax.lanes",
-        "import ptsmc_jax.lanes as L",
-        "from . import lanes",
-        "from .lanes import vmap",
-        "def f():\n    from ptsmc_jax.lanes import vmap",
-        "if TYPE_CHECKING:\n    from ptsmc_jax.lanes import vmap",
-        "import importlib\nimportlib.import_module('ptsmc_jax.lanes')",
+        "from ptsmc_jax.batching import lanes",
+        "from ptsmc_jax.batching.lanes import vmap",
+        "import ptsmc_jax.batching.lanes",
+        "import ptsmc_jax.batching.lanes as L",
+        "def f():\n    from ptsmc_jax.batching.lanes import vmap",
+        "if TYPE_CHECKING:\n    from ptsmc_jax.batching.lanes import vmap",
+        "import importlib\nimportlib.import_module('ptsmc_jax.batching.lanes')",
     ],
 )
 def test_the_reader_of_imports_sees_every_form(line):
-    assert list(imported(line, "ptsmc_jax")) == [("ptsmc_jax", "lanes")]
-    assert not allowed("ptsmc_jax", "rollout", "ptsmc_jax", "lanes")
-    assert not allowed("ptsmc_jax", "clock", "ptsmc_jax", "observers")
-    assert allowed("ptsmc_jax", "theory", "ptsmc_jax", "lanes")
-    assert not allowed("ptsmc_jax", "plotting", "tuning", "bounds")
+    assert list(imported(line)) == [("ptsmc_jax", "batching.lanes")]
+    assert not allowed("ptsmc_jax", "batching.components", "ptsmc_jax", "batching.lanes")
+    assert not allowed("ptsmc_jax", "observers.nonlinear", "ptsmc_jax", "observers.none")
+    assert not allowed("ptsmc_jax", "observers.nonlinear", "ptsmc_jax", "simulation.clock")
+    assert not allowed("ptsmc_jax", "scenario.pace", "ptsmc_jax", "scenario")
+    assert allowed("ptsmc_jax", "scenario", "ptsmc_jax", "scenario.pace")
+    assert allowed("ptsmc_jax", "theory.solutions", "ptsmc_jax", "batching.lanes")
+    assert not allowed("ptsmc_jax", "figures.run_plots", "tuning", "search.bounds")
 
 
 def python(code):
@@ -178,13 +182,13 @@ def python(code):
 
 
 def test_importing_the_package_and_the_command_does_not_import_jax():
-    loaded = python("import ptsmc_jax, tuning.cli, json, sys; print(json.dumps(sorted(sys.modules)))")
-    assert "tuning.cli" in loaded
+    loaded = python("import ptsmc_jax, tuning.cli.main, json, sys; print(json.dumps(sorted(sys.modules)))")
+    assert "tuning.cli.main" in loaded
     assert not {"jax", "jaxlib", "numpy", "scipy", "matplotlib", "optax"} & set(loaded)
 
 
 def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
-    names = [f"{package}.{name}" for package, name in FLOOR]
+    names = list(modules())
     changed = python(f"""
 import importlib, json, os, warnings
 import jax, polars  # which sets a variable of its allocator's own
@@ -225,12 +229,12 @@ def test_type_checkers_see_the_same_exports():
 
 
 def sources():
-    return [path for folder in (*FLOORS, "tests") for path in sorted((ROOT / folder).glob("**/*.py"))]
+    return [*modules().values(), *modules("tests").values()]
 
 
 def test_dataclasses_are_registered_by_our_own_decorator():
-    """See `numerics.pytree`: by JAX's own, one law's compiled program is taken for another's now and then."""
-    files = [path for package in FLOORS for path in (ROOT / package).glob("**/*.py") if path.stem != "numerics"]
+    """See `pytrees.pytree`: by JAX's own, one law's compiled program is taken for another's now and then."""
+    files = [path for path in modules().values() if path.stem != "pytrees"]
     assert not [path.name for path in files if "register_dataclass" in path.read_text(encoding="utf-8")]
 
 

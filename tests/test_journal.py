@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.journal import Journal
+from tuning.search.journal import Journal
 
 
 def ask(journal, count, asked):

@@ -7,9 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import catalogues, kernel, lanes, montecarlo, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.batching import kernel, lanes
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation import catalogues
 from tests.helpers import short
-from tuning.gains import with_gains
+from tuning.search.gains import with_gains
 
 SEED = 3
 NUMBERS = np.arange(6, dtype=np.uint32)

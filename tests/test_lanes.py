@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from ptsmc_jax import lanes
+from ptsmc_jax.batching import lanes
 
 TRIALS = 5
 scan, cond, while_loop, fori_loop = lax.scan, lax.cond, lax.while_loop, lax.fori_loop

@@ -9,8 +9,8 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxprs_in_params
 
-from ptsmc_jax import lanes
-from ptsmc_jax.plants import AttitudeState
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.plants.rigid_body import AttitudeState
 from tests.test_lanes import (
     FIXED,
     SYMMETRIC,
@@ -92,7 +92,7 @@ OUTSIDE = {
 }  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore::ptsmc_jax.lanes.LanesWarning")
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize("name", OUTSIDE)
 def test_lanes_compose_with_transformations_from_outside(name):
     got, expected = (jax.jit(partial(OUTSIDE[name], vmap))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
@@ -130,7 +130,7 @@ ROWS = [
 ]  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore::ptsmc_jax.lanes.LanesWarning")
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize(("function", "args", "in_axes"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
 def test_arguments_mapped_and_shared(function, args, in_axes):
     check(function, *args, in_axes=in_axes)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ptsmc_jax import montecarlo, scenario
-from ptsmc_jax.schema import ScenarioError
-from tuning import mapping
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.scenario.errors import ScenarioError
+from tuning.studies import mapping
 
 SHORT = """
 loop = { mode = "sampled", period = 0.1, t_end = 7.0, clock = "flight" }

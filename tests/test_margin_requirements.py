@@ -7,11 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import explore, layouts, margin_verdicts, margins, scenario, store
-from ptsmc_jax.requirements import Requirement, over, verdict_text
+from ptsmc_jax import explore, scenario
+from ptsmc_jax.campaigns import margin_verdicts, store
+from ptsmc_jax.scenario import layouts
+from ptsmc_jax.simulation.requirements import Requirement, over, verdict_text
+from ptsmc_jax.theory import margins
 from tests.helpers import SHORT
-from tuning import margin_rows, report, stability
-from tuning.gains import with_gains
+from tuning.search import margin_rows
+from tuning.search.gains import with_gains
+from tuning.studies import stability, tuner
 
 BODY = {
     "controller": {"t_f": 8.0, "delta": 0.4, "sign_width": 0.02, "k1": 2.0},
@@ -90,7 +94,7 @@ def drawn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(margin_verdicts, "TRIALS", 4)
         patch.setattr(margin_rows, "CASES", 2)
-        yield report.pose(scenario.from_tables(tables), 3)
+        yield tuner.pose(scenario.from_tables(tables), 3)
 
 
 def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(drawn):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from scipy import optimize, signal
 
-from ptsmc_jax import borders, linear, margins, plants, rollout, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.plants import second_order
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import borders, linear, margins
 from tests.helpers import short
-from tuning.gains import with_gains
+from tuning.search.gains import with_gains
 
 CHAIN = {
     "plant": {"kind": "chain", "order": 2},
@@ -149,7 +152,7 @@ STIFF = np.array([[3.0, 0.5], [0.5, 2.0]])
 COUPLED = {
     "plant": {
         "kind": "system",
-        "system": plants.system(
+        "system": second_order.system(
             2,
             F=lambda t, x, v: v + 0.1 * x,
             H=lambda t, x, v: -jnp.asarray(STIFF) @ jnp.sin(x) - 0.2 * v,

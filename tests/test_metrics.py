@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from ptsmc_jax import catalogues, metrics, rollout
+from ptsmc_jax.simulation import catalogues, metrics, rollout
 from tests.helpers import parts, vector
 
 

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import dispersions, hardware, montecarlo, numerics, plants, rollout, scenario, sensors, signals
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.devices import actuators, sensors
+from ptsmc_jax.dispersions import attitudes, variation
+from ptsmc_jax.numerics import pytrees
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import rollout
 from tests.helpers import FIRST_FLIGHT, parts, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
@@ -18,7 +25,7 @@ TABLE = (
     (5.0, 0.5, 10.0, (2.7e-5, 0.45), (4.3e-5, 0.45)),
     (4.0, 1.0, 40.0, (1.3e-5, 0.29), (1.5e-5, 0.29)),
 )
-SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +124,7 @@ torque_limit = { kind = "relative_normal", std = 0.2 }
 """
 
 
-@numerics.pytree
+@pytrees.pytree
 class _Biased(sensors.Sensors):
     """Sensors with a gyro that is off by what is given, not by what is drawn."""
 
@@ -141,17 +148,17 @@ def test_a_trial_made_by_hand_from_its_row_is_the_trial():
         for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             body[i, j] = body[j, i] = upper[i][j]
         sine = ready.parts.disturbance
-        d = signals.Sinusoid(numbers("disturbance_amplitude_", 3), sine.frequency, numbers("disturbance_phase_", 3),
-                             sine.bias + numbers("disturbance_bias_", 3))  # fmt: skip
+        swing, phase = numbers("disturbance_amplitude_", 3), numbers("disturbance_phase_", 3)
+        d = disturbances.Sinusoid(swing, sine.frequency, phase, sine.bias + numbers("disturbance_bias_", 3))
         eyes = _Biased(row.pop("attitude_noise"), row.pop("rate_noise"), numbers("rate_bias_", 3))
         by_hand = replace(
             ready.parts,
-            plant=plants.spacecraft(body),
-            initial=plants.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
-            reference=signals.Fixed(numbers("reference_q", 4)),
+            plant=rigid_body.spacecraft(body),
+            initial=rigid_body.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
+            reference=references.Fixed(numbers("reference_q", 4)),
             disturbance=d,
             sensors=eyes,
-            actuators=hardware.Actuators(torque_limit=row.pop("torque_limit")),
+            actuators=actuators.Actuators(torque_limit=row.pop("torque_limit")),
         )
         turn = Rotation.from_quat(by_hand.reference.q).inv() * Rotation.from_quat(by_hand.initial.q)
         assert float(row.pop("initial_angle")) == pytest.approx(turn.magnitude(), rel=1e-12)
@@ -164,8 +171,8 @@ def test_a_trial_made_by_hand_from_its_row_is_the_trial():
 
 def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
     run, trials = flown
-    wide = replace(SPREAD, attitude=dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
-    near = replace(wide, attitude=dispersions.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
+    wide = replace(SPREAD, attitude=attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
+    near = replace(wide, attitude=attitudes.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
     failed = montecarlo.run(run, near, 5, np.arange(8))
     assert failed.counts() == {"ok": 0, "diverged": 0, "singular": 8, "missed": 0}
     assert np.all(failed.bad_time >= 0.0)

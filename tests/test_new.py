@@ -5,13 +5,13 @@ import tomllib
 
 import pytest
 
-from ptsmc_jax import catalogues, keys, layouts, schema
-from ptsmc_jax.scenario import from_tables
-from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.scenario import from_tables, keys, layouts, schema
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.simulation import catalogues
 from tests.helpers import ROOT
-from tuning import new
-from tuning.options import UsageError
+from tuning.cli import new
+from tuning.errors import UsageError
 
 KEY = re.compile(r"^#?([a-z]\w*) = ")
 TABLE = re.compile(r"^#?\[(\w+)\]")

@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 from scipy.linalg import expm
 
-from ptsmc_jax import numerics
+from ptsmc_jax.numerics import guards, integrators, matrices, pytrees
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
@@ -34,7 +34,7 @@ class _Other(_Law):
 
 def test_two_classes_with_the_same_fields_are_two_structures():
     """What `jit` goes by, and where `jax.tree_util.register_dataclass` of jaxlib 0.10.2 takes one for the other."""
-    kinds = [numerics.pytree(kind) for kind in (_Law, _Other)]
+    kinds = [pytrees.pytree(kind) for kind in (_Law, _Other)]
     one, other = (jax.tree.structure(kind(1.0, {"inertia": 2.0}, 3)) for kind in kinds)
     assert one != other
     assert one == jax.tree.structure(_Law(5.0, {"inertia": 6.0}, 3))
@@ -51,7 +51,7 @@ def test_two_classes_with_the_same_fields_are_two_structures():
 def test_smooth_sign_is_tanh_and_tends_to_the_sign():
     s = np.array([-2.0, -0.3, -1e-4, 0.0, 1e-7, 0.01, 5.0])
     for width in (1e-5, 1e-3, 0.7):
-        got = np.asarray(numerics.smooth_sign(vector(s), vector(width)))
+        got = np.asarray(guards.smooth_sign(vector(s), vector(width)))
         # s / width and tanh round once each: 2 eps relative, with a factor of 2 for the compiled tanh
         np.testing.assert_allclose(got, [math.tanh(x / width) for x in s], rtol=4 * EPS, atol=0)
         # 1 - tanh(x) <= 2 exp(-2 x)
@@ -60,12 +60,12 @@ def test_smooth_sign_is_tanh_and_tends_to_the_sign():
 
 def test_width_zero_is_the_exact_sign():
     s = np.array([-1e300, -1e-300, -0.0, 0.0, 1e-300, 1e-9, 3.0])
-    np.testing.assert_array_equal(numerics.smooth_sign(vector(s), vector(0.0)), np.sign(s))
+    np.testing.assert_array_equal(guards.smooth_sign(vector(s), vector(0.0)), np.sign(s))
 
 
 @pytest.mark.parametrize(("s", "width"), [(0.0, 0.0), (0.3, 0.0), (0.0, 1e-3), (2e-3, 1e-3), (1.0, 1e-9)])
 def test_slopes_of_smooth_sign(s, width):
-    value, ratio = numerics.smooth_sign, s / width if width else math.inf
+    value, ratio = guards.smooth_sign, s / width if width else math.inf
     cosh = math.cosh(ratio) if ratio < 300 else math.inf
     expected = (0.0, 0.0) if width == 0 else (1 / (width * cosh**2), -ratio / (width * cosh**2))
     point = (vector(s), vector(width))
@@ -84,16 +84,16 @@ def test_norm_and_its_gradient_are_those_of_the_2_norm(size):
     direction = np.array([[0.6, -1.2, 0.3], [0.1, 0.0, 2.0]])
     direction /= math.sqrt(math.fsum(v * v for v in direction.flat))
     x = vector(size * direction)
-    np.testing.assert_allclose(numerics.norm(x), size, rtol=8 * EPS)  # six squares, a root
-    np.testing.assert_allclose(jax.grad(numerics.norm)(x), direction, rtol=16 * EPS, atol=0)
+    np.testing.assert_allclose(guards.norm(x), size, rtol=8 * EPS)  # six squares, a root
+    np.testing.assert_allclose(jax.grad(guards.norm)(x), direction, rtol=16 * EPS, atol=0)
 
 
 def test_norm_at_zero_has_gradient_zero():
     for shape in ((3,), (3, 3), ()):
         zero = jnp.zeros(shape)
-        assert numerics.norm(zero) == 0.0
-        np.testing.assert_array_equal(jax.grad(numerics.norm)(zero), np.zeros(shape))
-        np.testing.assert_array_equal(jax.jvp(numerics.norm, (zero,), (jnp.ones(shape),))[1], 0.0)
+        assert guards.norm(zero) == 0.0
+        np.testing.assert_array_equal(jax.grad(guards.norm)(zero), np.zeros(shape))
+        np.testing.assert_array_equal(jax.jvp(guards.norm, (zero,), (jnp.ones(shape),))[1], 0.0)
 
 
 # blends
@@ -101,14 +101,14 @@ def test_norm_at_zero_has_gradient_zero():
 
 def test_lerp_goes_from_b_to_a():
     a, b = {"x": vector(2.0), "y": vector([1.0, -1.0])}, {"x": vector(4.0), "y": vector([5.0, 7.0])}
-    got = numerics.lerp(vector(0.25), a, b)
+    got = guards.lerp(vector(0.25), a, b)
     assert got["x"] == 3.5
     np.testing.assert_array_equal(got["y"], [4.0, 5.0])
 
 
 def test_select_takes_one_side_and_no_tangent_of_the_other():
     def f(x, side):
-        return numerics.select(side, {"v": 3.0 * x}, {"v": jnp.sqrt(x)})["v"]  # sqrt has an infinite slope at 0
+        return guards.select(side, {"v": 3.0 * x}, {"v": jnp.sqrt(x)})["v"]  # sqrt has an infinite slope at 0
 
     for side, value, slope in ((True, 0.0, 3.0), (False, 0.0, math.inf)):
         assert jax.jvp(partial(f, side=jnp.asarray(side)), (vector(0.0),), (vector(1.0),)) == (value, slope)
@@ -136,7 +136,7 @@ def test_rk4_is_of_order_4():
         return {"growth": y["growth"] * jnp.cos(t), "turn": 2 * t * jnp.stack([-z, x])}
 
     start = {"growth": vector(1.0), "turn": vector([1.0, 0.0])}
-    step, errors = partial(numerics.rk4, rate), []
+    step, errors = partial(integrators.rk4, rate), []
     for count in (40, 80, 160, 320):
         got = march(step, start, 2.0, count)
         turn = np.linalg.norm(got["turn"] - np.array([math.cos(4.0), math.sin(4.0)]))
@@ -170,8 +170,8 @@ def phi_series(x, order):
     return np.asarray(total, dtype=float)
 
 
-three_phis = jax.jit(lambda x: numerics.phi_functions(x, 3))
-slopes = jax.jit(jax.jacrev(lambda x: sum(jnp.sum(phi) for phi in numerics.phi_functions(x, 3))))
+three_phis = jax.jit(lambda x: integrators.phi_functions(x, 3))
+slopes = jax.jit(jax.jacrev(lambda x: sum(jnp.sum(phi) for phi in integrators.phi_functions(x, 3))))
 BASIS = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
 
@@ -215,7 +215,7 @@ def test_phi_functions_of_any_matrix(size):
 
 
 def phi_corners(rate):
-    return jnp.stack([phi[0, 0] for phi in numerics.phi_functions(-rate * jnp.eye(2), 3)])
+    return jnp.stack([phi[0, 0] for phi in integrators.phi_functions(-rate * jnp.eye(2), 3)])
 
 
 phi_jacobians = [jax.jit(jacobian(phi_corners)) for jacobian in (jax.jacfwd, jax.jacrev)]
@@ -243,9 +243,9 @@ def test_etdrk4_without_linear_part_is_rk4():
         return jnp.concatenate([f, g])
 
     y, m = vector([1.0, -2.0]), vector([0.4, 0.3, -0.9])
-    linear = numerics.decay(jnp.zeros((3, 3)), dt)
-    y_next, m_next, _, _ = numerics.etdrk4(rate, linear, t, y, m, dt)
-    expected = numerics.rk4(joined, t, jnp.concatenate([y, m]), dt)
+    linear = integrators.decay(jnp.zeros((3, 3)), dt)
+    y_next, m_next, _, _ = integrators.etdrk4(rate, linear, t, y, m, dt)
+    expected = integrators.rk4(joined, t, jnp.concatenate([y, m]), dt)
     # phi_k(0) = 1/k! to an eps; the weights of m are sums of three of them
     np.testing.assert_allclose(jnp.concatenate([y_next, m_next]), expected, rtol=0, atol=50 * EPS)
 
@@ -267,7 +267,7 @@ def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
         linear = decay(matrix, vector(1.5 / count))
 
         def step(t, y, dt, linear=linear):
-            return numerics.etdrk4(rate, linear, t, y[0], y[1], dt)[:2]
+            return integrators.etdrk4(rate, linear, t, y[0], y[1], dt)[:2]
 
         end = march(step, exact(vector(0.0)), vector(1.5), count)
         errors.append(max(np.abs(a - b).max() for a, b in zip(end, exact(1.5), strict=True)))
@@ -276,19 +276,19 @@ def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
 
 
 RATES = 10.0 ** np.arange(-6, 7)
-decay = jax.jit(numerics.decay)
+decay = jax.jit(integrators.decay)
 
 
 @jax.jit
 def forced(linear, m, g, dt):
     """A step under a constant forcing g."""
-    return numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
+    return integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
 
 
 def waving(t, y, dt):
     """A step under the forcing cos t; the coefficients travel with the state."""
     y, m, linear = y
-    step = numerics.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
+    step = integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
     return *step[:2], linear
 
 
@@ -334,8 +334,8 @@ def test_etdrk4_hands_out_its_first_and_third_stage():
         forcing = jnp.stack([y[0] * y[1], jnp.ones(()), jnp.zeros(())]) + t * m * m
         return y * m[:2] - t, forcing, {"t": t, "y": y, "m": m}
 
-    linear = numerics.decay(vector(matrix), vector(dt))
-    *_, start, middle = numerics.etdrk4(rate, linear, vector(t), vector(y), vector(m), vector(dt))
+    linear = integrators.decay(vector(matrix), vector(dt))
+    *_, start, middle = integrators.etdrk4(rate, linear, vector(t), vector(y), vector(m), vector(dt))
     for got, expected in ((start, (t, y, m)), (middle, (t + dt / 2, y3, m3))):
         for a, b in zip((got["t"], got["y"], got["m"]), expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)  # numbers near 1, a dozen roundings
@@ -344,8 +344,8 @@ def test_etdrk4_hands_out_its_first_and_third_stage():
 @jax.jit
 @partial(jax.grad, argnums=(0, 1))
 def step_slopes(rate, dt):
-    linear = numerics.decay(rate * jnp.eye(2), dt)
-    return numerics.etdrk4(
+    linear = integrators.decay(rate * jnp.eye(2), dt)
+    return integrators.etdrk4(
         lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
     )[1][0]
 
@@ -375,40 +375,40 @@ def test_solve_and_determinant_are_lapacks(n):
         expected = np.linalg.solve(a, b)
         lost = 100 * EPS * np.linalg.cond(a / np.linalg.norm(a, axis=1, keepdims=True))
         np.testing.assert_allclose(
-            numerics.solve(vector(a), vector(b)), expected, rtol=0, atol=lost * np.abs(expected).max()
+            matrices.solve(vector(a), vector(b)), expected, rtol=0, atol=lost * np.abs(expected).max()
         )
         np.testing.assert_allclose(
-            numerics.solve(vector(a), vector(b[:, 0])), expected[:, 0], rtol=0, atol=lost * np.abs(expected).max()
+            matrices.solve(vector(a), vector(b[:, 0])), expected[:, 0], rtol=0, atol=lost * np.abs(expected).max()
         )
         rows = a / np.linalg.norm(a, axis=1, keepdims=True)
         whole = np.prod(np.linalg.norm(a, axis=1))
         np.testing.assert_allclose(
-            numerics.determinant(vector(a)) / whole, np.linalg.det(rows), rtol=0, atol=20 * n * EPS
+            matrices.determinant(vector(a)) / whole, np.linalg.det(rows), rtol=0, atol=20 * n * EPS
         )
 
 
 def test_determinant_of_a_singular_matrix_is_zero_and_solve_says_so_with_numbers_that_are_not_finite():
     for a in ([[0.0]], [[1.0, 2.0], [2.0, 4.0]], [[0.0, 1.0], [0.0, 2.0]], [[0.0, 0.0], [1.0, 2.0]], np.zeros((3, 3))):
         matrix = vector(np.asarray(a))
-        assert float(numerics.determinant(matrix)) == 0.0
-        assert not np.all(np.isfinite(numerics.solve(matrix, jnp.ones(len(a)))))
+        assert float(matrices.determinant(matrix)) == 0.0
+        assert not np.all(np.isfinite(matrices.solve(matrix, jnp.ones(len(a)))))
 
 
 def test_slope_of_solve_is_that_of_the_inverse():
     rng = np.random.default_rng(4)
     a, b, da = (vector(rng.normal(size=shape)) for shape in ((3, 3), (3,), (3, 3)))
-    x, slope = jax.jvp(lambda a: numerics.solve(a, b), (a,), (da,))
+    x, slope = jax.jvp(lambda a: matrices.solve(a, b), (a,), (da,))
     np.testing.assert_allclose(slope, -np.linalg.solve(a, da @ x), rtol=1e-10)
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-3])
 def test_signed_root(width):
     x = vector(np.array([-4.0, -1e-3, 0.0, 1e-9, 0.25]))
-    got = numerics.signed_root(x, vector(width))
+    got = guards.signed_root(x, vector(width))
     exact = np.asarray(x) / np.where(np.asarray(x) == 0, 1.0, (np.asarray(x) ** 2 + width**2) ** 0.25)
     np.testing.assert_allclose(got, exact, rtol=4 * EPS, atol=0)
     if width == 0.0:
         np.testing.assert_allclose(got, np.sign(x) * np.sqrt(np.abs(x)), rtol=4 * EPS)
-    slope = jax.vmap(jax.grad(lambda v: numerics.signed_root(v, vector(width))))(x)
+    slope = jax.vmap(jax.grad(lambda v: guards.signed_root(v, vector(width))))(x)
     assert np.all(np.isfinite(slope))
     np.testing.assert_allclose(slope[2], 0.0 if width == 0.0 else width**-0.5, rtol=4 * EPS)

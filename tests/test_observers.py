@@ -3,14 +3,15 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax import observers, plants
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.plants import rigid_body
 from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
 NOW = vector(0.0)
 
 
 def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
-    return observers.NonlinearObserver(plants.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
+    return nonlinear.NonlinearObserver(rigid_body.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-9, 0.05, 1.0, 1e3])
@@ -23,7 +24,7 @@ def test_update_matrix_is_one_minus_the_exponential_over_dt(dt):
 
 
 def body(w):
-    return plants.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
+    return rigid_body.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
 
 
 def held_motion(inertia, torque, seconds, steps=2000):
@@ -69,7 +70,7 @@ def test_continuous_error_obeys_its_equation():
     """(54) with the true motion: d_hat' = forcing - A d_hat must be -A (d_hat - d)."""
     found = observer()
     w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
-    x_dot = plants.spacecraft(FULL_INERTIA).rate(NOW, body(w), u, d)
+    x_dot = rigid_body.spacecraft(FULL_INERTIA).rate(NOW, body(w), u, d)
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     np.testing.assert_allclose(found.decay_matrix(NOW, NOW), a, rtol=1e-12)
     found_rate = (

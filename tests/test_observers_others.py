@@ -10,20 +10,24 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm
 
-from ptsmc_jax import observers, plants, rollout, scenario, signals
+from ptsmc_jax import scenario
+from ptsmc_jax.observers import finite_time, prescribed_time
+from ptsmc_jax.plants import base, integrator_chain, rigid_body, second_order
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import rollout
 from tests.helpers import FULL_INERTIA, chain_parts, parts, short, vector
 
-MASS: plants.Plant = plants.chain(2)  # one input, M = 1
+MASS: base.Plant = integrator_chain.chain(2)  # one input, M = 1
 GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
-def prescribed(model: plants.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+def prescribed(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
     values = (vector([gain] * model.inputs), *(vector(v) for v in (c, start, mu, t_o, delta_o)))
-    return observers.PrescribedTimeObserver(model, *values)
+    return prescribed_time.PrescribedTimeObserver(model, *values)
 
 
-def finite(model: plants.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
-    return observers.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
+def finite(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
+    return finite_time.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 
 def kept(t, gain=GAIN, mu=MU):
@@ -41,7 +45,7 @@ def test_digital_prescribed_time_observer_forgets_as_its_closed_form_says(h):
 
 
 def test_prescribed_time_update_for_a_full_inertia_is_the_matrix_exponential():
-    found = prescribed(plants.spacecraft(FULL_INERTIA), gain=10.0)
+    found = prescribed(rigid_body.spacecraft(FULL_INERTIA), gain=10.0)
     t, h = 3.0, 0.5
     a = 10.0 * np.linalg.inv(FULL_INERTIA)
     factor = expm(-a * h) * ((T_O - t) / (T_O - t + h)) ** MU
@@ -59,7 +63,7 @@ def test_updates_of_length_zero_change_nothing_and_have_finite_slopes():
 
         slope = jax.jacfwd(moved)(vector(0.0))
         assert np.all(np.isfinite(slope))
-        if isinstance(found, observers.PrescribedTimeObserver):
+        if isinstance(found, prescribed_time.PrescribedTimeObserver):
             np.testing.assert_allclose(moved(vector(0.0)), 0.1)
 
 
@@ -73,7 +77,7 @@ def continuous(observer, disturbance, t_f=6.0, steps=400):
 
 def test_continuous_prescribed_time_observer_forgets_as_its_closed_form_says():
     d = 0.4
-    log = continuous(prescribed(), signals.Constant(vector([d])))
+    log = continuous(prescribed(), disturbances.Constant(vector([d])))
     expected = np.array([-d * kept(t) for t in log.t])
     # order 4 on nodes a tenth nearer each: 1e-7; it is what is left of d that counts
     np.testing.assert_allclose(log.d_hat[:, 0] - d, expected, rtol=0, atol=1e-6 * d)
@@ -144,7 +148,7 @@ def test_finite_time_bound_is_the_geometric_series_of_its_overshoots(share, cons
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9])
 def test_no_disturbance_that_keeps_to_its_rate_beats_the_overshoots_of_the_finite_time_bound(share):
     """Half a cycle, e0 from 0 to 0, with d' = +-share c switched on the lines e = k sqrt(e0): the worst of many."""
-    limit = np.interp(share, np.linspace(0, 1, 11), observers._OVERSHOOT)
+    limit = np.interp(share, np.linspace(0, 1, 11), finite_time._OVERSHOOT)
     worst, h = 0.0, 5e-4
     for switch in (-9.0, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0):
         root, error = 1e-6, 1.0  # root of e0, which moves smoothly through the start
@@ -185,7 +189,7 @@ def test_digital_finite_time_observer_follows_the_equations_with_order_1():
 
 def test_continuous_finite_time_observer_finds_a_constant_within_its_time():
     d = 0.4
-    log = continuous(finite(gain=0.5, start=d, width=1e-5), signals.Constant(vector([d])), steps=3000)
+    log = continuous(finite(gain=0.5, start=d, width=1e-5), disturbances.Constant(vector([d])), steps=3000)
     settled = 1.2519 * d / 0.5
     assert np.abs(log.d_hat[log.t < 0.5 * settled, 0] - d).max() == pytest.approx(d)
     # inside the layer e0 holds +-width at most: 1.5 sqrt(c width) is left of the error
@@ -240,7 +244,7 @@ def _pendulums():
     def H(t, x_1, x_2):  # noqa: N802
         return -jnp.sin(x_1) + 0.1 * (x_1[::-1] - x_1)
 
-    return plants.system(2, F, H, G, D=G)
+    return second_order.system(2, F, H, G, D=G)
 
 
 PENDULUMS = _pendulums()

@@ -8,10 +8,13 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from ptsmc_jax import scenario, schema, store, systems
-from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.store import RefusedError
-from tuning import campaign_folder, own_parts
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from tuning.search import own_parts
+from tuning.studies import campaign_folder
 
 # what marks that it was run; a double integrator, and a metric of one's own
 PROGRAM = """

@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers import tree
 from tests.pages import Page, checked
-from tuning import page, page_charts
+from tuning.output import page, page_charts
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from ptsmc_jax import paper, slips
+from ptsmc_jax.paper import claims, slips
 from ptsmc_jax.scenario import read
 from tests.helpers import REFERENCE
-from tuning import reproduction
+from tuning.studies import reproduction
 
 
 @pytest.fixture(scope="module")
@@ -17,14 +17,14 @@ def made():
 
 
 def test_every_figure_of_the_paper_is_a_case():
-    numbers = [int(n) for figures, _, _ in paper.CASES.values() for n in figures.split(", ")]
+    numbers = [int(n) for figures, _, _ in claims.CASES.values() for n in figures.split(", ")]
     assert numbers == list(range(1, 11))
 
 
 def test_cases_are_those_of_the_reference_data(made):
     """The independent integration was made with c instead of sqrt(3) c in (55): a larger K2 holds a tenth less."""
     by_name = {(c["t_f"], c["eta"]): c["summary"] for c in REFERENCE["cases"]}
-    for name in paper.SPACECRAFT:
+    for name in claims.SPACECRAFT:
         law = made.cases[name].parts.controller
         truth = by_name[float(law.t_f), float(law.eta)]
         np.testing.assert_allclose(made.cases[name].metrics["terminal_error"], truth["terminal_error_2"], rtol=0.3)
@@ -56,7 +56,7 @@ def test_verdicts_are_those_that_the_theory_notes_expect(made):
 def test_a_verdict_follows_its_measurement(made):
     """The same words with other runs: nothing is decided beforehand."""
     swapped = {**made.cases, "case_2_eta_3": made.cases["case_2_eta_5"], "case_2_eta_5": made.cases["case_2_eta_3"]}
-    told = {claim.claim: claim.verdict for claim in paper.claims(swapped)}
+    told = {claim.claim: claim.verdict for claim in claims.claims(swapped)}
     assert told["a larger eta converges faster"] == "differs"
     assert told["so does a larger eta"] == "differs"
 
@@ -93,11 +93,11 @@ def test_folder_holds_figures_claims_and_scenarios(made, tmp_path):
     names = {path.name for path in (tmp_path / "figures").iterdir()}
     for number in range(1, 11):
         assert any(name.startswith(f"fig_{number:02}") for name in names), number
-    assert {f"convergence_{name}.png" for name in paper.CASES} <= names
+    assert {f"convergence_{name}.png" for name in claims.CASES} <= names
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["status"] == "ok"
     assert sum(summary["verdicts"].values()) == len(summary["claims"]) == len(made.claims)
-    assert all(claim["verdict"] in paper.VERDICTS for claim in summary["claims"])
+    assert all(claim["verdict"] in claims.VERDICTS for claim in summary["claims"])
     text = (tmp_path / "claims.md").read_text()
     for line in (*made.claims, *made.slips):
         assert line.where in text

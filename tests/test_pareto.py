@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.metrics import Metrics
-from ptsmc_jax.montecarlo import Trials
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
 from tests.pages import checked
-from tuning import pareto, report, show, told
+from tuning.output import sentences, terminal
+from tuning.studies import pareto, tuner
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
@@ -78,7 +79,7 @@ def test_a_front_with_gains_that_never_fly_can_be_told():
     lost = {"gains": {"eta": 3.0}, "peak": None, "mean_peak": None, "rms": None, "interval": None, "failures": 9,
             "knee": False, "meets": False, "dominated": False}  # fmt: skip
     summary = {"plant": "spacecraft", "points": [lost], "requirements": [], "paper": lost, "paper_refused": None}
-    assert told.front(summary).rows == [
+    assert sentences.front(summary).rows == [
         ("", "-", "-", "-", "-", "3", "9 failed or missed"),
         ("paper", "-", "-", "-", "-", "3", "9 failed or missed"),
     ]
@@ -88,7 +89,7 @@ def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
     each = {"gains": {"observer_gain_1": 5.0, "observer_gain_2": 6.0}, "peak": 0.3, "mean_peak": 0.2, "rms": 1e-5,
             "interval": None, "failures": 0, "knee": False, "meets": True, "dominated": False}  # fmt: skip
     others = {"paper": {**each, "gains": {"observer_gain": 10.0}}, "before": {**each, "gains": {}}}
-    rows = told.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
+    rows = sentences.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
     assert [row[5:7] for row in rows] == [("5", "6"), ("10", "10"), ("-", "-")]
 
 
@@ -117,7 +118,7 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
         made = scenario.replace(
             scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
         )
-        flown = report.judge(made, summary["seed"], ())
+        flown = tuner.judge(made, summary["seed"], ())
         np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
         np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
     assert f"{len(kept)} points, each judged on 60 fresh trials" in told
@@ -181,7 +182,7 @@ def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(show.Progress, "__call__", stop)
+        patch.setattr(terminal.Progress, "__call__", stop)
         status, _, err = command(*run, "cut")
     assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
     assert not (tmp_path / "cut" / "front.csv").exists()

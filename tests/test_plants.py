@@ -10,7 +10,9 @@ from jax import lax
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import formulas, numerics, plants
+from ptsmc_jax import formulas
+from ptsmc_jax.numerics import integrators
+from ptsmc_jax.plants import rigid_body
 from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
 EPS = np.finfo(float).eps
@@ -31,10 +33,10 @@ INERTIAS = [np.diag(PAPER_INERTIA), np.array(FULL_INERTIA), random_body(0), rand
 @pytest.mark.parametrize("inertia", INERTIAS)
 def test_rate_is_eulers_equation(inertia):
     rng = np.random.default_rng(4)
-    body = plants.spacecraft(inertia)
+    body = rigid_body.spacecraft(inertia)
     for _ in range(5):
         q, w, u, d = rng.normal(size=4), *rng.normal(size=(3, 3))
-        x = plants.AttitudeState(vector(q), vector(w))
+        x = rigid_body.AttitudeState(vector(q), vector(w))
         got = body.rate(vector(0.0), x, vector(u), vector(d))
         momentum = inertia @ w
         gyroscopic = [
@@ -46,7 +48,7 @@ def test_rate_is_eulers_equation(inertia):
         tolerance = 10 * EPS * np.linalg.norm(inertia) * np.linalg.norm(w)
         np.testing.assert_allclose(body.gyroscopic(vector(w)), gyroscopic, rtol=0, atol=10 * EPS * scale)
         np.testing.assert_allclose(
-            body.momentum(plants.AttitudeState(vector(q), vector(w))), momentum, rtol=0, atol=tolerance
+            body.momentum(rigid_body.AttitudeState(vector(q), vector(w))), momentum, rtol=0, atol=tolerance
         )
         w_dot = np.linalg.solve(inertia, u + d - gyroscopic)
         tolerance = 20 * EPS * np.linalg.cond(inertia) * (np.abs(w_dot).max() + scale / np.linalg.norm(inertia))
@@ -62,16 +64,16 @@ def coast(body, x, end, count):
         def rate(t, y):
             return body.rate(t, y, jnp.zeros(3), jnp.zeros(3))
 
-        return numerics.rk4(rate, k * (end / count), x, end / count), None
+        return integrators.rk4(rate, k * (end / count), x, end / count), None
 
     return lax.scan(advance, x, jnp.arange(count))[0]
 
 
 @pytest.mark.parametrize("inertia", INERTIAS)
 def test_free_motion_conserves_momentum_and_energy_to_order_4(inertia):
-    body, rotation = plants.spacecraft(inertia), Rotation.from_rotvec([0.3, -2.0, 1.0])
+    body, rotation = rigid_body.spacecraft(inertia), Rotation.from_rotvec([0.3, -2.0, 1.0])
     w, end = np.array([0.3, -0.5, 0.4]), 40.0
-    start = plants.AttitudeState(vector(rotation.as_quat()), vector(w))
+    start = rigid_body.AttitudeState(vector(rotation.as_quat()), vector(w))
     momentum, energy = rotation.apply(inertia @ w), w @ inertia @ w / 2
 
     drifts = []
@@ -98,9 +100,9 @@ def test_free_motion_conserves_momentum_and_energy_to_order_4(inertia):
 
 def test_the_body_is_turned_by_its_rate():
     # a principal spin: q exp(w t) exactly, body axes on the right
-    body, w = plants.spacecraft(PAPER_INERTIA), np.array([0.0, 0.2, 0.0])
+    body, w = rigid_body.spacecraft(PAPER_INERTIA), np.array([0.0, 0.2, 0.0])
     start = Rotation.from_rotvec([1.0, 0.2, -0.5])
-    x = coast(body, plants.AttitudeState(vector(start.as_quat()), vector(w)), 10.0, 100)
+    x = coast(body, rigid_body.AttitudeState(vector(start.as_quat()), vector(w)), 10.0, 100)
     end = (start * Rotation.from_rotvec(w * 10.0)).as_quat()
     np.testing.assert_allclose(x.w, w, rtol=0, atol=4 * EPS)
     # (|w|/2 h)^5/120 a step
@@ -108,8 +110,8 @@ def test_the_body_is_turned_by_its_rate():
 
 
 def test_normalise_restores_the_norm_alone():
-    x = plants.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
-    got = plants.spacecraft(PAPER_INERTIA).normalise(x)
+    x = rigid_body.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
+    got = rigid_body.spacecraft(PAPER_INERTIA).normalise(x)
     np.testing.assert_allclose(got.q, np.array([1, 2, -3, 4]) / np.sqrt(30), rtol=4 * EPS)
     np.testing.assert_array_equal(got.w, x.w)
 
@@ -118,7 +120,7 @@ def test_normalise_restores_the_norm_alone():
 
 
 def test_the_spacecraft_is_a_frozen_pytree_of_arrays():
-    body = plants.spacecraft(FULL_INERTIA)
+    body = rigid_body.spacecraft(FULL_INERTIA)
     leaves = jax.tree.leaves(body)
     assert len(leaves) == 2
     assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 and leaf.shape == (3, 3) for leaf in leaves)
@@ -167,7 +169,7 @@ def test_bodies_that_cannot_exist_are_refused_in_any_size_and_axes(moments, reas
     for order in itertools.permutations(moments):
         for rotation in ROTATIONS:
             tensor = scale * rotation @ np.diag(order) @ rotation.T
-            for build in (formulas.check_inertia, plants.spacecraft):
+            for build in (formulas.check_inertia, rigid_body.spacecraft):
                 with pytest.raises(ValueError, match=reason):
                     build((tensor + tensor.T) / 2)
 
@@ -186,7 +188,7 @@ def test_bodies_that_cannot_exist_are_refused_in_any_size_and_axes(moments, reas
     ],
 )
 def test_what_is_no_inertia_is_refused(inertia, reason):
-    for build in (formulas.check_inertia, plants.spacecraft):
+    for build in (formulas.check_inertia, rigid_body.spacecraft):
         with pytest.raises(ValueError, match=reason):
             build(inertia)
 
@@ -204,9 +206,9 @@ HELD = {0.1: (1.3e-12, 9e-15, 1e-13), 0.2: (4e-11, 1e-12, 2e-12), 0.5: (4e-9, 3e
 
 @pytest.mark.parametrize("rate", HELD)
 def test_a_control_period_of_twenty_hertz_needs_one_step(rate):
-    body, inertia = plants.spacecraft(PAPER_INERTIA), np.diag(PAPER_INERTIA)
+    body, inertia = rigid_body.spacecraft(PAPER_INERTIA), np.diag(PAPER_INERTIA)
     w0 = rate * np.array([1.0, -0.7, 0.5]) / np.linalg.norm([1.0, -0.7, 0.5])
-    start = plants.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector(w0))
+    start = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector(w0))
 
     def derivative(_, y):
         q, w = y[:4], y[4:]

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import configure, numerics, programs
-from tests.helpers import ROOT
+from ptsmc_jax import configure, programs
+from ptsmc_jax.numerics import pytrees
+from tests.tree import ROOT, modules
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def spied(name="spied", factor=2.0):
         traced.append(kind)
         return {"both": jnp.sin(factor * x) + y * len(kind), "grid": jnp.linspace(0.0, 1.0, points)}
 
-    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.attitude", name, name
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", name, name
     return programs.jit(function, static_argnames="kind"), traced
 
 
@@ -53,7 +54,7 @@ def test_a_program_is_compiled_once_and_loaded_by_the_next_process(folder):
     np.testing.assert_allclose(first[1]["both"], np.sin(4 * X) + 5.0, rtol=1e-15)
 
 
-@numerics.pytree
+@pytrees.pytree
 @dataclass(frozen=True)
 class _Law:
     gain: Any
@@ -65,8 +66,8 @@ class _Other(_Law):
 
 
 for _kind in (_Law, _Other):
-    _kind.__module__ = "ptsmc_jax.controllers"
-numerics.pytree(_Other)
+    _kind.__module__ = "ptsmc_jax.laws.error_quaternion"
+pytrees.pytree(_Other)
 
 
 def test_another_structure_shape_type_static_argument_version_or_code_is_another_program(folder, monkeypatch):
@@ -93,7 +94,7 @@ def test_two_laws_with_the_same_numbers_are_two_programs(folder):
     def function(law):
         return law.gain * (3.0 if type(law) is _Other else 1.0)
 
-    function.__module__, function.__qualname__ = "ptsmc_jax.attitude", "function"
+    function.__module__, function.__qualname__ = "ptsmc_jax.numerics.attitude", "function"
     for _ in range(2):  # compiled, then loaded
         program = programs.jit(function)
         assert [float(program(law(2.0))) for law in (_Law, _Other)] == [2.0, 6.0]
@@ -174,7 +175,8 @@ import sys
 from ptsmc_jax.configure import configure
 configure(devices=2, cache=sys.argv[1], keep_programs=True)
 import jax, jax.numpy as jnp, numpy as np
-from ptsmc_jax import montecarlo, programs
+from ptsmc_jax import programs
+from ptsmc_jax.campaigns import montecarlo
 
 traced = []
 
@@ -184,7 +186,7 @@ def poles(a):
     spread = montecarlo.spread(lambda x: jnp.sin(3.0 * x) * x + 1.0, jnp.arange(4.0), 2)
     return jnp.sort(jnp.abs(values)), spread
 
-poles.__module__, poles.__qualname__ = "ptsmc_jax.linear", "poles"
+poles.__module__, poles.__qualname__ = "ptsmc_jax.theory.linear", "poles"
 
 def same(given):
     return poles(**given)
@@ -223,8 +225,7 @@ def test_processes_share_programs_with_lapack_and_several_devices_in_them(tmp_pa
 def test_every_program_is_a_function_of_its_module():
     """Called by keywords where it is kept, and known by its name: no function that another one wraps, as vmap does."""
     found = 0
-    for path in sorted((ROOT / "ptsmc_jax").glob("*.py")) + sorted((ROOT / "tuning").glob("*.py")):
-        module = importlib.import_module(f"{path.parent.name}.{path.stem}")
+    for module in map(importlib.import_module, modules()):
         for program in [v for v in vars(module).values() if isinstance(v, programs.Program)]:
             home = sys.modules[program._function.__module__]
             named = getattr(home, program._function.__name__)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.test_trust import SPREAD
-from tuning import objective, refine
-from tuning.bounds import Bounds
-from tuning.descent import Best
-from tuning.evaluate import Evaluator, Measured
+from tuning.search import objective, refine
+from tuning.search.bounds import Bounds
+from tuning.search.descent import Best
+from tuning.search.evaluate import Evaluator, Measured
 
 
 class Valley(Evaluator):

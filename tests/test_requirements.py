@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from ptsmc_jax.catalogues import CATALOGUE
-from ptsmc_jax.requirements import Requirement, fewest_trials, least_within
+from ptsmc_jax.simulation.catalogues import CATALOGUE
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within
 
 LIMIT = 0.5
 BEYOND = np.nextafter(LIMIT, 1.0)

@@ -5,7 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, plants, rollout, runs, scenario, signals, theory
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import runs
+from ptsmc_jax.plants import rigid_body, second_order
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.theory import solutions
 from tests.helpers import FULL_INERTIA, REFERENCE, finer, parts, short, vector, with_controller
 
 fly = rollout.simulate_jit
@@ -13,7 +18,7 @@ fly = rollout.simulate_jit
 
 def perfect(run: rollout.Parts) -> rollout.Parts:
     """No disturbance, so that d_hat = 0 is a perfect estimate, and K2 = 0: exact solution 1 applies."""
-    quiet = signals.Constant(jnp.zeros(3))
+    quiet = disturbances.Constant(jnp.zeros(3))
     bound = replace(run.observer, disturbance_rate_bound=vector(0.0))
     return replace(run, disturbance=quiet, observer=bound)
 
@@ -56,7 +61,7 @@ def test_perfect_estimate_gives_the_exact_solution(eta, rate):
     before = np.asarray(log.t) < 29.949
     error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
     t = np.asarray(log.t)[before]
-    exact = jax.vmap(lambda t: theory.exact_error(t, vector(30.0), vector(eta), error, error_rate))(vector(t))
+    exact = jax.vmap(lambda t: solutions.exact_error(t, vector(30.0), vector(eta), error, error_rate))(vector(t))
     # the default grid leaves up to 1e-9, twice its steps a sixteenth; s is tau times a rate, tau up to 30 s
     np.testing.assert_allclose(np.asarray(log.error)[before], exact.error, rtol=0, atol=1e-10)
     np.testing.assert_allclose(np.asarray(log.s)[before], exact.s, rtol=0, atol=3e-9)
@@ -64,9 +69,9 @@ def test_perfect_estimate_gives_the_exact_solution(eta, rate):
 
 TILTED = vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06))
 MOVING = {
-    "spin": signals.Spin(TILTED, vector(0.004, -0.006, 0.005)),
-    "sinusoid": signals.Swing(TILTED, vector(0.1, -0.05, 0.08), vector(0.1, 0.15, 0.2), vector(0.0, 1.0, 2.0)),
-    "slew": signals.Slew(TILTED, vector(0.3, 0.4, -0.2), vector(25.0)),
+    "spin": references.Spin(TILTED, vector(0.004, -0.006, 0.005)),
+    "sinusoid": references.Swing(TILTED, vector(0.1, -0.05, 0.08), vector(0.1, 0.15, 0.2), vector(0.0, 1.0, 2.0)),
+    "slew": references.Slew(TILTED, vector(0.3, 0.4, -0.2), vector(25.0)),
 }
 
 
@@ -79,7 +84,7 @@ def test_exact_solution_for_a_moving_reference(kind):
     before = np.asarray(log.t) < 19.89
     error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
     t = vector(np.asarray(log.t)[before])
-    exact = jax.vmap(lambda t: theory.exact_error(t, vector(20.0), vector(3.5), error, error_rate))(t)
+    exact = jax.vmap(lambda t: solutions.exact_error(t, vector(20.0), vector(3.5), error, error_rate))(t)
     np.testing.assert_allclose(np.asarray(log.error)[before], exact.error, rtol=0, atol=1e-10)
 
 
@@ -126,7 +131,7 @@ def test_order_of_convergence_is_four():
 @pytest.mark.parametrize("gain", [0.5, 10.0, 300.0])
 def test_no_observer_gain_blows_up(inertia, gain):
     scale = np.max(inertia) / 14.0
-    wave = signals.Sinusoid(*(vector([v] * 3) for v in (0.01 * scale, 0.1, 0.0, 0.0)))
+    wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01 * scale, 0.1, 0.0, 0.0)))
     run = parts(30.0, 3.0, 0.5, gain, inertia=inertia, disturbance=wave, rate_bound=1e-3 * scale)
     result = fly(run, record=True)
     assert result.log is not None
@@ -189,11 +194,11 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     assert 20.02 - log.t[k] > 1e-3  # not on a sample
     halves = 64  # Euler-free check: RK4 in many small steps from the sample before, under the same torque
     x = jax.tree.map(lambda v: jnp.asarray(v[k]), log.x)
-    from ptsmc_jax import numerics
+    from ptsmc_jax.numerics import integrators
 
     for j in range(halves):
         step = (20.02 - log.t[k]) / halves
-        x = numerics.rk4(
+        x = integrators.rk4(
             lambda t, y: run.plant.rate(t, y, jnp.asarray(log.u[k]), run.disturbance(t)),
             vector(log.t[k] + j * step),
             x,
@@ -222,7 +227,7 @@ def flown(plant, mode, **tables):
     return runs.fly(scenario.study(scenario.from_tables({"plant": plant, "loop": {"mode": mode}, **tables})))
 
 
-MASS = plants.system(1, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(1))
+MASS = second_order.system(1, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(1))
 
 
 @pytest.mark.parametrize("mode", ["continuous", "sampled"])
@@ -258,7 +263,7 @@ def test_either_sign_of_the_quaternion_is_the_same_run():
     np.testing.assert_array_equal(one.log.x.q, other.log.x.q)
     np.testing.assert_array_equal(one.metrics.window_error, other.metrics.window_error)
     # and a reference given with q_f4 < 0 is reached with a true error of zero, not of 2 pi
-    flipped = fly(parts(reference=signals.Fixed(vector(0.0, 0.0, 0.0, -1.0))))
+    flipped = fly(parts(reference=references.Fixed(vector(0.0, 0.0, 0.0, -1.0))))
     np.testing.assert_allclose(flipped.metrics.window_error, one.metrics.window_error, rtol=1e-9)
     assert float(flipped.metrics.terminal_angle) < 1e-6
 
@@ -290,11 +295,11 @@ def test_simulate_without_jit_is_the_same():
 
 
 def test_observer_and_controller_hold_a_model_of_their_own():
-    heavier = plants.spacecraft((10.5, 12.6, 14.7))
+    heavier = rigid_body.spacecraft((10.5, 12.6, 14.7))
     run = parts(30.0, 3.0, 0.5, period=0.05)
     off = fly(replace(run, plant=heavier))
     assert int(off.status) == rollout.OK
-    same = fly(replace(run, plant=plants.spacecraft((10.0, 12.0, 14.0))))
+    same = fly(replace(run, plant=rigid_body.spacecraft((10.0, 12.0, 14.0))))
     np.testing.assert_array_equal(same.metrics.window_error, fly(run).metrics.window_error)
     assert abs(float(off.metrics.window_error / same.metrics.window_error) - 1.0) > 0.05
     np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)

@@ -2,7 +2,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax import rows
+from ptsmc_jax.campaigns import rows
 
 KEY = rows.key_of({"loop": {"period": 0.1}}, {"seed": 1})
 

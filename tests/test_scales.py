@@ -7,12 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import attitude, borders, observers, plants, scales, scenario
-from ptsmc_jax.plants import AttitudeState
-from ptsmc_jax.signals import Target
+from ptsmc_jax import scenario
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.plants import rigid_body, second_order
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.scenario import scales
+from ptsmc_jax.signals.references import Target
+from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, parts, vector
 
-ARM = {"plant": {"kind": "system", "system": plants.system(
+ARM = {"plant": {"kind": "system", "system": second_order.system(
     1, F=lambda t, x, v: v, H=lambda t, x, v: 0.0 * x, G=lambda t, x, v: jnp.eye(1)), "x0": [1.0, 0.0]}}  # fmt: skip
 
 
@@ -24,8 +29,8 @@ def flight(**changes):
 def test_a_dead_beat_observer_leaves_what_it_says_of_the_slowest_error(inertia):
     """E of the observer that flies, its largest eigenvalue; per axis where the axes are principal ones."""
     gain = scales.dead_beat_gain(flight(spacecraft__inertia=inertia))
-    body = plants.spacecraft(inertia)
-    observer = observers.NonlinearObserver(body, vector([gain] * 3), vector(1e-3), vector(0.0))
+    body = rigid_body.spacecraft(inertia)
+    observer = nonlinear.NonlinearObserver(body, vector([gain] * 3), vector(1e-3), vector(0.0))
     kept = np.abs(np.linalg.eigvals(np.eye(3) - 0.05 * np.asarray(observer.update_matrix(vector(0.05)))))  # of I - E
     np.testing.assert_allclose(kept.max(), 5e-5, rtol=1e-8)  # rounding of 1 beside 5e-5
 

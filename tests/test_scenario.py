@@ -9,11 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import clock, dispersions, pace, schema, sensors, signal_tables, signals, store
-from ptsmc_jax.attitude_keys import quaternion
-from ptsmc_jax.pace import Reach
-from ptsmc_jax.scenario import from_tables, read, replace, study
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.devices import sensors
+from ptsmc_jax.dispersions import attitudes
+from ptsmc_jax.scenario import from_tables, pace, read, replace, schema, signal_tables, study
+from ptsmc_jax.scenario.attitude_keys import quaternion
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.pace import Reach
+from ptsmc_jax.signals import references
+from ptsmc_jax.simulation import clock
 from tests.bad_scenarios import BAD, ONE_KEY, SAMPLED
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector
 
@@ -265,7 +269,7 @@ def test_every_key_reaches_its_part():
     assert (float(parts.sensors.attitude_noise), float(parts.sensors.rate_noise)) == (2e-5, 1e-6)
     assert isinstance(parts.clock, clock.Anchored)
     assert (float(parts.clock.period), float(parts.clock.t_end)) == (0.25, 33.0)
-    assert isinstance(ready.dispersion.attitude, dispersions.AxisAngle)
+    assert isinstance(ready.dispersion.attitude, attitudes.AxisAngle)
     np.testing.assert_allclose(ready.dispersion.attitude.smallest, np.pi / 2, rtol=ROUNDING)
     np.testing.assert_allclose(ready.dispersion.attitude.largest, np.pi, rtol=ROUNDING)
     assert [(r.metric, r.limit) for r in ready.requirements] == [("effort", 6.0), ("peak_torque", 0.5)]
@@ -277,7 +281,7 @@ def test_kinds_choose_parts():
 
     assert isinstance(parts_of("").clock, clock.Graded)
     assert isinstance(parts_of(SAMPLED + "loop.clock = 'flight'").clock, clock.Flight)
-    assert isinstance(parts_of("").reference, signals.Fixed)
+    assert isinstance(parts_of("").reference, references.Fixed)
     assert parts_of(SAMPLED).sensors is None
     steady = parts_of("disturbance = { kind = 'constant', amplitude = [1.0, 2.0, 3.0] }")
     np.testing.assert_array_equal(steady.disturbance(steady.t_end), [1.0, 2.0, 3.0])
@@ -293,9 +297,9 @@ def test_kinds_of_dispersion():
         return study(from_tables(tomllib.loads(text))).dispersion.attitude
 
     assert drawn("") is None
-    assert isinstance(drawn("dispersion.attitude.kind = 'uniform'"), dispersions.UniformAttitude)
+    assert isinstance(drawn("dispersion.attitude.kind = 'uniform'"), attitudes.UniformAttitude)
     normal = drawn("dispersion.attitude = { kind = 'normal', std_deg = 90.0 }")
-    assert isinstance(normal, dispersions.NormalAttitude)
+    assert isinstance(normal, attitudes.NormalAttitude)
     np.testing.assert_allclose(normal.std, np.pi / 2, rtol=ROUNDING)
 
 

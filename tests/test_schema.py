@@ -4,16 +4,15 @@ import re
 
 import pytest
 
-from ptsmc_jax import schema
-from ptsmc_jax.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
-from ptsmc_jax.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
-from ptsmc_jax.law_tables import Baseline, Prescribed
-from ptsmc_jax.plant_tables import ChainPlant
-from ptsmc_jax.scenario import from_tables
-from ptsmc_jax.schema import ScenarioError
-from ptsmc_jax.signal_tables import Attitude, GravityGradient, SumDisturbance
-from ptsmc_jax.tables import Scenario
-from ptsmc_jax.values import Table
+from ptsmc_jax.scenario import errors, from_tables, schema
+from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import Baseline, Prescribed
+from ptsmc_jax.scenario.plant_tables import ChainPlant
+from ptsmc_jax.scenario.signal_tables import Attitude, GravityGradient, SumDisturbance
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.simulation.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
 from tests.helpers import ROOT
 
 # design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
@@ -334,7 +333,7 @@ def test_lists_of_wrong_length(tables, path):
     for wrong in ([], right[:-1], [*right, 0.0]):
         said = refusal(changed(tables, path[:-1], wrong))
         assert said.startswith(f"{key_of(path)} is ")
-        assert schema.show(wrong) in said
+        assert errors.show(wrong) in said
         assert re.search("must be .*((one|two|three|four) |a list of )", said)
 
 
@@ -372,7 +371,7 @@ def test_a_table_is_a_table(name):
     ],
 )
 def test_values_are_shown_as_a_scenario_file_would_write_them(value, shown):
-    assert schema.show(value) == shown
+    assert errors.show(value) == shown
 
 
 def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():

@@ -11,7 +11,10 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, clock, draws, formulas, plants, sensors
+from ptsmc_jax import formulas
+from ptsmc_jax.devices import attitude_filter, sensors, ticks
+from ptsmc_jax.numerics import attitude, draws
+from ptsmc_jax.plants import rigid_body
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
@@ -19,13 +22,13 @@ SIGMAS = -stats.norm.ppf(0.5e-6)  # with other seeds a check would fail once in 
 SIZES = (2e-5, 1e-6)
 SENSORS = sensors.Sensors(vector(SIZES[0]), vector(SIZES[1]))
 ATTITUDE = Rotation.from_rotvec([1.0, -2.0, 0.4])
-STATE = plants.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2, 0.03]))
+STATE = rigid_body.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2, 0.03]))
 
 
 def tick(sample, weight=1.0):
     """A control period's number and weight: what sensors look at."""
     zero = vector(0.0)
-    return clock.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight))
+    return ticks.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight))
 
 
 def seen_by(sensor, x, seed, trial, sample):
@@ -112,12 +115,12 @@ def test_state_sensor_adds_independent_noise_of_the_stated_size_to_every_state()
 
 def test_filter_propagates_a_turning_body():
     """Two-sample coning: the error of a period is of fifth order in it."""
-    found = sensors.attitude_filter(0.2, 1e-5, 1e-6, 0.0, 0.05, 1)
+    found = attitude_filter.attitude_filter(0.2, 1e-5, 1e-6, 0.0, 0.05, 1)
     errors = []
     for steps in (8, 16, 32):
         h, q = 2.0 / steps, vector([0.0, 0.0, 0.0, 1.0])
         rate = [vector(0.3 * np.array([np.sin(t), np.cos(2 * t), 1.0])) for t in np.linspace(0, 2, steps + 1)]
-        estimate = sensors.Estimate(q, vector([0.0] * 3))
+        estimate = attitude_filter.Estimate(q, vector([0.0] * 3))
         for a, b in itertools.pairwise(rate):
             estimate = found.propagate(estimate, a, b, vector(h))
         fine = solve_ivp(
@@ -142,9 +145,9 @@ def filtered():
     Errors of attitude [rad] and bias [rad/s] per axis of 4 000 trials just after each sample of a body at rest.
     """
     period, every, noise, gyro, walk = (TRACKED[name] for name in list(TRACKED)[:5])
-    found = sensors.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)
+    found = attitude_filter.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)
     sensor = sensors.Sensors(vector(noise), vector(gyro), vector(1e-4), vector(walk / np.sqrt(period)), found, every)
-    rest = plants.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0] * 3))
+    rest = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0] * 3))
 
     @functools.partial(jax.jit, static_argnames="count")
     @functools.partial(jax.vmap, in_axes=(None, None, 0, None))
@@ -170,7 +173,7 @@ def steady():
     Of attitude, bias and the gyro's noise at the sample, half of which the trapezium rule takes into each period.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
-    k1, k2 = (float(v) for v in sensors.filter_gains(vector(bandwidth), h * every))
+    k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))
     step = np.array([[1.0, -h, h / 2], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     keep = np.array([[1.0 - k1, 0.0, 0.0], [k2, 1.0, 0.0], [0.0, 0.0, 1.0]])
     fresh, drift = np.array([h / 2, 0.0, 1.0]), np.array([h / 2, -1.0, 0.0])
@@ -184,7 +187,7 @@ def steady():
 
 
 def test_spread_of_the_filter_solves_lyapunovs_equation():
-    found = np.asarray(sensors.attitude_filter(**{k: TRACKED[k] for k in sorted(TRACKED)}).spread)
+    found = np.asarray(attitude_filter.attitude_filter(**{k: TRACKED[k] for k in sorted(TRACKED)}).spread)
     covariance, keep, star = steady()
     np.testing.assert_allclose(found @ found.swapaxes(1, 2), covariance, rtol=1e-12)
     after = keep @ covariance[-1] @ keep.T + star
@@ -218,7 +221,7 @@ def test_filter_comes_to_its_steady_state_from_any_start(filtered):
 
 
 def test_start_of_the_filter_does_not_jump_where_the_partial_first_period_vanishes():
-    found = sensors.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
+    found = attitude_filter.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
     q, none, normals = STATE.q, vector([0.0] * 3), vector([1.0, -0.3, 0.2, 0.5, 0.1, -1.0])
     for k in range(-4, 1):
         vanishing, whole = (found.begin(q, none, normals, jnp.asarray(n), vector(s)) for n, s in ((k, 0), (k + 1, 1)))
@@ -226,24 +229,24 @@ def test_start_of_the_filter_does_not_jump_where_the_partial_first_period_vanish
 
 
 def test_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
-    found = sensors.attitude_filter(0.5, 1e-5, 1e-6, 0.0, 0.1, 3)
+    found = attitude_filter.attitude_filter(0.5, 1e-5, 1e-6, 0.0, 0.1, 3)
     sensor = sensors.Sensors(vector(0.0), vector(0.0), None, None, found, 3)
     begun = sensor.begin(0, 0, STATE, tick(0))
     off = attitude.multiply(STATE.q, attitude.from_rotation_vector(vector([1e-3, 0.0, 0.0])))
-    begun = begun._replace(estimate=sensors.Estimate(off, vector([0.0] * 3)))
+    begun = begun._replace(estimate=attitude_filter.Estimate(off, vector([0.0] * 3)))
 
     def left(sample, weight):
         _, memory = sensor.measure(begun, STATE, tick(sample, weight), vector(0.0))
         return float(attitude.angle(memory.estimate.q, STATE.q))
 
     np.testing.assert_allclose([left(1, 1.0), left(2, 1.0), left(0, 0.0)], 1e-3, rtol=1e-9)
-    k1, _ = sensors.filter_gains(vector(0.5), 0.3)
+    k1, _ = attitude_filter.filter_gains(vector(0.5), 0.3)
     np.testing.assert_allclose(left(3, 1.0), 1e-3 * (1 - float(k1)), rtol=1e-6)
     np.testing.assert_allclose(left(-3, 0.5), 1e-3 * (1 - 0.5 * float(k1)), rtol=1e-6)
 
 
 def test_filter_gains_put_both_poles_where_they_are_said_to_be():
-    k1, k2 = (float(v) for v in sensors.filter_gains(vector(0.7), 0.4))
+    k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(0.7), 0.4))
     matrix = np.array([[1 - k1, 0], [k2, 1]]) @ np.array([[1, -0.4], [0, 1]])
     poles = np.linalg.eigvals(matrix)
     np.testing.assert_allclose(poles, np.exp(-0.28), rtol=1e-6)  # a double pole: its roots are found to sqrt(eps)

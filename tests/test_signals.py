@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import attitude, scenario, signals
+from ptsmc_jax import scenario
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.signals import disturbances, references
 from tests.helpers import vector
 
 EPS = np.finfo(float).eps
@@ -19,8 +21,8 @@ target = jax.jit(lambda signal, t: signal(t))
 position_and_rates = jax.jit(
     lambda signal, t: (
         signal(t).q,
-        signals.time_derivative(lambda t: signal(t).q, t),
-        signals.time_derivative(lambda t: signals.time_derivative(lambda t: signal(t).q, t), t),
+        references.time_derivative(lambda t: signal(t).q, t),
+        references.time_derivative(lambda t: references.time_derivative(lambda t: signal(t).q, t), t),
         attitude.derivative(signal(t).q, signal(t).w),
         signal(t).vector_rates(),
     )
@@ -30,7 +32,7 @@ position_and_rates = jax.jit(
 def test_fixed_does_not_move():
     q = START.as_quat()
     for t in TIMES:
-        got = target(signals.Fixed(vector(q)), vector(t))
+        got = target(references.Fixed(vector(q)), vector(t))
         np.testing.assert_array_equal(got.q, q)
         for rate in (got.w, got.w_dot, *got.vector_rates()):
             np.testing.assert_array_equal(rate, np.zeros(3))
@@ -38,7 +40,7 @@ def test_fixed_does_not_move():
 
 @pytest.mark.parametrize("rate", RATES)
 def test_spin_turns_about_its_own_axes(rate):
-    spin = signals.Spin(vector(START.as_quat()), vector(rate))
+    spin = references.Spin(vector(START.as_quat()), vector(rate))
     for t in TIMES:
         got = target(spin, vector(t))
         exact = (START * Rotation.from_rotvec(np.array(rate) * t)).as_matrix()
@@ -52,7 +54,7 @@ def test_spin_turns_about_its_own_axes(rate):
 
 @pytest.mark.parametrize("rate", RATES)
 def test_spin_solves_the_kinematics_and_vector_rates_are_its_derivatives(rate):
-    spin, size = signals.Spin(vector(START.as_quat()), vector(rate)), np.linalg.norm(rate)
+    spin, size = references.Spin(vector(START.as_quat()), vector(rate)), np.linalg.norm(rate)
     for t in TIMES:
         _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(spin, vector(t))
         # w times numbers up to 1 whose angle |w| t is rounded relatively
@@ -71,7 +73,7 @@ def test_vector_rates_of_a_target_with_acceleration():
     axis = np.array([2, -1, 2]) / 3
     a, a_dot, a_ddot = 1.3, 0.4, -0.2
     q = vector([*axis * math.sin(a / 2), math.cos(a / 2)])
-    first, second = signals.Target(q, vector(axis * a_dot), vector(axis * a_ddot)).vector_rates()
+    first, second = references.Target(q, vector(axis * a_dot), vector(axis * a_ddot)).vector_rates()
     np.testing.assert_allclose(first, axis * math.cos(a / 2) * a_dot / 2, rtol=0, atol=8 * EPS)
     exact = axis * (math.cos(a / 2) * a_ddot / 2 - math.sin(a / 2) * a_dot**2 / 4)
     np.testing.assert_allclose(second, exact, rtol=0, atol=8 * EPS)
@@ -80,7 +82,7 @@ def test_vector_rates_of_a_target_with_acceleration():
 def test_sinusoid_and_its_time_derivative():
     amplitude, frequency = np.array([0.01, -0.02, 0.0]), np.array([0.1, 3.0, 7.0])
     phase, bias = np.array([0.0, 1.0, -2.0]), np.array([1e-3, 0.0, -5e-3])
-    signal = signals.Sinusoid(vector(amplitude), vector(frequency), vector(phase), vector(bias))
+    signal = disturbances.Sinusoid(vector(amplitude), vector(frequency), vector(phase), vector(bias))
     for t in (0.0, 0.7, 40.0):
         x = [f * t + p for f, p in zip(frequency, phase, strict=True)]
         # the argument is rounded relatively
@@ -88,27 +90,27 @@ def test_sinusoid_and_its_time_derivative():
         value = [b + a * math.sin(y) for a, y, b in zip(amplitude, x, bias, strict=True)]
         np.testing.assert_allclose(signal(vector(t)), value, rtol=0, atol=0.02 * tolerance)
         slope = [a * f * math.cos(y) for a, f, y in zip(amplitude, frequency, x, strict=True)]
-        np.testing.assert_allclose(signals.time_derivative(signal, vector(t)), slope, rtol=0, atol=0.06 * tolerance)
+        np.testing.assert_allclose(references.time_derivative(signal, vector(t)), slope, rtol=0, atol=0.06 * tolerance)
 
 
 def test_constant_has_no_derivative():
-    signal = signals.Constant(vector([0.1, -0.2, 0.3]))
+    signal = disturbances.Constant(vector([0.1, -0.2, 0.3]))
     np.testing.assert_array_equal(signal(vector(5.0)), [0.1, -0.2, 0.3])
-    np.testing.assert_array_equal(signals.time_derivative(signal, vector(5.0)), np.zeros(3))
+    np.testing.assert_array_equal(references.time_derivative(signal, vector(5.0)), np.zeros(3))
 
 
 def test_time_derivative_takes_whole_numbers_too():
-    signal = signals.Sinusoid(*(vector([x] * 3) for x in (1.0, 1.0, 0.0, 0.0)))
-    np.testing.assert_allclose(signals.time_derivative(signal, jnp.asarray(2.0)), [math.cos(2)] * 3, rtol=4 * EPS)
+    signal = disturbances.Sinusoid(*(vector([x] * 3) for x in (1.0, 1.0, 0.0, 0.0)))
+    np.testing.assert_allclose(references.time_derivative(signal, jnp.asarray(2.0)), [math.cos(2)] * 3, rtol=4 * EPS)
 
 
 @pytest.mark.parametrize(
     ("signal", "leaves"),
     [
-        (signals.Fixed(jnp.ones(4)), 1),
-        (signals.Spin(jnp.ones(4), jnp.ones(3)), 2),
-        (signals.Constant(jnp.ones(3)), 1),
-        (signals.Sinusoid(*[jnp.ones(3)] * 4), 4),
+        (references.Fixed(jnp.ones(4)), 1),
+        (references.Spin(jnp.ones(4), jnp.ones(3)), 2),
+        (disturbances.Constant(jnp.ones(3)), 1),
+        (disturbances.Sinusoid(*[jnp.ones(3)] * 4), 4),
     ],
 )
 def test_signals_are_frozen_pytrees_and_every_number_is_a_leaf(signal, leaves):
@@ -130,7 +132,9 @@ def body_rate(r, r_dot):
     return jacobian @ r_dot
 
 
-SWING = signals.Swing(vector(START.as_quat()), vector(0.4, -0.2, 0.7), vector(0.1, 0.3, 0.05), vector(0.2, 1.0, -0.5))
+SWING = references.Swing(
+    vector(START.as_quat()), vector(0.4, -0.2, 0.7), vector(0.1, 0.3, 0.05), vector(0.2, 1.0, -0.5)
+)
 
 
 @pytest.mark.parametrize("t", [0.0, 3.0, 41.0])
@@ -150,7 +154,9 @@ def test_swing_against_the_jacobian_of_the_rotation_vector(t):
 
 
 def test_swing_about_one_axis_is_a_pendulum():
-    swing = signals.Swing(vector(START.as_quat()), vector(0.0, 0.5, 0.0), vector(1.0, 0.2, 1.0), vector(0.0, 0.3, 0.0))
+    swing = references.Swing(
+        vector(START.as_quat()), vector(0.0, 0.5, 0.0), vector(1.0, 0.2, 1.0), vector(0.0, 0.3, 0.0)
+    )
     for t in TIMES:
         got = target(swing, vector(t))
         phase = 0.2 * t + 0.3
@@ -163,7 +169,7 @@ TURN = np.array([0.5, -1.5, 2.0])
 
 @pytest.mark.parametrize("t", [-5.0, 0.0, 0.02, 7.0, 20.0, 39.9, 40.0, 60.0])
 def test_slew_is_a_quintic_about_a_fixed_axis(t):
-    slew = signals.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))
+    slew = references.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))
     got, x = target(slew, vector(t)), np.clip(t / 40.0, 0.0, 1.0)
     share, rate = x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / 40.0
     second = 60 * x * (1 - x) * (1 - 2 * x) / 40.0**2
@@ -173,7 +179,7 @@ def test_slew_is_a_quintic_about_a_fixed_axis(t):
     np.testing.assert_allclose(got.w_dot, second * TURN, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("signal", [SWING, signals.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))])
+@pytest.mark.parametrize("signal", [SWING, references.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))])
 def test_moving_references_solve_the_kinematics(signal):
     for t in (0.5, 11.0, 39.0):
         _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(signal, vector(t))

@@ -6,9 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from ptsmc_jax import margins, scenario
+from ptsmc_jax import scenario
+from ptsmc_jax.theory import margins
 from tests.helpers import SHORT, short
-from tuning import page, stability, told_margins
+from tuning.output import margin_sentences, page
+from tuning.studies import stability
 
 
 def tables(path):
@@ -75,16 +77,16 @@ def test_few_margins_are_warned_of():
     unlimited = {**dict.fromkeys(enough), "phase_margin": 61.0, "modulus_margin": 1.0, "stable": True}
     few = {**enough, "gain_margin": 5.9, "phase_margin": 0.0, "modulus_margin": 7.0}
 
-    assert not [line for line in told_margins.tuned({"hold": enough, "before": unlimited}) if "less than" in line]
-    lines = list(told_margins.tuned({"hold": few, "before": enough}))
+    assert not [line for line in margin_sentences.tuned({"hold": enough, "before": unlimited}) if "less than" in line]
+    lines = list(margin_sentences.tuned({"hold": few, "before": enough}))
     assert lines[:2] == [
         "margins in hold: gain 5.9 dB, phase 0 deg, delay 0.1 s, modulus 7 dB",
         "less than 6 dB of gain and 30 deg of phase in hold: what the model leaves out may cost the stability",
     ]
-    said = list(told_margins.tuned({"hold": enough, "before": few}))
+    said = list(margin_sentences.tuned({"hold": enough, "before": few}))
     assert any(line.startswith("less than 6 dB of gain") and "hand-over" in line for line in said)
     lost = {**few, "gain_margin": -1.2, "stable": False}
-    assert "the frozen loop is NOT stable in hold" in next(told_margins.tuned({"hold": lost}))
+    assert "the frozen loop is NOT stable in hold" in next(margin_sentences.tuned({"hold": lost}))
 
 
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ptsmc_jax import statistics
-from ptsmc_jax.requirements import fewest_trials, least_within
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation.requirements import fewest_trials, least_within
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (3, 20), (20, 20), (2398, 2400), (999_999, 1_000_000)])

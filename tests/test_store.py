@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ptsmc_jax import store
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.simulation.requirements import Requirement
 
 
 def test_a_folder_is_whole_or_not_there(tmp_path):

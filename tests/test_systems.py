@@ -11,26 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import (
-    attitude,
-    controllers,
-    observers,
-    plants,
-    rollout,
-    scenario,
-    schema,
-    signals,
-    store,
-    systems,
-    theory,
-)
-from ptsmc_jax.plants import AttitudeState
-from ptsmc_jax.schema import ScenarioError
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.observers import none
+from ptsmc_jax.plants import second_order
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.signals import references
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import envelopes, solutions
 from tests.helpers import FULL_INERTIA, ROOT, finer, parts, short, vector
-from tuning import report
+from tuning.studies import tuner
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
-SPIN = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
+SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
 
 
 def spacecraft_as_system(reference, inertia=FULL_INERTIA):
@@ -50,7 +47,7 @@ def spacecraft_as_system(reference, inertia=FULL_INERTIA):
     def G(t, x_1, x_2):  # noqa: N802
         return inverse
 
-    return plants.system(3, F, H, G, D=G, inertia=inertia)
+    return second_order.system(3, F, H, G, D=G, inertia=inertia)
 
 
 def as_system(run, reference):
@@ -60,11 +57,11 @@ def as_system(run, reference):
     return replace(
         run,
         plant=model,
-        controller=controllers.PrescribedTimeSystem(
+        controller=prescribed_time.PrescribedTimeSystem(
             model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width, law.surface_rate
         ),
         observer=replace(run.observer, model=model),
-        reference=signals.Now(),
+        reference=references.Now(),
         initial=jnp.concatenate([error, run.initial.w]),
     )
 
@@ -128,10 +125,10 @@ def test_arm_follows_the_exact_solution_without_a_disturbance():
     result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
     before = result.log.t < 2.949
     start = ready.parts.controller.errors(ready.parts.initial, vector(0.0))
-    exact = jax.vmap(lambda t: theory.exact_error(t, vector(3.0), vector(3.0), *start))(vector(result.log.t[before]))
+    exact = jax.vmap(lambda t: solutions.exact_error(t, vector(3.0), vector(3.0), *start))(vector(result.log.t[before]))
     np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-8)  # of the default grid
     # and the torque of the exact motion is the one flown, down to the feedback gain times that
-    u = jax.vmap(lambda t: theory.exact_input(ready.parts, t)[0])(vector(result.log.t[before]))
+    u = jax.vmap(lambda t: solutions.exact_input(ready.parts, t)[0])(vector(result.log.t[before]))
     assert np.abs(u - result.log.u[before]).max() < 1e-8 * 9.0 / 0.05**2
 
 
@@ -142,7 +139,7 @@ def test_arm_stays_inside_its_envelope(mode):
     assert result.status == rollout.OK
     before = result.log.t < 2.949
     size = np.linalg.norm(result.log.error[before], axis=1)
-    limit = theory.error_bound(ready.parts, result.log.t[before])
+    limit = envelopes.error_bound(ready.parts, result.log.t[before])
     slack = 0.0 if mode == "continuous" else 1e-3  # a period's hold of torques that change by some 10 N m/s
     assert np.all(size <= limit * (1 + 1e-9) + slack)
     assert result.metrics.window_error < 5e-3
@@ -190,8 +187,8 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time():
     def swapped(t, x_1, x_2):
         return jnp.stack([jnp.stack([0 * x_1[0], x_1[0] - 0.2]), jnp.stack([1.0 + 0 * x_1[0], 0 * x_1[0]])])
 
-    one = plants.system(1, F, H, G)
-    two = plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, swapped)
+    one = second_order.system(1, F, H, G)
+    two = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, swapped)
     for mode in ("continuous", "sampled"):
         for model, x0 in ((one, [0.5, 0.0]), (two, [0.5, 0.3, 0.0, 0.0])):
             tables = {
@@ -205,7 +202,7 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time():
             # solution 1 says when x_1 is 0.2
             t = np.linspace(0.0, 4.9, 4000)
             start = (vector([x0[0]]), vector([0.0]))
-            x = jax.vmap(lambda t, start=start: theory.exact_error(t, vector(5.0), vector(3.0), *start).error[0])(t)
+            x = jax.vmap(lambda t, start=start: solutions.exact_error(t, vector(5.0), vector(3.0), *start).error[0])(t)
             crossing = t[np.argmax(np.asarray(x) < 0.2)]
             assert result.bad_time == pytest.approx(crossing, abs=0.06)
 
@@ -214,14 +211,14 @@ def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
     def F(t, x_1, x_2):  # noqa: N802
         return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
 
-    model = plants.system(2, F, lambda t, a, b: -b, lambda t, a, b: jnp.eye(2) + 0.1 * jnp.outer(a, a))
+    model = second_order.system(2, F, lambda t, a, b: -b, lambda t, a, b: jnp.eye(2) + 0.1 * jnp.outer(a, a))
     tables = {"plant": {"kind": "system", "system": model, "x0": [0.4, -0.2, 0.3, 0.1]}, "controller": {"delta": 0.1}}
     ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
     quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
     run = replace(ready.parts, observer=quiet)
     log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True)).log
     before = log.t < 4.8
-    u = jax.vmap(lambda t: theory.exact_input(run, t)[0])(vector(log.t[before]))
+    u = jax.vmap(lambda t: solutions.exact_input(run, t)[0])(vector(log.t[before]))
     assert np.abs(u - log.u[before]).max() < 1e-6
 
 
@@ -233,17 +230,17 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         return jnp.eye(2)
 
     with pytest.raises(ValueError, match=r"G\(t, x_1, x_2\) returns \(2, 2\), but for n = 3 must return an array"):
-        plants.system(3, F, F, G)
+        second_order.system(3, F, F, G)
     with pytest.raises(ValueError, match=r"H\(t, x_1, x_2\) fails for x_1 and x_2 of shape \(2,\)"):
-        plants.system(2, F, lambda t, x: x, G)
+        second_order.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match="n is 0"):
-        plants.system(0, F, F, G)
+        second_order.system(0, F, F, G)
     with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
-        plants.system(2, F, F, G, inertia=np.array([[1.0, 5.0], [0.0, 1.0]]))
+        second_order.system(2, F, F, G, inertia=np.array([[1.0, 5.0], [0.0, 1.0]]))
     with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
-        plants.system(2, F, F, G, inertia=-np.eye(2))
+        second_order.system(2, F, F, G, inertia=-np.eye(2))
     with pytest.raises(ValueError, match=r"^F\(t, x_1, x_2\) fails .*TracerBoolConversionError: [^\n]*$"):
-        plants.system(2, lambda t, a, b: b if a[0] > 0 else -b, F, G)
+        second_order.system(2, lambda t, a, b: b if a[0] > 0 else -b, F, G)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +288,7 @@ def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_be
     tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
     changed = scenario.replace(scenario.from_tables(tables), controller__eta=4.0)
     assert scenario.study(changed).parts.plant is made
-    assert isinstance(scenario.study(changed).parts.observer, observers.NoObserver)
+    assert isinstance(scenario.study(changed).parts.observer, none.NoObserver)
     (tmp_path / "my.py").write_text((ROOT / "scenarios" / "two_link_arm.py").read_text())
     (tmp_path / "my.toml").write_text('[plant]\nkind = "system"\nsystem = "my.py:arm"\nx0 = [1, 1, 0, 0]\n')
     one, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
@@ -304,7 +301,7 @@ def study(system, x0, **tables):
 
 
 def one(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(1), D=None):
-    return plants.system(1, F, H, G, D)
+    return second_order.system(1, F, H, G, D)
 
 
 def final(run):
@@ -339,11 +336,12 @@ def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
 @pytest.mark.parametrize(
     ("system", "x0", "singular"),
     [
-        (plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5)),
+        (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5)),
          [1.0, 0.2, 0.0, 0.0], True),
         (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], True),
         # the same plant, its first input in another unit
-        (plants.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]])),
+        (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a,
+                             lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]])),
          [1.0, 0.2, 0.0, 0.0], False),
     ],
 )  # fmt: skip
@@ -357,7 +355,7 @@ def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, sin
 def test_a_singular_matrix_at_the_start_is_refused_by_name():
     with pytest.raises(ScenarioError, match=r"^plant\.system has a singular dF/dx2 G at t = 0 in plant\.x0"):
         study(one(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
-    half = plants.system(
+    half = second_order.system(
         2,
         lambda t, a, b: b,
         lambda t, a, b: 0 * a,
@@ -410,12 +408,12 @@ def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypa
         "loop": {"mode": "sampled", "period": 0.05},
         "tune": {"free": ["t_f", "eta"], "bounds": {"t_f": [0.5, 4.0]}},
     }
-    looked_at, visited = [], theory.visited
+    looked_at, visited = [], solutions.visited
 
     def spied(parts):
         looked_at.append((float(parts.controller.t_f), float(parts.t_end)))
         return visited(parts)
 
-    monkeypatch.setattr(theory, "visited", spied)
-    report.pose(scenario.from_tables(tables), 0)
+    monkeypatch.setattr(solutions, "visited", spied)
+    tuner.pose(scenario.from_tables(tables), 0)
     assert looked_at == [(0.5, 10.5)]

@@ -7,7 +7,10 @@ import pytest
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax import clock, hold, observers, rollout, signals, theory
+from ptsmc_jax.observers import none
+from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.theory import envelopes, hold, rules, solutions
 from tests.helpers import FULL_INERTIA, PAPER_ATTITUDE, chain_parts, drawn, parts, vector, with_controller
 
 
@@ -22,7 +25,7 @@ def test_exact_error_solves_the_second_order_system(eta):
     times = np.array([0.0, 1.0, 4.0, 6.9])
     y = solve_ivp(rate, (0.0, 6.9), [0.7, -0.3], t_eval=times, rtol=1e-12, atol=1e-14).y
     for k, t in enumerate(times):
-        exact = theory.exact_error(vector(t), vector(7.0), vector(eta), vector([0.7]), vector([-0.3]))
+        exact = solutions.exact_error(vector(t), vector(7.0), vector(eta), vector([0.7]), vector([-0.3]))
         np.testing.assert_allclose(exact.error[0], y[0, k], atol=1e-9)
         np.testing.assert_allclose(exact.error_rate[0], y[1, k], atol=1e-8)
         np.testing.assert_allclose(exact.s[0], (7.0 - t) * y[1, k] + eta * y[0, k], atol=1e-8)
@@ -33,7 +36,7 @@ def test_first_torque_against_the_run_and_in_angles():
     run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA)
     log = rollout.simulate_jit(run, record=True).log
     assert log is not None
-    first = theory.first_torque(vector(body), vector(PAPER_ATTITUDE), vector(3.5), vector(25.0))
+    first = rules.first_torque(vector(body), vector(PAPER_ATTITUDE), vector(3.5), vector(25.0))
     np.testing.assert_allclose(log.u[0], first, rtol=1e-12)
     angle, axis = 2 * np.arccos(PAPER_ATTITUDE[3]), PAPER_ATTITUDE[:3] / np.linalg.norm(PAPER_ATTITUDE[:3])
     np.testing.assert_allclose(np.abs(first), 2 * 3.5**2 * np.abs(body @ axis) * np.tan(angle / 2) / 25.0**2)
@@ -43,22 +46,22 @@ def test_first_torque_against_the_run_and_in_angles():
 def test_later_peak_of_small_eta(eta):
     """A small slew without disturbance: the braking peak, its size over the first torque and its time."""
     small = np.array([0.0, 0.0, np.sin(0.01), np.cos(0.01)])
-    quiet = signals.Constant(vector([0.0] * 3))
+    quiet = disturbances.Constant(vector([0.0] * 3))
     run = parts(30.0, eta, 1e-9, q=small, disturbance=quiet, rate_bound=0.0, t_end=31.0)
     log = rollout.simulate_jit(run, record=True).log
     assert log is not None
     u, t = np.asarray(log.u[:, 2]), np.asarray(log.t)
     first, k = abs(u[0]), int(np.argmax(u))  # it brakes with the opposite sign
     # small-angle formula: corrections of (0.01)^2; the peak is read off nodes some tau/10 apart, flat at the top
-    np.testing.assert_allclose(u[k] / first, theory.later_peak_ratio(vector(eta)), rtol=2e-3)
-    remaining = (30.0 - t[k]) / (30.0 - float(theory.later_peak_time(vector(eta), vector(30.0))))
+    np.testing.assert_allclose(u[k] / first, rules.later_peak_ratio(vector(eta)), rtol=2e-3)
+    remaining = (30.0 - t[k]) / (30.0 - float(rules.later_peak_time(vector(eta), vector(30.0))))
     assert 0.93 < remaining < 1.07
 
 
 def test_later_peak_ratio_published_values():
     for eta, ratio in ((2.05, 7.4), (2.1, 3.7), (2.2, 1.87), (2.3, 1.27), (2.5, 0.79), (3.0, 0.45)):
-        np.testing.assert_allclose(theory.later_peak_ratio(vector(eta)), ratio, atol=0.006 * ratio + 0.005)
-    np.testing.assert_allclose(theory.later_peak_ratio(vector(2.386)), 1.0, atol=1e-3)
+        np.testing.assert_allclose(rules.later_peak_ratio(vector(eta)), ratio, atol=0.006 * ratio + 0.005)
+    np.testing.assert_allclose(rules.later_peak_ratio(vector(2.386)), 1.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
@@ -70,26 +73,26 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
     t = np.asarray(log.t)
     before = t < 29.95
     size = np.linalg.norm(np.asarray(log.s)[before], axis=1)
-    allowed = theory.sliding_bound(run, t[before])
+    allowed = envelopes.sliding_bound(run, t[before])
     assert np.all(size <= allowed * (1 + 1e-6) + 1e-9)
 
 
 def test_the_narrowest_sign_is_reached_through_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
-    width = theory.narrowest_sign(run, 0.05)
+    width = envelopes.narrowest_sign(run, 0.05)
     before, _ = run.controller.boundary_layer(run.observer.error_bound().largest)
     # its layer's rate times the period, from the law's own rate at its own width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
-    np.testing.assert_allclose(theory.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
+    np.testing.assert_allclose(envelopes.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
 
 
 def test_exact_path_is_the_path_of_the_run():
     rate = (0.02, -0.03, 0.05)
     run = parts(30.0, 3.0, 0.05, rate=rate)
-    quiet = parts(30.0, 3.0, 0.05, rate=rate, disturbance=signals.Constant(vector([0.0] * 3)), rate_bound=0.0)
+    quiet = parts(30.0, 3.0, 0.05, rate=rate, disturbance=disturbances.Constant(vector([0.0] * 3)), rate_bound=0.0)
     log = rollout.simulate_jit(quiet, record=True).log
     assert log is not None
-    t, _, square = theory.exact_path(run)
+    t, _, square = solutions.exact_path(run)
     before = np.asarray(log.t) < 29.9
     flown = np.asarray(log.x.q[:, 3]) ** 2
     np.testing.assert_allclose(np.interp(log.t[before], t, square), flown[before], atol=1e-4)  # interpolation
@@ -127,7 +130,7 @@ def stays_inside_the_corrected_bounds(case):
     q = np.append(np.sin(case["angle"] / 2) * axis / np.linalg.norm(axis), np.cos(case["angle"] / 2))
     amplitude = 0.02 * np.array(case["amplitude"])
     speed = case["frequency"] / t_f
-    wave = signals.Sinusoid(vector(amplitude), vector([speed] * 3), vector([case["phase"]] * 3), vector([0.0] * 3))
+    wave = disturbances.Sinusoid(vector(amplitude), vector([speed] * 3), vector([case["phase"]] * 3), vector([0.0] * 3))
     run = parts(t_f, case["eta"], case["delta"] * t_f, inertia=body, q=q, disturbance=wave)
     observer = dataclasses.replace(
         run.observer,
@@ -150,9 +153,9 @@ def stays_inside_the_corrected_bounds(case):
     off = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
     assert np.all(off <= np.asarray(jax.vmap(bound)(vector(log.t))) * (1 + 1e-6) + 1e-9)
     size = np.linalg.norm(log.s[before], axis=1)
-    assert np.all(size <= theory.sliding_bound(run, t) * (1 + 1e-6) + 1e-9 * size.max())
+    assert np.all(size <= envelopes.sliding_bound(run, t) * (1 + 1e-6) + 1e-9 * size.max())
     error = np.linalg.norm(log.error[before], axis=1)
-    assert np.all(error <= theory.error_bound(run, t) * (1 + 1e-6) + 1e-9)
+    assert np.all(error <= envelopes.error_bound(run, t) * (1 + 1e-6) + 1e-9)
     # after it steps of at most 0.06 s take (2 0.06)^5 / 120 of what decays, 400 times
     later, t = ~before, log.t[~before]
     size, error = (np.linalg.norm(v[later], axis=1) for v in (log.s, log.error))
@@ -169,7 +172,7 @@ def slew(seed, eta, t_f):
     rng = np.random.default_rng(seed)
     angle, axis = np.deg2rad(rng.uniform(5.0, 150.0)), rng.normal(size=3)
     q = np.append(np.sin(angle / 2) * axis / np.linalg.norm(axis), np.cos(angle / 2))
-    quiet = signals.Constant(vector([0.0] * 3))
+    quiet = disturbances.Constant(vector([0.0] * 3))
     run = parts(t_f, eta, t_f * 1e-4, inertia=random_body(rng), q=q, disturbance=quiet, rate_bound=0.0)
     grid = clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 600), jnp.zeros(0), 600, 100)
     return dataclasses.replace(run, clock=grid)
@@ -182,7 +185,7 @@ def test_shortest_time_of_fifty_spacecraft(below):
     for seed in range(50):
         eta, limit = rng.uniform(2.05, 2.4) if below else rng.uniform(2.4, 6.0), rng.uniform(0.05, 2.0)
         start = slew(seed, eta, 30.0)
-        t_f = float(theory.shortest_time(start.plant.inertia, start.initial.q, vector(eta), vector(limit)))
+        t_f = float(rules.shortest_time(start.plant.inertia, start.initial.q, vector(eta), vector(limit)))
         flown = rollout.simulate_jit(slew(seed, eta, t_f))
         assert int(flown.status) == rollout.OK
         # the torque of an undisturbed slew goes like 1 / t_f^2
@@ -193,39 +196,39 @@ def test_shortest_time_of_fifty_spacecraft(below):
 
 def test_input_along_the_exact_motion_is_the_flown_one():
     """Rates at t = 0, moving references and small eta, where the closed rule does not reach."""
-    spin = signals.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.004, -0.006, 0.005))
-    quiet, rest, rate = signals.Constant(vector([0.0] * 3)), (0.0, 0.0, 0.0), (0.02, -0.03, 0.01)
+    spin = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.004, -0.006, 0.005))
+    quiet, rest, rate = disturbances.Constant(vector([0.0] * 3)), (0.0, 0.0, 0.0), (0.02, -0.03, 0.01)
     for reference, start, eta in ((None, rest, 2.1), (spin, rate, 3.0), (spin, rest, 5.0)):
         run = parts(25.0, eta, 0.5, inertia=FULL_INERTIA, reference=reference, rate=start, disturbance=quiet)
         run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, disturbance_rate_bound=vector(0.0)))
         flown = rollout.simulate_jit(run, record=True)
         assert flown.log is not None
         before = np.asarray(flown.log.t) < 24.49
-        u = jax.vmap(lambda time, run=run: theory.exact_input(run, time)[0])(flown.log.t[before])
+        u = jax.vmap(lambda time, run=run: solutions.exact_input(run, time)[0])(flown.log.t[before])
         # gains of 2 J eta^2 / tau^2 < 3000 on states within 1e-9
         np.testing.assert_allclose(flown.log.u[before], u, rtol=0, atol=3e-6)
-        _, u, _ = theory.exact_path(run, 400)
-        np.testing.assert_allclose(theory.exact_peak(run), np.abs(u).max())
-    pushed = dataclasses.replace(run, disturbance=signals.Constant(vector([0.01, -0.02, 0.0])))
-    less = theory.exact_input(run, vector(3.0))[0] - theory.exact_input(pushed, vector(3.0))[0]
+        _, u, _ = solutions.exact_path(run, 400)
+        np.testing.assert_allclose(solutions.exact_peak(run), np.abs(u).max())
+    pushed = dataclasses.replace(run, disturbance=disturbances.Constant(vector([0.01, -0.02, 0.0])))
+    less = solutions.exact_input(run, vector(3.0))[0] - solutions.exact_input(pushed, vector(3.0))[0]
     np.testing.assert_allclose(less, [0.01, -0.02, 0.0], atol=1e-15)
 
 
 def test_first_torque_to_a_reference_elsewhere():
     q_f = np.array([0.2, -0.3, 0.1, np.sqrt(1 - 0.14)])
-    run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=signals.Fixed(vector(q_f)))
+    run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=references.Fixed(vector(q_f)))
     log = rollout.simulate_jit(run, record=True).log
     assert log is not None
-    first = theory.first_torque(vector(FULL_INERTIA), vector(PAPER_ATTITUDE), vector(3.5), vector(25.0), vector(q_f))
+    first = rules.first_torque(vector(FULL_INERTIA), vector(PAPER_ATTITUDE), vector(3.5), vector(25.0), vector(q_f))
     np.testing.assert_allclose(log.u[0], first, rtol=1e-12)
 
 
 def test_residual_error_is_what_a_constant_disturbance_leaves():
     """Rule 3.6, with no observer and no switching: a tau^2 / (eta-2)^2, then the parabola to t_f."""
     eta, delta, d = 4.5, 0.5, 1e-4
-    run = chain_parts([0.0, 0.0], 30.0, eta, delta, disturbance=signals.Constant(vector([d])))
+    run = chain_parts([0.0, 0.0], 30.0, eta, delta, disturbance=disturbances.Constant(vector([d])))
     log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True).log)
-    at_hand_over, at_t_f = theory.residual_error(vector(d), vector(eta), vector(delta))
+    at_hand_over, at_t_f = rules.residual_error(vector(d), vector(eta), vector(delta))
     k = np.argmax(log.t >= 29.5 - 1e-9)
     np.testing.assert_allclose(log.x[k, 0], at_hand_over, rtol=1e-3)  # (delta/t_f)^(eta-2) of the start is left
     np.testing.assert_allclose(log.x[np.argmax(log.t >= 30.0), 0], at_t_f, rtol=0.25)  # the hold law acts meanwhile
@@ -236,7 +239,7 @@ def test_hold_floor_is_what_an_axis_holds(rate):
     """Rule 3.7: a ramp of the disturbance leaves d'/(l c (K1 + |T J^-1| K2/width)) in the end."""
     ramp = 2e-5
     gain, width = 20.0, 0.05
-    wave = signals.Sinusoid(*(vector([v] * 3) for v in (ramp / 1e-3, 1e-3, 0.0, 0.0)))
+    wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (ramp / 1e-3, 1e-3, 0.0, 0.0)))
     run = parts(
         10.0,
         3.0,
@@ -251,16 +254,14 @@ def test_hold_floor_is_what_an_axis_holds(rate):
     )
     log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True).log)
     switching = float(np.sqrt(3.0) / 10.0 * run.observer.error_bound().floor)
-    expected = theory.hold_floor(
-        vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate)
-    )
+    expected = rules.hold_floor(vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate))
     np.testing.assert_allclose(np.abs(log.error[-1]), expected, rtol=2e-2)  # cos(1e-3 t) is not yet a ramp's
 
 
 def test_spacecraft_without_an_observer_keeps_its_envelope():
-    wave = signals.Sinusoid(*(vector([v] * 3) for v in (0.01, 0.4, 0.3, 0.0)))
+    wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01, 0.4, 0.3, 0.0)))
     run = parts(30.0, 3.0, 0.5, disturbance=wave, sign_width=0.2)
-    blind = dataclasses.replace(run, observer=observers.NoObserver(run.plant, vector(0.01)))
+    blind = dataclasses.replace(run, observer=none.NoObserver(run.plant, vector(0.01)))
     np.testing.assert_allclose(blind.observer.error_bound()(vector(7.0)), 0.01 * np.sqrt(3.0))
     result = rollout.simulate_jit(blind, record=True)
     log = jax.tree.map(np.asarray, result.log)
@@ -268,7 +269,7 @@ def test_spacecraft_without_an_observer_keeps_its_envelope():
     assert np.all(log.d_hat == 0.0)
     before = log.t < 29.5
     size = np.linalg.norm(log.s[before], axis=1)
-    assert np.all(size <= theory.sliding_bound(blind, log.t[before]) * (1 + 1e-6))
+    assert np.all(size <= envelopes.sliding_bound(blind, log.t[before]) * (1 + 1e-6))
     sampled = parts(30.0, 3.0, 0.5, disturbance=wave, sign_width=0.2, period=0.05)
     sampled = dataclasses.replace(sampled, observer=blind.observer)
     assert int(rollout.simulate_jit(sampled).status) == rollout.OK

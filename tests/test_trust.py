@@ -7,21 +7,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ptsmc_jax import clock, dispersions, signals
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.dispersions import attitudes, variation
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, vector
-from tuning import evolution, objective, optimise, trust
-from tuning.bounds import Bounds
-from tuning.evaluate import Evaluator
+from tuning.search import evolution, objective, optimise, trust
+from tuning.search.bounds import Bounds
+from tuning.search.evaluate import Evaluator
 
-SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 
 
 @pytest.fixture(scope="module")
 def quiet():
     """From rest, without noise or disturbance: the first torque is the largest, 2 eta^2 |J v / q4| / t_f^2."""
-    run = parts(20.0, 3.0, 1.0, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)))
+    run = parts(20.0, 3.0, 1.0, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)))
     run = replace(run, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
     return objective.problem(run, SPREAD, 3, np.arange(8), BOUNDS.names, [Requirement("peak_torque", 0.9)])
 
@@ -132,7 +134,7 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     monkeypatch.setattr(evolution, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
-    nothing = dispersions.Dispersion()
+    nothing = variation.Dispersion()
     some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
     found = optimise.search(evaluate, some, [Requirement("peak_torque", 0.6)], np.array([3.0, 0.5]), 4, 40, 1)

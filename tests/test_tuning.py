@@ -7,28 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, dispersions, lanes, montecarlo, rollout, scenario, signals, theory
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax import scenario
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.dispersions import attitudes, variation
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation.requirements import Requirement
+from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning import (
-    bounds,
-    confirm,
-    descent,
-    descents,
-    gains,
-    objective,
-    optimise,
-    refine,
-    report,
-    results,
-    starts,
-    told,
-    worst,
-)
-from tuning.evaluate import Evaluator, Sloped
+from tuning.output import sentences
+from tuning.search import bounds, confirm, descent, descents, gains, objective, optimise, refine, starts, worst
+from tuning.search.evaluate import Evaluator, Sloped
+from tuning.studies import tune_files, tuner
 
-SPREAD = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +110,7 @@ def test_the_narrowest_sign_follows_the_observer():
         share = some.share(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
         assert share[4] == 0.0
         width = some.gains(jnp.asarray(share))[4]
-        np.testing.assert_allclose(width, theory.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
+        np.testing.assert_allclose(width, envelopes.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
         inside = np.append(share[:4], 0.3)
         np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
     # bounds that are the user's stay as they are
@@ -205,7 +199,7 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
 def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
-    assert [report._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
+    assert [tuner._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
     assert confirm.fresh_trials([share]) == confirm.FRESH
     assert confirm.fresh_trials([share, sure]) == 2 * 852
     assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 852]
@@ -213,11 +207,11 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"objective": kind}}).tune
         assert table is not None
-        assert report._tail(table, 64) == tail
+        assert tuner._tail(table, 64) == tail
 
 
 def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
-    near = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))
+    near = variation.Dispersion(attitudes.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))
 
     some = problem(dispersion=near, peak_torque=0.7)
 
@@ -234,7 +228,7 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
 @pytest.mark.parametrize("tail", [None, 3])
 def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
     """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
-    turned = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(np.pi)))
+    turned = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(np.pi)))
     eight = replace(problem(8, turned, peak_torque=0.7), tail=tail)
     ((name, drawn),) = eight.coordinates.items()
     lost = (0.9 * drawn).at[5, 2].set(1.0)  # by 180 degrees, the others by less than 165
@@ -338,10 +332,10 @@ def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
 
 def test_judged_is_the_very_law_on_the_flight_clock():
     own = scenario.read(FIRST_FLIGHT)
-    flown = report.as_flown(own)
+    flown = tuner.as_flown(own)
     assert flown.loop.clock == "flight"
     assert flown.controller == own.controller
-    assert report.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+    assert tuner.as_flown(scenario.from_tables({})) == scenario.from_tables({})
 
 
 @pytest.mark.parametrize(("law", "words"), [
@@ -350,7 +344,7 @@ def test_judged_is_the_very_law_on_the_flight_clock():
     ({"kind": "pd"}, "flight clock"),
 ])  # fmt: skip
 def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
-    assert report.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
+    assert tuner.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
 
 
 @pytest.mark.parametrize(("width", "free", "sloped"), [
@@ -358,7 +352,7 @@ def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
 ])  # fmt: skip
 def test_only_gains_flown_with_the_exact_sign_are_looked_for_without_slopes(width, free, sloped):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
-    posed = report.pose(scenario.from_tables(tables), 0)
+    posed = tuner.pose(scenario.from_tables(tables), 0)
     assert posed.sloped == sloped
     assert float(posed.problem.parts.controller.sign_width) == width
 
@@ -450,9 +444,9 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
 
 def test_statistics_count_failures_and_average_the_rest():
     run = parts(20.0, 3.0, 0.5, period=0.2, t_end=21.0)
-    wide = dispersions.Dispersion(dispersions.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
+    wide = variation.Dispersion(attitudes.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
     trials = montecarlo.run(run, wide, 5, np.arange(64))
-    told = results.statistics(trials, "spacecraft")
+    told = tune_files.statistics(trials, "spacecraft")
     assert told["trials"] == 64
     assert 0 < told["counts"]["singular"] < 64
     errors = trials.metrics.window_error[trials.ok]
@@ -484,10 +478,10 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     helpers.small_search(monkeypatch)
     eta, limit, theta = 3.0, 0.9, np.deg2rad(100.0)
     q = [0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)]
-    run = parts(20.0, eta, 1.0, q=q, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)))
+    run = parts(20.0, eta, 1.0, q=q, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)))
     run = replace(run, clock=clock.anchored(0.2, 21.0, 40.0, 5.0))
     wanted = [Requirement("peak_torque", limit)]
-    some = objective.problem(run, dispersions.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
+    some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
     evaluate = Evaluator(bounds.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
     found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), 2, 20, 0)
     expected = eta * np.sqrt(2 * 14.0 * np.tan(theta / 2) / limit)
@@ -508,5 +502,5 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
 def test_what_breaks_a_limit_in_training_is_said(ratio, said):
     """Infinite in a result, absent from the file it is read from."""
     found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
-    (line,) = told.search({"search": found})
+    (line,) = sentences.search({"search": found})
     assert said in line

@@ -1,8 +1,8 @@
 """Progress on one scale: what is done over what is done and left, whatever ends early or comes in addition."""
 
-from tuning.bounds import Bounds
-from tuning.evaluate import Evaluator
-from tuning.work import Work
+from tuning.search.bounds import Bounds
+from tuning.search.evaluate import Evaluator
+from tuning.search.work import Work
 
 
 def test_steps_that_end_early_and_further_rounds_move_one_scale():

@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import clock, dispersions, signals
-from ptsmc_jax.requirements import Requirement
+from ptsmc_jax.dispersions import attitudes, inertias, numbers, variation
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, small_search, vector
-from tuning import objective, optimise, worst
-from tuning.bounds import Bounds
-from tuning.evaluate import Evaluator
+from tuning.search import objective, optimise, worst
+from tuning.search.bounds import Bounds
+from tuning.search.evaluate import Evaluator
 
 T_F, ETA = 20.0, 3.0
 LIMIT = 0.5
@@ -20,7 +22,7 @@ LIMIT = 0.5
 
 def posed(dispersion, requirement=None, **others):
     """A problem without noise or disturbance, from rest to the identity."""
-    run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=signals.Constant(jnp.zeros(3)), **others)
+    run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)), **others)
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0))
     wanted = [requirement or Requirement("peak_torque", LIMIT)]
     return objective.problem(run, dispersion, 5, np.arange(8), ("eta", "delta"), wanted), wanted
@@ -40,7 +42,7 @@ def few_screened(monkeypatch):
 def test_the_worst_attitude_is_the_one_theory_names(inertia):
     """For a torque component i, |(J n)_i| is largest along row i of J: the worst axis is that of the longest row."""
     smallest, largest = np.deg2rad(20.0), np.deg2rad(140.0)
-    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(smallest), vector(largest)))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(smallest), vector(largest)))
     problem, wanted = posed(spread, inertia=inertia)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     tensor = np.diag(inertia) if np.ndim(inertia) == 1 else np.asarray(inertia)
@@ -59,15 +61,15 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
 
 
 def test_attitudes_up_to_180_degrees_have_no_worst_case():
-    for kind in (dispersions.AxisAngle(vector(np.pi / 2), vector(np.pi)), dispersions.UniformAttitude()):
-        problem, wanted = posed(dispersions.Dispersion(kind))
+    for kind in (attitudes.AxisAngle(vector(np.pi / 2), vector(np.pi)), attitudes.UniformAttitude()):
+        problem, wanted = posed(variation.Dispersion(kind))
         assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
 
 
 def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
     from scipy.stats import chi2
 
-    spread = dispersions.Dispersion(rate=dispersions.Normal(vector([1e-3, 1e-3, 1e-3])))
+    spread = variation.Dispersion(rate=numbers.Normal(vector([1e-3, 1e-3, 1e-3])))
     problem, wanted = posed(spread, Requirement("peak_rate", 0.05), q=[0.0, 0.0, 0.0, 1.0])
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     size = np.linalg.norm(found.coordinates["initial_rate"])
@@ -79,13 +81,13 @@ def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
 
 
 def test_slopes_of_the_ascent_agree_with_central_differences():
-    spread = dispersions.Dispersion(
-        dispersions.AxisAngle(vector(0.4), vector(2.0)),
-        rate=dispersions.Uniform(vector([1e-2, 1e-2, 1e-2])),
-        phase=dispersions.UniformPhase(3),
+    spread = variation.Dispersion(
+        attitudes.AxisAngle(vector(0.4), vector(2.0)),
+        rate=numbers.Uniform(vector([1e-2, 1e-2, 1e-2])),
+        phase=numbers.UniformPhase(3),
     )
     problem, _ = posed(spread)
-    sine = signals.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
+    sine = disturbances.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
     run = replace(problem.parts, disturbance=sine)
     chosen = np.arange(3, dtype=np.uint32)
     coordinates = objective.coordinates_of(spread, 5, chosen)
@@ -109,7 +111,7 @@ def test_slopes_of_the_ascent_agree_with_central_differences():
 def test_a_robust_search_keeps_the_limit_in_the_worst_case():
     """Closed form again: the largest eta that keeps the limit at 140 degrees about the longest row."""
     largest = np.deg2rad(140.0)
-    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
     problem, wanted = posed(spread, Requirement("peak_torque", 1.9))
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     eta = np.sqrt(1.9 / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
@@ -127,7 +129,7 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
 
 def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     """With a quantile no single trial counts: `robust` finds nothing to do."""
-    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0)))
     problem, wanted = posed(spread, Requirement("peak_torque", 1.9, quantile=0.9))
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
@@ -137,7 +139,7 @@ def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
 
 def test_coordinates_given_are_flown_as_drawn_ones():
     """A case that joined by its coordinates counts in the constraints like the trial that has them."""
-    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0)))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0)))
     problem, _ = posed(spread)
     more = objective.with_trials(problem, np.asarray([40]))
     own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
@@ -155,7 +157,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
 
 
 def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
-    problem, _ = posed(dispersions.Dispersion(dispersions.AxisAngle(vector(0.4), vector(2.0))))
+    problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
     problem, joined = optimise._with_room(problem, 16), 0
     for count in (8, 8, 3, 8, 1):
         new = np.arange(200 + joined, 200 + joined + count)
@@ -172,7 +174,7 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
 def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     """Only the true inertia is drawn; at rest the law's first torque does not know of it, what follows does."""
     body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
-    spread = dispersions.Dispersion(inertia=dispersions.RelativeInertia(*body))
+    spread = variation.Dispersion(inertia=inertias.RelativeInertia(*body))
     problem, wanted = posed(spread, Requirement("peak_rate", 0.1))
     at = np.array([ETA, 1.0])
     found = worst.hardest(problem, wanted, at)
@@ -185,7 +187,7 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
 
 def test_a_trial_without_a_value_is_the_hardest():
     """Nearer ones settle, farther ones not before the end."""
-    spread = dispersions.Dispersion(dispersions.AxisAngle(vector(0.01), vector(2.0)))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.01), vector(2.0)))
     problem, wanted = posed(spread, Requirement("settling_time", 19.0))
     problem = replace(problem, parts=replace(problem.parts, settling_angle=vector(1e-4)))
     at = np.array([ETA, 1.0])

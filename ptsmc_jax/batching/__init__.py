@@ -1,0 +1,1 @@
+"""One trajectory, traced, evaluated over many trials at once."""

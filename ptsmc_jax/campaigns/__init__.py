@@ -1,0 +1,1 @@
+"""Runs and campaigns of many trials, their rows and their folders."""

@@ -1,0 +1,195 @@
+"""A Monte Carlo campaign: trials flown part by part, each part written as it is done; what is there is not flown again.
+
+What a trial is does not depend on the parts, so that shards, clusters and interrupted runs give the same rows.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+
+from ptsmc_jax import programs
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.campaigns.montecarlo import OwnMetrics
+from ptsmc_jax.campaigns.rows import Part, Rows
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.scenario import Study
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from ptsmc_jax.simulation.rollout import Parts
+
+PART = 4096  # trials in one part
+WAITING = 2  # parts that may wait to be written while the next one is flown
+
+Wanted = tuple[int, int]  # first trial and count of a part to fly
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What is flown: a scenario's trials under one seed."""
+
+    ready: Study
+    seed: int
+    own: OwnMetrics | None = None  # metrics of one's own
+
+    def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
+        """Rows of these trials."""
+        # never so few that another program flies them: rows are then the same to the last digit
+        wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
+        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, wanted, own=self.own)
+        named = [rollout.STATUS[int(code)] for code in flown.status]
+        heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
+        numbers = {
+            "bad_time": flown.bad_time,
+            **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
+            **flown.drawn,
+            **flown.own,
+        }
+        frame = pl.DataFrame({"trial": wanted, **heading, **numbers})
+        return frame.head(len(trials)).with_columns(pl.col(pl.Float64).fill_nan(None))
+
+    def draw(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
+        """What these trials would fly with."""
+        wanted = np.asarray(trials, dtype=np.uint32)
+        padded = np.resize(wanted, -(-wanted.size // PART) * PART)
+        drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), padded)
+        return pl.DataFrame({"trial": wanted, **{name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}})
+
+    def own_names(self) -> list[str]:
+        """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
+        if self.own is None:
+            return []
+        found = jax.eval_shape(
+            lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=self.own)
+        )
+        if not isinstance(found.own, dict) or not found.own or not all(isinstance(name, str) for name in found.own):
+            raise ValueError(f"it returns {type(found.own).__name__}, but must return named numbers, a dict")
+        for name, value in found.own.items():
+            if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
+                raise ValueError(f"its {name} is no single number")
+            if name in {"trial", "status", "reason", "bad_time", *found.metrics._fields, *found.drawn}:
+                raise ValueError(f"its {name} has the name of a column that the rows have already")
+        return list(found.own)
+
+
+@programs.jit
+def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> dict[str, jax.Array]:
+    return lanes.vmap(lambda trial: montecarlo.values(dispersion, dispersion.apply(parts, seed, trial), seed, trial))(
+        trials
+    )
+
+
+def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
+    """Parts that are not there yet, of a campaign of so many trials; shard (i, n): of every n-th part from the i-th."""
+    there = {part.first: part.count for part in parts}
+    every = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
+    return [part for part in every[shard[0] - 1 :: shard[1]] if there.get(part[0], 0) < part[1]]
+
+
+@dataclass
+class Tally:
+    """Where a campaign stands."""
+
+    done: int  # trials
+    total: int
+    failed: int  # that did not end well
+
+
+def tally(parts: list[Part], total: int) -> Tally:
+    """Where a campaign with these parts stands."""
+    failed = sum(failures(pl.read_parquet(part.path, columns=["status"])) for part in parts)
+    return Tally(sum(part.count for part in parts), total, failed)
+
+
+def failures(frame: pl.DataFrame) -> int:
+    """How many of these rows did not end well."""
+    return int((frame["status"] != "ok").sum())
+
+
+def finished(frame: pl.DataFrame) -> np.ndarray:
+    """Which of these rows were flown to the end, (trials,) bool: their metrics are those of the run."""
+    return frame["status"].is_in([rollout.STATUS[code][0] for code in rollout.FINISHED]).to_numpy()
+
+
+def verdicts(requirements: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
+    """One for each requirement over these rows; a failed trial breaks every one."""
+    ok = finished(frame)
+    return [r.verdict(frame[r.metric].to_numpy().astype(float), ok) for r in requirements]
+
+
+def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
+    """Make the wanted parts on this machine, and write each while the next one is made.
+
+    Yields each part that is on the disk, and how many of its trials did not end well. make: numbers of trials -> rows.
+    Accelerators, which fly more than a part at a time, make several in one go.
+    """
+    together = max(1, montecarlo.abreast() * len(jax.local_devices()) // PART)
+    writing: deque[tuple[Any, int]] = deque()
+    with ThreadPoolExecutor(1) as writer:
+        for group, made in _made(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
+            begin = 0
+            for first, count in group:
+                frame, begin = made.slice(begin, count), begin + count
+                bad = failures(frame) if "status" in frame.columns else 0
+                writing.append((writer.submit(rows.write, first, frame), bad))
+            while writing and (len(writing) > WAITING or writing[0][0].done()):
+                done, bad = writing.popleft()
+                yield done.result(), bad
+        for done, bad in writing:
+            yield done.result(), bad
+
+
+def _made(
+    make: Callable[[np.ndarray], pl.DataFrame], groups: Sequence[list[Wanted]]
+) -> Iterator[tuple[list[Wanted], pl.DataFrame]]:
+    """The rows of each group of parts, in order; two at a time, so that one is flown while rows are made of another."""
+
+    def of(group: list[Wanted]) -> pl.DataFrame:
+        return make(np.concatenate([np.arange(first, first + count) for first, count in group]))
+
+    flying: deque[tuple[list[Wanted], Future]] = deque()
+    with ThreadPoolExecutor(2) as makers:
+        for k, group in enumerate(groups):
+            if k == 0:
+                yield group, of(group)  # alone: it compiles
+                continue
+            flying.append((group, makers.submit(of, group)))
+            if len(flying) == 2:
+                first, made = flying.popleft()
+                yield first, made.result()
+        for group, made in flying:
+            yield group, made.result()
+
+
+def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
+    """Tell of each part as it lands."""
+    report(standing)
+    for part, failed in parts:
+        standing.done += part.count
+        standing.failed += failed
+        report(standing)
+
+
+def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
+    ready = campaign.ready
+    t, error, lasts = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), jnp.asarray(trials))
+    kept = np.asarray(lasts)[0]
+    return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
+
+
+@programs.jit
+def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> tuple:
+    def one(trial: jax.Array) -> tuple:
+        log = rollout.simulate(dispersion.apply(parts, seed, trial), seed, trial, record=True).log
+        assert log is not None
+        return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.lasts
+
+    return montecarlo.blocks(one, trials)

@@ -1,0 +1,103 @@
+"""One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ptsmc_jax import programs
+from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.scenario import Study
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.requirements import Verdict
+from ptsmc_jax.simulation.rollout import Log, Parts
+from ptsmc_jax.theory import error_floor
+from ptsmc_jax.theory.error_floor import Floor
+
+FLOORS = 4  # trials whose floors are pooled: they differ by a few per cent
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    parts: Parts  # as flown
+    log: Log  # numpy arrays (time, component), intervals of length zero left out
+    metrics: dict[str, float]
+    catalogue: dict[str, tuple[str, str]]  # what those are: name -> (unit, meaning)
+    status: str
+    reason: str
+    bad_time: float  # [s], NaN if none
+    verdicts: list[Verdict]
+
+    @property
+    def met(self) -> bool:
+        """The run ended well and met every requirement."""
+        return self.status == "ok" and all(v.met for v in self.verdicts)
+
+    @property
+    def torque_limit(self) -> float | None:
+        """What the scenario allows of the torque; None: it does not say."""
+        return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
+
+    @cached_property
+    def floor(self) -> Floor | None:
+        """What no controller can beat along this run, see `error_floor`; None: it was not flown to the end."""
+        finished = self.status in [rollout.STATUS[code][0] for code in rollout.FINISHED]
+        return error_floor.along(self.parts, self.log) if finished else None
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable, wheels."""
+        log = self.log
+        blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
+        if log.wheels is not None:
+            blocks["h"], blocks["v"] = log.wheels
+        found = {"t": np.asarray(log.t)}
+        for name, block in blocks.items():
+            found |= numbered(name, block)
+        return found
+
+
+def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
+    """The columns of a (time, component) array, by its name and a number from 1 on."""
+    return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
+
+
+def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
+    """Fly one run: nominal with the noise of trial 0, or a trial with its dispersions and its noise."""
+    run = _fly(ready, seed, trial)
+    return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
+
+
+def _fly(ready: Study, seed: int, trial: int | None) -> Run:
+    key, number = jnp.uint32(seed), jnp.uint32(trial or 0)
+    parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, number)
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
+    assert result.log is not None
+    lasts = result.log.lasts
+    log = jax.tree.map(lambda rows: rows[lasts], result.log)
+    status, reason = rollout.STATUS[int(result.status)]
+    metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
+    finished = np.asarray(int(result.status) in rollout.FINISHED)
+    verdicts = [r.verdict(np.asarray(metrics[r.metric]), finished) for r in ready.requirements]
+    return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
+
+
+@programs.jit
+def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array) -> Parts:
+    return dispersion.apply(parts, seed, trial)
+
+
+def floor(ready: Study, seed: int = 0) -> float | None:
+    """RMS window error that no controller can beat, in its unit, see `error_floor`; 0: nothing is unknown.
+
+    Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials. None: none of these is
+    flown to the end.
+    """
+    trials = range(FLOORS) if ready.dispersion.varies else (None,)
+    runs = (_fly(ready, seed, trial) for trial in trials)
+    return error_floor.pooled(run.floor for run in runs if run.floor is not None)

@@ -1,0 +1,207 @@
+"""Result folders: what is refused, what lies in each, written so that a folder is whole or not there."""
+
+import csv
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from ptsmc_jax.scenario import schema
+
+JOURNAL = "journal.bin"  # of a run that is not finished
+PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
+
+
+class RefusedError(ValueError):
+    """A folder that must not be written to. Its text is one sentence."""
+
+
+def versions(command: str, seed: int | None, **others: Any) -> dict[str, Any]:
+    """What made a result: command and seed (None: nothing is drawn), versions, machine."""
+    return {
+        "command": command,
+        "seed": seed,
+        **others,
+        "python": platform.python_version(),
+        **packages(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+    }
+
+
+def packages() -> dict[str, str]:
+    """Versions of the packages that numbers depend on."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
+
+
+def made(folder: Path) -> dict[str, Any]:
+    """What `versions` said when the results in a folder were made; empty where it cannot be read."""
+    try:
+        told = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def previous(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The summary of the same scenario with the same command, seed and what else `versions` was told; None: none."""
+    try:
+        return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, told) else None
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def begun(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+    """Whether the folder holds the beginning of the same run, by the same versions: see `begin`."""
+    return (folder / JOURNAL).exists() and _same(folder, scenario, versions(**told))
+
+
+def begin(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any], *, fresh: bool) -> Path:
+    """Make the folder of a run that can go on where it was interrupted; returns the path of its journal.
+
+    fresh: forget what the folder's journal holds, and the summary of what was there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fresh:
+        end(folder)
+        (folder / "summary.json").unlink(missing_ok=True)  # it would pass for this run's
+    write_toml(folder / "scenario.toml", scenario)
+    write_json(folder / "versions.json", versions(**told))
+    (folder / JOURNAL).touch()
+    return folder / JOURNAL
+
+
+def end(folder: Path) -> None:
+    """Forget the journal of a run that is done."""
+    (folder / JOURNAL).unlink(missing_ok=True)
+
+
+def _same(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+    return difference(folder, scenario, told) is None
+
+
+def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> str | None:
+    """What tells the run in the folder from this one, in words; None: nothing does."""
+    there = made(folder)
+    try:
+        known = schema.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
+    except (OSError, ValueError):
+        return "something else"
+    if not there or not all(isinstance(table, dict) for table in known.values()):
+        return "something else"
+    wanted = json.loads(json.dumps(_named(scenario)))
+    for name, value in told.items():
+        if there.get(name) != value:
+            return f"a run with {name} {there.get(name)}, not {value}"
+    for table in dict.fromkeys((*known, *wanted)):
+        for key in dict.fromkeys((*known.get(table, {}), *wanted.get(table, {}))):
+            old, new = (tables.get(table, {}).get(key, "absent") for tables in (known, wanted))
+            if old != new:
+                return f"a run of another scenario: {table}.{key} is {old} there, and {new} here"
+    return None
+
+
+def check(folder: Path, force: bool) -> None:
+    """Raise RefusedError where this folder must not be written to."""
+    above = next((parent for parent in folder.parents if parent.exists() and not parent.is_dir()), None)
+    if above is not None:
+        raise RefusedError(f"--out is {folder}, which lies below the file {above}; allowed is a new folder")
+    if folder.exists() and not folder.is_dir():
+        raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
+    if folder.is_dir() and any(folder.iterdir()) and not force:
+        raise RefusedError(
+            f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
+        )
+
+
+def check_file(file: Path, force: bool) -> None:
+    """Raise RefusedError where this file must not be written."""
+    if not file.parent.is_dir():
+        raise RefusedError(f"the file is {file}, but {file.parent} is no folder; allowed is one that exists")
+    if file.is_dir() or (file.exists() and not force):
+        allowed = "another name" if file.is_dir() else "another name, or --force to write over it"
+        raise RefusedError(f"the file is {file}, which is there already; allowed is {allowed}")
+
+
+def write(folder: Path, fill: Callable[[Path], None]) -> None:
+    """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        fill(making)
+        making.chmod(0o755)
+        if not folder.exists():
+            try:
+                making.rename(folder)
+                return
+            except OSError:  # another process was first, with the same run: shards begin at once
+                pass
+        for path in sorted(making.rglob("*")):
+            if path.is_file():
+                target = folder / path.relative_to(making)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(path, target)
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
+
+
+def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
+    """A TOML file, arrays on one line."""
+    text, before = tomli_w.dumps(_named(tables)), ""
+    while text != before:  # innermost arrays first
+        text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
+    write_text(path, text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """A JSON file; numbers that are not finite become null."""
+    write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """A text file that is whole or not there."""
+    making = path.with_name(f".{path.name}-{os.getpid()}")
+    making.write_text(text, encoding="utf-8")
+    os.replace(making, path)
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A CSV file; numbers with as many digits as it takes to read them back exactly."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
+
+
+def _one_line(array: re.Match[str]) -> str:
+    return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].rstrip("\n").split("\n")) + "]"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _named(value: Any) -> Any:
+    """Tables whose objects made in Python, which no file can hold, are named; reading refuses such a name."""
+    if isinstance(value, Mapping):
+        return {k: _named(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_named(v) for v in value]
+    return value if isinstance(value, bool | int | float | str) else f"<{type(value).__name__} made in Python>"

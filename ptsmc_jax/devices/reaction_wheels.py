@@ -1,0 +1,37 @@
+"""Reaction wheels: axes, limits and momentum."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.formulas import wheel_axes
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+
+
+@pytree
+@dataclass(frozen=True)
+class Wheels:
+    """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A.
+
+    h is absolute, spin inertia times (wheel speed + a . w); J is then the whole spacecraft's less the spin inertia of
+    each wheel about its axis, J_total - sum I a a' (Hughes, Spacecraft Attitude Dynamics, 1986).
+    """
+
+    axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
+    allocation: Leaf  # (n, 3) pseudo-inverse of A
+    initial: Leaf  # (n,) momentum at t = 0 [N m s]
+    torque_limit: Leaf | None = None  # per wheel [N m]
+    momentum_limit: Leaf | None = None  # per wheel [N m s]
+
+
+def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_limit: Any = None) -> Wheels:
+    """Wheels from their spin axes (n, 3) in body axes, of any length; initial: momenta (n,) [N m s], default 0.
+
+    Raises ValueError where the axes do not span all directions.
+    """
+    unit = wheel_axes(axes)
+    start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
+    limits = (None if v is None else jnp.asarray(float(v)) for v in (torque_limit, momentum_limit))
+    return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)

@@ -1,0 +1,202 @@
+"""What the law sees: star tracker and gyro, raw or through a gyro-propagated attitude filter; a chain's states.
+
+White noise is 1 sigma per sample, density / sqrt(period) (IEEE Std 952): attitudes in rad, rates in rad/s, a chain's
+states in the states' own units. A sensor has a memory (noise of the sample, bias, estimate) that the rollout carries;
+its noise belongs to (seed, trial, sample). In the partial first period of the anchored clock everything a sample does
+is weighted by the period's share, so that nothing jumps where that period vanishes.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import attitude, draws, guards
+from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.plants.rigid_body import AttitudeState
+
+Scalar = Float[Array, ""]
+
+
+ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
+
+
+RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
+
+
+class Sensor(Protocol):
+    """What the rollout asks of a sensor."""
+
+    def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> Any:
+        """Memory before the first sample of positive length, which is now."""
+        ...
+
+    def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
+        """The state as the law sees it, and the memory; dt: length of the period just ended [s]."""
+        ...
+
+
+class Reading(NamedTuple):
+    """What a sensor says of a state near the true one, to first order, for `floor`.
+
+    Of (x, own): the plant's local coordinates (n,), see `Plant.moved`, then states of the sensor's own, a gyro's bias.
+    """
+
+    rows: np.ndarray  # (m, n + own) what is read of them
+    noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
+    every: np.ndarray  # (m,) control periods from one reading to the next
+    own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
+    own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
+    start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
+
+
+class Memory(NamedTuple):
+    """What `Sensors` carries from sample to sample."""
+
+    keys: tuple
+    noise: tuple[Array, Array]  # of the sample to come
+    bias: Any  # (3,) of the gyro [rad/s]; None without one
+    estimate: Any  # Estimate; None without a filter
+    rate: Any  # (3,) as last measured [rad/s]; None without a filter
+
+
+@pytree
+@dataclass(frozen=True)
+class Sensors:
+    """Star tracker [rad] and gyro [rad/s] sampled once a period, white noise, independent per axis and sample.
+
+    Without a filter the law sees the samples themselves; with one, its attitude and the gyro's rate less its bias.
+    """
+
+    attitude_noise: Leaf  # 1 sigma of the small rotation about each body axis [rad]
+    rate_noise: Leaf  # 1 sigma [rad/s]
+    rate_bias: Leaf | None = None  # 1 sigma, constant over a run [rad/s]
+    bias_rate: Leaf | None = None  # 1 sigma of the bias's change per second of a period: walk / sqrt(period) [rad/s^2]
+    filter: AttitudeFilter | None = None
+    every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
+
+    def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
+        """The same with a filter of another bandwidth [rad/s]; period: of control [s]."""
+        walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
+        noises = self.attitude_noise, self.rate_noise, walk
+        return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
+
+    def bandwidth(self, period: Any) -> Any:
+        """Bandwidth of the filter [rad/s]."""
+        assert self.filter is not None
+        return -0.5 * jnp.log1p(-self.filter.attitude_gain) / (period * self.every)
+
+    def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key, draws.Key]:
+        """Streams of a trial's noise: attitude, rate, change of the bias."""
+        return (
+            draws.stream(seed, trial, ATTITUDE_NOISE),
+            draws.stream(seed, trial, RATE_NOISE),
+            draws.stream(seed, trial, BIAS_WALK),
+        )
+
+    def noise(self, keys: tuple, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""
+        return (
+            self.attitude_noise * draws.normals(keys[0], 3, sample),
+            self.rate_noise * draws.normals(keys[1], 3, sample),
+        )
+
+    def first_bias(self, seed: Whole, trial: Whole) -> Float[Array, "3"]:
+        """Bias of the gyro at the first sample, (3,) [rad/s]."""
+        if self.rate_bias is None:
+            return jnp.zeros(3)
+        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+
+    def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, now: Ticks) -> Memory:
+        """Memory before the first sample of positive length, which is now."""
+        keys, bias, estimate = self.keys(seed, trial), None, None
+        if self.rate_bias is not None or self.bias_rate is not None:
+            bias = self.first_bias(seed, trial)
+        if self.filter is not None:
+            normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
+            none = jnp.zeros(3) if bias is None else bias
+            estimate = self.filter.begin(x0.q, none, normals, now.sample, now.noise_weight)
+        return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
+
+    def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
+        noise_next = self.noise(memory.keys, now.sample + 1)
+        turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
+        bias, estimate = memory.bias, memory.estimate
+        if self.bias_rate is not None:
+            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
+        w = jnp.add(x.w, shift)
+        if bias is not None:
+            w = w + bias
+        q = attitude.multiply(x.q, attitude.from_rotation_vector(turn))
+        if self.filter is None:
+            return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
+        weight = jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+        estimate = self.filter.correct(self.filter.propagate(estimate, memory.rate, w, dt), q, weight)
+        seen = AttitudeState(estimate.q, w - estimate.bias)
+        return seen, Memory(memory.keys, noise_next, bias, estimate, w)
+
+    def moved(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
+        """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""
+        if memory.estimate is None:
+            return memory
+        turn, bias, rate = by.reshape(3, 3)
+        q = attitude.multiply(memory.estimate.q, attitude.from_rotation_vector(turn))
+        return memory._replace(estimate=Estimate(q, memory.estimate.bias + bias), rate=memory.rate + rate)
+
+    def apart(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
+        """What `moved` takes a memory to another one by, to first order."""
+        if memory.estimate is None:
+            return jnp.zeros(0)
+        turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
+        return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
+
+    def reading(self, period: float) -> Reading:
+        """Rotation [rad], every so many periods behind a filter, and rate with its bias [rad/s], every period [s]."""
+        one, none = np.eye(3), np.zeros((3, 3))
+        star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
+        bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
+        start, every = None, 1
+        if self.filter is not None:
+            root, every = np.asarray(self.filter.spread[-1]), self.every
+            start = np.block([[one, none, none], [none, none, one]]), np.kron(root @ root.T, one)
+        rows = np.block([[one, none, none], [none, one, one]])
+        kept = np.repeat([every, 1], 3)
+        return Reading(rows, np.repeat([star, gyro], 3), kept, np.full(3, bias), np.full(3, drift), start)
+
+
+@pytree
+@dataclass(frozen=True)
+class StateSensor:
+    """All states sampled once a period, white noise in the states' own units, independent per state and sample."""
+
+    sigma: Leaf  # (n,) 1 sigma of each state
+
+    def key(self, seed: Whole, trial: Whole) -> draws.Key:
+        """Stream of a trial's noise."""
+        return draws.stream(seed, trial, STATE_NOISE)
+
+    def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " n"]:
+        """Noise of one sample, (n,)."""
+        return self.sigma * draws.normals(key, self.sigma.shape[-1], sample)
+
+    def begin(self, seed: Whole, trial: Whole, x0: Float[Array, " n"], now: Ticks) -> tuple:
+        """Memory before the first sample of positive length, which is now."""
+        key = self.key(seed, trial)
+        return key, self.noise(key, now.sample)
+
+    def measure(self, memory: tuple, x: Float[Array, " n"], now: Ticks, dt: Scalar) -> tuple[Float[Array, " n"], tuple]:
+        """The states as measured, and the memory."""
+        key, noise = memory
+        noise_next = self.noise(key, now.sample + 1)
+        return x + guards.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
+
+    def reading(self, period: float) -> Reading:
+        """Every state, every period [s]."""
+        sigma = np.asarray(self.sigma)
+        return Reading(np.eye(sigma.size), sigma, np.ones(sigma.size, int), np.zeros(0), np.zeros(0))

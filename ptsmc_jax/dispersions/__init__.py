@@ -1,0 +1,1 @@
+"""What varies from trial to trial, and how it is drawn."""

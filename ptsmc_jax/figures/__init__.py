@@ -1,0 +1,1 @@
+"""Runs, studies and campaigns as matplotlib figures; each function returns a Figure."""

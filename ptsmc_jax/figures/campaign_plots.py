@@ -1,0 +1,140 @@
+"""Campaigns as matplotlib figures: the fan of the error, distributions, points by status; each returns a Figure."""
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ptsmc_jax.figures.style import RC, STYLES, figure_of, plain_ticks
+from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
+BEYOND = "beyond a limit"  # flown to the end, but a requirement is broken
+# outcome: colour, marker, size
+MARKS = {
+    "ok": (STYLES[0][0], "o", 6.0),
+    BEYOND: ("#CC79A7", "D", 8.0),
+    "missed": (STYLES[1][0], "^", 16.0),
+    "singular": (STYLES[3][0], "x", 18.0),
+    "diverged": (STYLES[2][0], "s", 16.0),
+}
+
+
+def fan(
+    t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str = "spacecraft"
+) -> Figure:
+    """Error over time of many trials: central bands, the median, the worst run.
+
+    t (time,) [s]; errors (trials, time); worst: trial of the largest window error, and its errors (time,).
+    """
+    unit = CATALOGUES[kind]["terminal_error"][0]
+    figure, axes = figure_of(f"Error of {len(errors)} trials, median in white", f"2-norm of the error [{unit}]")
+    for share, grey in BANDS:
+        low, high = np.percentile(errors, [50.0 - share / 2, 50.0 + share / 2], axis=0)
+        axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{share:g} % of the trials")
+    axes.semilogy(t, np.median(errors, axis=0), color="white", lw=1.6)
+    axes.semilogy(t, worst[1], color=STYLES[1][0], lw=1.2, label=f"largest window error: trial {worst[0]}")
+    axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
+    axes.annotate("$t_f$", (t_f, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom")
+    positive = errors[errors > 0.0]
+    if positive.size:
+        axes.set_ylim(bottom=max(np.percentile(positive, 0.1) / 3.0, positive.max() * 1e-15))
+    axes.legend(fontsize=9)
+    return figure
+
+
+def distributions(found: Mapping[str, tuple[str, np.ndarray, float | None]]) -> Figure:
+    """Share of the trials up to each value, with the limits: metric -> (unit, values, limit).
+
+    A trial without a value (NaN) counts as beyond all. The scale of the shares is that of their odds, so that 99.9 %
+    is as far from 99 % as 1 % from 10 %.
+    """
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(8.0, 3.0 * len(found)), layout="constrained")
+        rows = figure.subplots(len(found), 1, squeeze=False)[:, 0]
+        for axes, (name, (unit, values, limit)) in zip(rows, found.items(), strict=True):
+            ordered = np.sort(values)  # NaN last
+            n, known = ordered.size, int(np.isfinite(ordered).sum())
+            # every rank near both ends, and as many between as can be seen
+            ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
+            ranks = ranks[ranks <= known]
+            share = (ranks - 0.5) / n
+            axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0], marker="." if known < 50 else None)
+            axes.set_yscale("logit")
+            edge = 0.3 / n
+            axes.set_ylim(edge, 1.0 - edge)
+            ticks = [q for k in range(1, 8) for q in (10.0**-k, 1.0 - 10.0**-k) if edge < q < 1.0 - edge]
+            axes.set_yticks([0.5, *ticks], [f"{100 * q:.8g} %" for q in (0.5, *ticks)])
+            axes.minorticks_off()
+            if known and ordered[0] > 0.0 and ordered[known - 1] > 3.0 * ordered[0]:
+                axes.set_xscale("log")
+                plain_ticks(axes.xaxis)
+            if limit is not None:
+                within = np.mean(values <= limit)
+                said = f"limit {limit:g} {unit}".rstrip(" -") + f": {100 * within:.6g} % within"
+                axes.axvline(limit, color=STYLES[1][0], ls="--", label=said)
+                axes.legend(fontsize=9, loc="lower right")
+            axes.set(xlabel=f"{name} [{unit}]" if unit else name, ylabel="share of the trials")
+    return figure
+
+
+def torque_by_angle(
+    angle: np.ndarray,
+    torque: np.ndarray,
+    outcome: np.ndarray,
+    totals: Mapping[str, int],
+    limit: float | None,
+    kind: str = "spacecraft",
+) -> Figure:
+    """Peak torque against the initial error, a point a trial; angle [rad], outcome one of `MARKS`, (trials,) each.
+
+    totals: how many trials of the campaign have each outcome; those given may be some of them.
+    """
+    unit, attitude = CATALOGUES[kind]["peak_torque"][0], kind == "spacecraft"
+    figure, axes = figure_of("Peak torque by how far the trial starts", f"peak torque [{unit}]")
+    _points(axes, np.degrees(angle) if attitude else angle, torque, outcome, totals)
+    axes.set_xlabel("initial angle [deg]" if attitude else "initial |x_1| [x1]")
+    if limit is not None:
+        axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
+    finished = torque[np.isin(outcome, ("ok", BEYOND, "missed")) & np.isfinite(torque)]
+    if finished.size and finished.min() > 0.0:
+        top = max(finished.max(), limit or 0.0)
+        axes.set_yscale("log")
+        plain_ticks(axes.yaxis)
+        axes.set_ylim(finished.min() / 1.3, top * 1.5)
+    axes.legend(fontsize=9)
+    return figure
+
+
+def pairs(inputs: Mapping[str, np.ndarray], outcome: np.ndarray, totals: Mapping[str, int]) -> Figure:
+    """Every two of the inputs against each other, a point a trial; see `torque_by_angle`."""
+    names = list(inputs)
+    with matplotlib.rc_context(RC):
+        size = len(names) - 1
+        figure = Figure(figsize=(2.9 * size + 0.6, 2.7 * size + 0.6), layout="constrained")
+        grid = figure.subplots(size, size, sharex="col", sharey="row", squeeze=False)
+        for axes in grid.ravel():
+            axes.set_visible(False)
+        for i, j in combinations(range(len(names)), 2):
+            axes = grid[j - 1, i]
+            axes.set_visible(True)
+            _points(axes, inputs[names[i]], inputs[names[j]], outcome, totals)
+            if j == size:
+                axes.set_xlabel(names[i])
+            if i == 0:
+                axes.set_ylabel(names[j])
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
+    return figure
+
+
+def _points(axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, totals: Mapping[str, int]) -> None:
+    for name, (colour, marker, size) in MARKS.items():
+        those = outcome == name
+        if np.any(those):
+            label = f"{name}: {totals[name]}"
+            width = 1.2 if marker == "x" else 0.0
+            axes.scatter(x[those], y[those], s=size, c=colour, marker=marker, alpha=0.6, label=label, linewidths=width)

@@ -1,0 +1,245 @@
+"""Histories of runs as matplotlib figures, axes labelled with units; each function returns a Figure."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import matplotlib.colors
+import matplotlib.lines
+import matplotlib.ticker
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from ptsmc_jax.figures.style import RC, STYLES, TIME, figure_of
+from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.laws.prescribed_time import PrescribedTime
+from ptsmc_jax.paper.remark_2 import Measured
+from ptsmc_jax.plants.rigid_body import Spacecraft
+from ptsmc_jax.simulation.rollout import Log, Parts
+from ptsmc_jax.theory import envelopes, solutions
+from ptsmc_jax.theory.error_floor import Floor
+
+
+def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
+    """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
+    figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
+    if isinstance(parts.controller, Prescribed):
+        figures["convergence"] = convergence(parts, log)
+    if np.any(log.d_hat):
+        figures["disturbance"] = disturbance(parts, log)
+    if log.wheels is not None:
+        figures["wheels"] = wheels(parts, log)
+    if isinstance(parts.plant, Spacecraft):
+        return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
+    return {"states": states(parts, log), **figures}
+
+
+def attitude(parts: Parts, log: Log, title: str = "Attitude") -> Figure:
+    """Quaternion and its reference over time."""
+    figure, axes = figure_of(title, "quaternion component [-]")
+    _components(axes, log.t, log.x.q, "q")
+    axes.plot(log.t, log.reference.q, color="0.6", lw=1.0, zorder=1)
+    axes.plot([], [], color="0.6", lw=1.0, label="reference")
+    _mark(axes, parts)
+    axes.legend(ncols=3, loc="best")
+    return figure
+
+
+def states(parts: Parts, log: Log, title: str = "States") -> Figure:
+    """States of a chain or a system over time."""
+    figure, axes = figure_of(title, "state")
+    _components(axes, log.t, log.x, "x")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
+def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
+    """2-norm of the error on a log scale with its bound and floor, and the window in which it is judged."""
+    symbol, _, _ = _names(parts)
+    figure, axes = figure_of("Error", symbol)
+    size = np.linalg.norm(log.error, axis=1)
+    axes.semilogy(log.t, np.maximum(size, 1e-16), color=STYLES[0][0], label="flown")
+    if isinstance(parts.controller, Prescribed):
+        before = log.t[log.t < float(parts.controller.hand_over)]
+        axes.plot(before, envelopes.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
+    if floor is not None and floor.window_error > 0.0:
+        known = (floor.error > 0.0) & (floor.error < size.max())  # before the first samples nothing is
+        axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="floor: no controller beats it")
+    t_f = float(parts.controller.t_f)
+    axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def rate(parts: Parts, log: Log) -> Figure:
+    """Body rate over time."""
+    figure, axes = figure_of("Body rate", "rate [rad/s]")
+    _components(axes, log.t, log.x.w, "w")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
+    """Delivered torque or input over time, its largest value marked, the limit drawn where one is given."""
+    _, label, unit = _names(parts)
+    figure, axes = figure_of(title or ("Control torque" if unit else "Control"), label)
+    held = not hasattr(parts.clock, "max_step")
+    _components(axes, log.t, log.u, "u", drawstyle="steps-post" if held else "default")
+    if isinstance(parts.controller, Prescribed):
+        t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
+        axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+        axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+    row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
+    peak = log.commanded[row, column]
+    marked = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
+    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=marked)
+    if limit is not None:
+        _limit(axes, limit, unit)
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def wheels(parts: Parts, log: Log) -> Figure:
+    """Momentum of the reaction wheels over time, and its limit."""
+    figure, axes = figure_of("Reaction wheels", "momentum [N m s]")
+    assert log.wheels is not None
+    assert parts.actuators is not None
+    _components(axes, log.t, log.wheels[0], "h")
+    device = parts.actuators.wheels
+    if device is not None and device.momentum_limit is not None:
+        _limit(axes, float(device.momentum_limit), " N m s")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
+def sliding(parts: Parts, log: Log) -> Figure:
+    """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
+    figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
+    _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
+    if isinstance(parts.controller, Prescribed):
+        before = log.t[log.t < float(parts.controller.hand_over)]
+        axes.plot(
+            before, envelopes.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise"
+        )
+    axes.set_yscale("log")
+    _mark(axes, parts)
+    axes.legend()
+    return figure
+
+
+def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees it") -> Figure:
+    """Error and s against the time to go, both on log axes, with the exact motion and the slopes of theory."""
+    symbol, _, unit = _names(parts)
+    law, n = parts.controller, parts.controller.order
+    t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
+    figure, axes = figure_of(title, f"{symbol} and |s|" if unit else "$|x_1|$ and |s|")
+    before = log.t < float(law.hand_over) * (1 - 1e-12)
+    t = np.asarray(log.t)[before]
+    tau = t_f - t
+    flown = {
+        symbol.split(" [")[0]: (np.linalg.norm(log.error, axis=1)[before], eta, STYLES[0]),
+        "|s|": (np.linalg.norm(log.s, axis=1)[before], eta + n - 2, STYLES[1]),
+    }
+    exact = solutions.exact_sizes(parts, t)
+    bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in flown.values())
+    for (name, (size, _, (colour, style))), ideal in zip(flown.items(), exact, strict=True):
+        axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, flown")
+        axes.loglog(tau, ideal, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+    # slopes of theory as short lines over the error and, where it differs, under s
+    span = t_f * np.array([0.3, max(0.03, delta / t_f)])
+    above = 6.0 * float(np.interp(-span[0], -tau, np.maximum(*exact)))
+    guides = [(above, eta, "$\\eta$", 6)]
+    if n > 2:
+        guides.append((float(np.interp(-span[0], -tau, np.minimum(*exact))) / 30.0, eta + n - 2, "$\\eta+n-2$", -14))
+    for start, slope, name, shift in guides:
+        line = start * (span / span[0]) ** slope
+        axes.loglog(span, line, color="black", lw=1.0)
+        axes.annotate(f"slope {name} = {slope:g}", (np.sqrt(span[0] * span[1]), np.sqrt(line[0] * line[1])),
+                      fontsize=10, xytext=(6, shift), textcoords="offset points",
+                      ha="left" if shift > 0 else "right")  # fmt: skip
+    axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+    axes.set_xlabel("time to go $t_f - t$ [s]")
+    axes.set_ylim(bottom=bottom / 3)
+    axes.invert_xaxis()
+    axes.legend(loc="lower left")
+    return figure
+
+
+def disturbance(parts: Parts, log: Log) -> Figure:
+    """Estimated and true disturbance over time."""
+    figure, axes = figure_of("Disturbance and its estimate", _names(parts)[1].replace("input", "disturbance"))
+    _components(axes, log.t, log.d_hat, "\\hat d")
+    axes.plot(log.t, log.disturbance, color="0.6", lw=1.0, zorder=1)
+    axes.plot([], [], color="0.6", lw=1.0, label="true $d_i$")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
+def observers(found: Sequence[Measured]) -> Figure:
+    """What each observer makes of the disturbance, and the chattering it leaves under both signs (Remark 2)."""
+    kinds = list(dict.fromkeys(one.observer for one in found))
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for kind, (colour, style) in zip(kinds, STYLES, strict=False):
+            one = next(one for one in found if one.observer == kind and one.sign == "smooth")
+            left.semilogy(one.t, np.maximum(one.off, 1e-6), color=colour, ls=style, label=kind)
+        left.set(xlabel=TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
+        left.legend(ncols=2)
+        signs = list(dict.fromkeys(one.sign for one in found))
+        for k, sign in enumerate(signs):
+            heights = [next(o.chattering for o in found if (o.observer, o.sign) == (kind, sign)) for kind in kinds]
+            colour, hatch = STYLES[k][0], ("", "//")[k % 2]
+            at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
+            bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
+            right.bar_label(bars, fmt="%.0e", fontsize=8)
+        right.set_yscale("log")
+        right.set_axisbelow(True)
+        right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
+        right.set(ylabel="chattering after $t_f$ [N m/s]")
+        right.set_ylim(top=8.0 * right.get_ylim()[1])
+        right.legend(ncols=2)
+    return figure
+
+
+def _names(parts: Parts) -> tuple[str, str, str]:
+    """Labels of the error and the input, and the input's unit behind a number."""
+    if not isinstance(parts.plant, Spacecraft):
+        return "$|x_1|$", "input u", ""
+    additive = isinstance(parts.controller, PrescribedTime)
+    return "|$\\varepsilon_1$| [-]" if additive else "|v| [-]", "torque [N m]", " N m"
+
+
+def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
+    values = np.asarray(values)
+    for k in range(values.shape[1]):  # beyond as many as there are styles, the same in thin lines
+        colour, style = STYLES[k % len(STYLES)]
+        width = {"lw": 0.8} if k >= len(STYLES) else {}
+        label = f"${symbol}_{{{k + 1}}}$"
+        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **kwargs)
+
+
+def _limit(axes: Axes, limit: float, unit: str) -> None:
+    """Lines at plus and minus a limit."""
+    for sign in (-1.0, 1.0):
+        axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
+    axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")
+
+
+def _mark(axes: Axes, parts: Parts) -> None:
+    """A line at the prescribed time."""
+    t_f = float(parts.controller.t_f)
+    axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
+    axes.annotate(
+        f"$t_f$ = {t_f:g} s", (t_f, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+        textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
+    )  # fmt: skip
+    axes.margins(x=0.01)

@@ -1,0 +1,1 @@
+"""Control laws: the paper's for every kind of plant, and those to compare with."""

@@ -1,0 +1,187 @@
+"""What the paper's prescribed-time laws share: gains, phases, and the law of every second-order error motion."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ptsmc_jax import formulas
+from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics.pytrees import Leaf
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
+
+
+class SurfaceGains(NamedTuple):
+    """What both phases of the law share: s = c eps' + e eps, desired 2 eps'' = -a eps' - b s - switching."""
+
+    c: Array  # [s] before the hand-over, [-] after
+    e: Array  # [-] before the hand-over, [1/s] after
+    a: Array  # [1/s]
+    b: Array  # [1/s^2] before the hand-over, [1/s] after
+
+
+class Motion(NamedTuple):
+    """What a plant does where its error moves in a given way."""
+
+    x: Any  # state
+    w_dot: Array  # (m,) derivative of its velocity
+    clearance: Array  # how far from a singularity, positive on this side of it
+
+
+class Law:
+    """What the rollout asks of a law, and what it needs no law of its own to say.
+
+    Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
+    and inputs' own units. A law is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
+    """
+
+    model: Any  # the nominal plant
+    t_f: Leaf  # prescribed time, or when the error is judged [s]
+    delta: Leaf  # hand-over this long before t_f [s]
+    free: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
+
+    @property
+    def hand_over(self) -> Scalar:
+        """t_s = t_f - delta [s]."""
+        return self.t_f - self.delta
+
+    def align(self, x: Any, target: Any) -> Any:
+        """The initial state in the form that the law can bring to the target."""
+        return x
+
+    def clearance(self, x: Any, target: Any) -> Scalar:
+        """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
+        return jnp.ones_like(self.t_f)
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """What clearances are counted in, from that of the initial state: its sign, so that the first is positive."""
+        return jnp.where(first < 0.0, -1.0, 1.0)
+
+    def torque(
+        self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector]:
+        """Commanded input (m,) and sliding variable; d_hat: estimated disturbance, k2: K2, bound on its error."""
+        raise NotImplementedError
+
+    @property
+    def order(self) -> int:
+        """Order n of the error's motion: 2, or that of a chain."""
+        return 2
+
+    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
+        """What is driven to zero, (m,), and its derivative."""
+        raise NotImplementedError
+
+    def angle(self, x: Any, target: Any) -> Scalar:
+        """What settles: the angle to the reference [rad], for other plants |x_1|."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Prescribed(Law):
+    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
+
+    The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
+    enough, and with delta > 0 V(t_f) is only small.
+    """
+
+    model: Any
+    t_f: Leaf
+    eta: Leaf  # eta > 2, and greater than the order of a chain [-]
+    delta: Leaf
+    k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
+    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
+    surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
+    free: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
+
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
+
+        visited: targets (points,) and states (points, ..) of a run, where it depends on them.
+        """
+        raise NotImplementedError
+
+    def boundary_layer(self, k2: Scalar, visited: Any = None) -> tuple[Scalar, Scalar]:
+        """Fastest rate of the smooth sign's boundary layer before and after the hand-over [1/s], for K2 up to k2."""
+        after = self.switching_rate(k2, visited) / self.sign_width
+        return self.t_f ** (self.order - 1) * after, after
+
+    def reaching_rate(self) -> Scalar:
+        """Rate at which s falls after the hand-over, but for the switching term [1/s]: K1 of (10), (29) and (40)."""
+        return self.k1
+
+    def surface(self) -> Float[Array, " roots"]:
+        """a_1 .. a_(n-1) of the surface after the hand-over, s = x_n + a_(n-1) x_(n-1) + .. + a_1 x_1 [1/s^(n-i)]."""
+        raise NotImplementedError
+
+    def hold_rates(self) -> dict[str, float]:
+        """Fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
+        on = float(np.max(np.abs(formulas.surface_roots(self.surface()))))
+        return {"k1": float(self.reaching_rate()), "surface_rate": on}
+
+
+@dataclass(frozen=True)
+class SecondOrder(Prescribed):
+    """The law of an error vector eps whose second derivative the input sets: (29), of which (57) and (60) are a case.
+
+    s = tau eps' + eta eps and 2 eps'' = -2 (eta-1) eps'/tau - 2 eta s/tau^2 - N K2 sign(s) before the hand-over (26),
+    s = eps' + c eps and 2 eps'' = -2 c eps' - b s - N K2 sign(s) after it (28), tau = t_f - t. N is the Frobenius norm
+    of 2 d(eps'')/dd, |T J^-1| in (57) and 2 |dF/dx2| in (29): the paper names no norm; this one is smooth and not below
+    the spectral norm that the proof needs where K2 bounds the 2-norm of the estimation error. c is `surface_rate`, in
+    the paper 1 1/s, and b is `pull`.
+
+    Differences from the paper: (29) lacks the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference; (60)
+    and (57) have them. sign(s) is tanh(s / sign_width), per component (0: exact).
+    """
+
+    def pull(self) -> Scalar:
+        """The coefficient b after the hand-over [1/s]: 2 K1 of (29)."""
+        return 2.0 * self.k1
+
+    def reaching_rate(self) -> Scalar:
+        """Half of `pull` [1/s]: s' = -b/2 s but for the switching term."""
+        return 0.5 * self.pull()
+
+    def surface(self) -> Float[Array, "1"]:
+        """(c,) [1/s]."""
+        return jnp.reshape(self.surface_rate, 1)
+
+    def influence(self, x: Any, target: Any) -> Scalar:
+        """The factor N, what a unit of disturbance does to 2 eps'' at most."""
+        raise NotImplementedError
+
+    def invert(self, x: Any, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (m,) for which 2 eps'' is `wanted` if the disturbance is d_hat."""
+        raise NotImplementedError
+
+    def motion(self, target: Any, start: Any, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
+        """State and w' for which the error and its derivatives are these; start: the initial state, for branches."""
+        raise NotImplementedError
+
+    def gains(self, t: Scalar, hold: Bool[Array, ""]) -> SurfaceGains:
+        """Gains of the surfaces and of the law at t [s]; `hold`: after the hand-over."""
+        tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
+        return SurfaceGains(
+            c=tau,
+            e=jnp.where(hold, self.surface_rate, self.eta),
+            a=jnp.where(hold, 2.0 * self.surface_rate, 2.0 * (self.eta - 1.0) / tau),
+            b=jnp.where(hold, self.pull(), 2.0 * self.eta / tau**2),
+        )
+
+    def torque(
+        self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector]:
+        """Commanded input by the law above before and after the hand-over, and the sliding variable.
+
+        d_hat: estimated disturbance; k2: K2, bound on the 2-norm of its error.
+        """
+        gains = self.gains(t, hold)
+        error, error_rate = self.errors(x, target)
+        s = gains.c * error_rate + gains.e * error
+        switching = self.influence(x, target) * k2 * guards.smooth_sign(s, self.sign_width)
+        wanted = -switching - gains.a * error_rate - gains.b * s
+        return self.invert(x, target, wanted, d_hat), s

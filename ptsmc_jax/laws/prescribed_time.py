@@ -1,0 +1,252 @@
+"""The paper's prescribed-time sliding mode laws: spacecraft (56)-(60), own plants (29), chains (36)-(40), (52).
+
+Order 2 of the chain is the second-order system (6) with (7), (9), (10) and (24).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ptsmc_jax.laws.base import Motion, Prescribed, SecondOrder
+from ptsmc_jax.laws.error_quaternion import ErrorQuaternion
+from ptsmc_jax.numerics import attitude, guards, matrices
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.plants.integrator_chain import Chain
+from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.plants.second_order import System
+from ptsmc_jax.signals.references import Target
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
+
+
+State = Float[Array, " twice"]
+
+
+@dataclass(frozen=True)
+class _Attitude(SecondOrder):
+    """What both laws for a spacecraft share: K1 acts with an effective gain of K1/2 in (60)."""
+
+    model: Spacecraft  # the nominal plant
+
+    def pull(self) -> Scalar:
+        """K1 of (60) [1/s]: half of what (29)'s K1 does."""
+        return self.k1
+
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
+
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
+        return 0.5 * guards.norm(self.model.inertia_inverse) * k2
+
+
+@pytree
+@dataclass(frozen=True)
+class PrescribedTime(_Attitude):
+    """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
+
+    (56), (57) before and (59), (60) after the hand-over. Besides what `SecondOrder` says: `T` of (1) is both torque and
+    matrix and q both quaternion and its scalar, here the torque is u and the scalar q4. The law is singular at q4 = 0,
+    180 degrees from the inertial frame's identity wherever the reference is, and cannot cross it: `align` chooses the
+    sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the bound grows
+    like 1/q4. Between attitudes on either side of the identity the path leads past it, which may be the long way round:
+    from 150 to -150 degrees about an axis the body turns by 300 degrees. After the hand-over nothing stays "at the
+    origin": the rates are c (`surface_rate`, 1 1/s in the paper) and K1/2.
+    """
+
+    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
+        """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""
+        opposite = x.q[3] * target.q[3] < 0.0
+        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+
+    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+        """q4 counted positive on the reference's side [-]: at 0 the law is singular, beyond it cannot come back."""
+        return jnp.where(target.q[3] < 0.0, -x.q[3], x.q[3])
+
+    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
+        """eps_1 [-] and its derivative [1/s], (4)."""
+        reference_rate, _ = target.vector_rates()
+        v_dot, _ = attitude.vector_rates(x.q, x.w, jnp.zeros(3))
+        return x.q[:3] - target.q[:3], v_dot - reference_rate
+
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T J^-1| of (57) [1/(kg m^2)]."""
+        return guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
+
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 eps_1'' = wanted [1/s^2]: w x J w - d_hat + J T^-1 (wanted + 2 q_1f'' - T' w)."""
+        _, reference_acceleration = target.vector_rates()
+        t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
+        turned = attitude.t_inverse_times(x.q, wanted + 2.0 * reference_acceleration - t_dot_w)
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
+
+    def motion(
+        self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
+    ) -> Motion:
+        """q4^2 = 1 - |v|^2 stands for the clearance; at or below 0 the path leaves the unit ball."""
+        rate_f, acceleration_f = target.vector_rates()
+        q, square = attitude.from_vector_part(target.q[:3] + error, target.q[3])
+        w = 2.0 * attitude.t_inverse_times(q, rate_f + error_rate)
+        turning = 2.0 * (acceleration_f + acceleration) + 0.5 * jnp.dot(w, w) * q[:3]
+        return Motion(AttitudeState(q, w), attitude.t_inverse_times(q, turning), square)
+
+
+@pytree
+@dataclass(frozen=True)
+class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
+    """The same law on the vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
+
+    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2, and
+
+        u = w x J w - d_hat + J (R w_f' - w_e x R w_f) + J T(q_e)^-1 (wanted + |w_e|^2 v / 2).
+
+    Singular only at q_e4 = 0, a true error of 180 degrees, which a run from rest below that never meets; with an
+    initial rate |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough. `align` makes q_e4 positive at t = 0, and it stays so: v
+    and -v lead along the same path, the short way round.
+    """
+
+    def motion(
+        self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
+    ) -> Motion:
+        """q_e4^2 = 1 - |v|^2 stands for the clearance."""
+        q_e, square = attitude.from_vector_part(error, jnp.ones_like(self.t_f))
+        w_e = 2.0 * attitude.t_inverse_times(q_e, error_rate)
+        q = attitude.multiply(target.q, q_e)
+        carried = attitude.rotate(attitude.conjugate(q_e), target.w)
+        x = AttitudeState(q, w_e + carried)
+        _, _, _, feedforward = self.relative(x, target)
+        turning = attitude.t_inverse_times(q_e, 2.0 * acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return Motion(x, feedforward + turning, square)
+
+
+@pytree
+@dataclass(frozen=True)
+class PrescribedTimeSystem(SecondOrder):
+    """Law (29) for a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation.
+
+    x_1 is the error, so F may know the time: a moving reference is part of it. dF/dx2 G must be invertible along the
+    run, and F(t, 0, x_2) = 0 must hold for one x_2 only, which x_2 then goes to. (57) is this law with dF/dx2 = T/2,
+    the disturbance's input matrix J^-1 and its K1 twice the K1 of (29); (29)'s K |dF/dx2| is `influence` / 2 times K2,
+    with the disturbance's own input matrix inside the norm: K2 bounds d, not what it does to x_2'.
+    """
+
+    model: System  # the nominal plant
+
+    def clearance(self, x: State, target: Scalar) -> Scalar:
+        """Det of dF/dx2 G: at 0 the law is singular."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        return matrices.determinant(slope @ gain)
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """The determinant at the start: the ratio does not depend on units."""
+        return first
+
+    def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:
+        """x_1 and F(t, x), (n,) each."""
+        return self.model.position(x), self.model.position_rate(target, x)
+
+    def angle(self, x: State, target: Scalar) -> Scalar:
+        """|x_1|."""
+        return guards.norm(self.model.position(x))
+
+    def influence(self, x: State, target: Scalar) -> Scalar:
+        """2 |dF/dx2 D|."""
+        return 2.0 * guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
+
+    def invert(self, x: State, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
+        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
+
+    def motion(self, target: Scalar, start: State, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
+        """x_2 from F(t, x_1, x_2) = x_1' by Newton's method from the initial x_2: one step where F is linear in x_2."""
+        n = self.model.inputs
+
+        def newton(_: Any, x: State) -> State:
+            off = self.model.position_rate(target, x) - error_rate
+            return jnp.concatenate([error, x[n:] - matrices.solve(self.model.slope(target, x), off)])
+
+        x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n:]]))
+        w_dot = matrices.solve(self.model.slope(target, x), acceleration - self.model.carried(target, x))
+        return Motion(x, w_dot, self.clearance(x, target))
+
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """|dF/dx2 D| K2, the largest over the states that are visited."""
+        times, states = visited
+        return 0.5 * jnp.max(jax.vmap(self.influence)(states, times)) * k2
+
+
+def expansion(eta: Scalar, order: int) -> list[Scalar]:
+    """c_0 .. c_(n-1) of (37) for order n, c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i) [-].
+
+    The paper only calls them expansion parameters (and says "expand (35)" for (36)). Order 2: (eta, 1), which is (7).
+    """
+    rising = [jnp.ones_like(eta)]
+    for k in range(order - 1):
+        rising.append(rising[-1] * (eta + k))
+    return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
+
+
+@pytree
+@dataclass(frozen=True)
+class PrescribedTimeChain(Prescribed):
+    """Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
+
+    For order 2 it is (24) on (6). Differences from the paper: its sums of (38), (40) and (52) run to n-1, but x_(n+1)
+    does not exist: they end at n-2; the s of Theorem 3 lacks the factor (t_f - t)^(eta+n-1) of (36); in (51) "-K s s"
+    must read -K1 s^2; sign(s) is tanh(s / sign_width) (0: exact). The paper's law has no observer, d_hat = 0 and
+    K2 = K; with an observer (Remark 3) its estimate and its bound take their place. With `surface_rate` c the poles of
+    (39) are c times those of a: a_i c^(n-i) stands for a_i, and c = 1 is the paper's.
+    """
+
+    model: Chain  # the nominal plant
+    a: Leaf  # (n-1,) a_1 .. a_(n-1) of (39), whose matrix must be Hurwitz [1/s^(n-i)]
+
+    @property
+    def order(self) -> int:
+        """Order n of the chain."""
+        return self.model.order
+
+    def errors(self, x: Float[Array, " n"], target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+        """x_1 and x_2, (1,) each: the origin is the target."""
+        return x[:1], x[1:2]
+
+    def angle(self, x: Float[Array, " n"], target: Any) -> Scalar:
+        """|x_1|."""
+        return jnp.abs(x[0])
+
+    def torque(
+        self, t: Scalar, hold: Bool[Array, ""], x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector]:
+        """Input (1,) by the first branch of (52) before and the second after the hand-over, and s (37), (39), (1,).
+
+        d_hat: estimated disturbance; k2: bound on its error, K where nothing is estimated.
+        """
+        n = self.order
+        tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
+        c = expansion(self.eta, n)
+        a = self.surface()
+        weights = [jnp.where(hold, held, c[i] * tau**i) for i, held in enumerate([*a, 1.0])]
+        s = jnp.dot(jnp.stack(weights), x)
+        rates = [jnp.where(hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
+        pull = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
+        known = jnp.dot(jnp.stack(rates), x[1:]) + pull * s
+        wanted = -known - k2 * guards.smooth_sign(s, self.sign_width)
+        u = (wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+        return u, jnp.reshape(s, 1)
+
+    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+        """K2."""
+        return k2
+
+    def surface(self) -> Float[Array, " roots"]:
+        """a_i c^(n-i) [1/s^(n-i)]: time runs c times as fast on the surface."""
+        n = self.order
+        return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])

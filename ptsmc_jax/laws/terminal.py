@@ -1,0 +1,33 @@
+"""Nonsingular terminal sliding mode."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from jaxtyping import Array, Float
+
+from ptsmc_jax.laws.comparison import Baseline
+from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+
+Vector = Float[Array, " m"]
+
+
+@pytree
+@dataclass(frozen=True)
+class Terminal(Baseline):
+    """s = v + sig^p(v')/b, alpha = -(b/p) sig^(2-p)(v') - k s - K sign(s), with sig^a(x) = sign(x) |x|^a, 1 < p < 2.
+
+    Feng, Yu, Man, Non-singular terminal sliding mode control of rigid manipulators, Automatica 38(12), 2002. On s = 0 a
+    component is at zero after |v|^(1 - 1/p) p / ((p - 1) b^(1/p)), the later the farther it starts.
+    """
+
+    p: Leaf  # [-]
+    b: Leaf  # [1/s^p]
+    k: Leaf  # [1/s^2]
+    sign_width: Leaf
+    free: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
+
+    def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
+        """As the class says, without K sign(s)."""
+        s = v + guards.signed_power(v_dot, self.p) / self.b
+        return s, -self.b / self.p * guards.signed_power(v_dot, 2.0 - self.p) - self.k * s

@@ -1,0 +1,1 @@
+"""Numerical pieces that the equations are written with: they know nothing of control."""

@@ -1,0 +1,95 @@
+"""Random numbers as a pure function of (seed, trial, name, sample): same values whatever the batch or the device.
+
+Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror, Shaw, SC11, 2011) on plain uint32. The rule, fixed for good:
+    key   = threefry(key=(seed, 0), counter=(trial, crc32(name)))
+    words = threefry(key, counter=(sample, block)), two a block
+    uniform u = (word + 1/2) / 2^32; normals in pairs by Box-Muller, r cos(a) and r sin(a), r from the first word.
+"""
+
+import zlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from ptsmc_jax.numerics import elementary
+
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+
+Word = UInt32[Array, "..."]
+Whole = int | np.integer | Array  # a whole number, negative ones wrap to 32 bits
+
+
+class Key(NamedTuple):
+    """Key of one stream of one trial: two 32-bit words."""
+
+    a: Array
+    b: Array
+
+
+def _word(value: Whole) -> Array:
+    if isinstance(value, int):
+        return jnp.asarray(np.uint32(value & 0xFFFFFFFF))
+    return jnp.asarray(value).astype(jnp.uint32)
+
+
+def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
+    """The two words [-] of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
+    schedule = (key.a, key.b, key.a ^ key.b ^ jnp.uint32(0x1BD11BDA))
+    x, y = counter[0] + schedule[0], counter[1] + schedule[1]
+    for group in range(5):
+        for r in _ROTATIONS[group % 2]:
+            x = x + y
+            y = ((y << r) | (y >> (32 - r))) ^ x
+        x = x + schedule[(group + 1) % 3]
+        y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
+    if jnp.result_type(float) != jnp.float64:  # without 64 bits there is no such number
+        return x, y
+    # packed into one number on the way: XLA then makes one kernel of all rounds, not one of each
+    both = (x.astype(jnp.uint64) << 32) | y.astype(jnp.uint64)
+    return (both >> 32).astype(jnp.uint32), both.astype(jnp.uint32)
+
+
+def stream(seed: Whole, trial: Whole, name: str) -> Key:
+    """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
+    label = jnp.uint32(zlib.crc32(name.encode()))
+    return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
+
+
+def derive(seed: int, name: str) -> int:
+    """Another seed, from 0 to 2^32 - 1, that follows from this one and a name (concrete, for whole studies)."""
+    return int(stream(seed, 0, name).a)
+
+
+def _pairs(key: Key, sample: Whole, count: int) -> tuple[Word, Word]:
+    """The words of so many numbers, two a block: (blocks,) each."""
+    blocks = jnp.arange((count + 1) // 2, dtype=jnp.uint32)
+    number = _word(sample)
+    # a loop over the blocks: the same work, but less code to compile
+    return jax.lax.map(lambda block: threefry(key, (number, block)), blocks)
+
+
+def _unit(word: Array) -> Array:
+    kind = jnp.result_type(float)
+    below_one = np.nextafter(kind.type(1.0), kind.type(0.0))  # float32 would round the largest words up to 1
+    return jnp.minimum((word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32), below_one)
+
+
+def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
+    """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits).
+
+    >>> key = stream(seed=0, trial=7, name="attitude_noise")
+    >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
+    True
+    """
+    return _unit(jnp.stack(_pairs(key, sample, count), axis=1).reshape(-1)[:count])
+
+
+def normals(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
+    """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
+    a, b = _pairs(key, sample, count)
+    radius = jnp.sqrt(-2.0 * elementary.log(_unit(a)))
+    pairs = jnp.stack([radius * part for part in elementary.cos_sin_turns(_unit(b))], axis=1)
+    return pairs.reshape(-1)[:count]

@@ -1,0 +1,119 @@
+"""Integrators: Runge and Kutta's of order 4, plain and exponential, and the phi functions of the latter."""
+
+from collections.abc import Callable
+from math import factorial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics.matrices import row_norm
+
+Scalar = Float[Array, ""]
+
+
+def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> Any:
+    """State at t + dt by one step of the classical Runge-Kutta method of order 4.
+
+    rate(t, y) returns dy/dt as a pytree like y; t, dt [s].
+    """
+
+    def ahead(slope: Any, step: Scalar) -> Any:
+        return jax.tree.map(lambda y, k: y + step * k, y, slope)
+
+    k1 = rate(t, y)
+    k2 = rate(t + dt / 2, ahead(k1, dt / 2))
+    k3 = rate(t + dt / 2, ahead(k2, dt / 2))
+    k4 = rate(t + dt, ahead(k3, dt))
+    return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
+
+
+_TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
+
+
+_DOUBLINGS = 40  # norms up to 2^39
+
+
+_FEW = 4  # of them
+
+
+def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = None) -> list[Float[Array, "n n"]]:
+    """phi_0(x) = e^x and phi_1 .. phi_order, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x, of a square matrix [-].
+
+    Scaling and doubling, phi_k(2x) = 2^-k (phi_0 phi_k + sum_(j=1..k) phi_j / (k-j)!) (Skaflestad and Wright, Applied
+    Numerical Mathematics 59, 2009): nothing cancels for small x, eigenvalues may repeat, and no LAPACK is called, whose
+    batched solves were seen to lock up when two of them shared a small thread pool. largest: `row_norm` of the largest
+    of many matrices, which then take as many doublings as that one and no more.
+    """
+    one = jnp.eye(x.shape[-1], dtype=x.dtype)
+    size = jax.lax.stop_gradient(row_norm(x) if largest is None else largest)
+    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
+    small = x * 2.0**-doublings
+    top = one / float(factorial(order + _TERMS))
+    for k in range(_TERMS - 1, -1, -1):
+        top = one / float(factorial(order + k)) + small @ top
+    phi = [top]
+    for k in range(order - 1, -1, -1):
+        phi.insert(0, one / factorial(k) + small @ phi[0])
+
+    def step(k: Any, phi: list[Array]) -> list[Array]:
+        return jax.lax.cond(k < doublings, _double, lambda phi: phi, phi)
+
+    # a loop of fixed length can be run backwards; few matrices need more than the first doublings
+    phi = jax.lax.fori_loop(0, _FEW, step, phi)
+    return jax.lax.cond(
+        doublings > _FEW, lambda phi: jax.lax.fori_loop(_FEW, _DOUBLINGS, step, phi), lambda phi: phi, phi
+    )
+
+
+def _double(phi: list[Array]) -> list[Array]:
+    """phi_k(2x) from phi_k(x)."""
+    return [
+        (phi[0] @ phi[k] + sum((phi[j] / factorial(k - j) for j in range(1, k + 1)), 0.0 * phi[0])) / 2**k
+        for k in range(len(phi))
+    ]
+
+
+class Decay(NamedTuple):
+    """What one step of `etdrk4` needs of the linear part -A over a step dt: matrices (n, n) [- or s]."""
+
+    half: Array  # e^(-A dt/2)
+    full: Array  # e^(-A dt)
+    stage: Array  # dt/2 phi_1(-A dt/2) [s]
+    ends: tuple[Array, Array, Array]  # weights of the forcing at the start, the middle (twice) and the end [s]
+
+
+def decay(a: Float[Array, "n n"], dt: Scalar, largest: Scalar | None = None) -> Decay:
+    """Coefficients of Cox and Matthews, J. Comput. Phys. 176 (2002), eqs. (26)-(29), for m' = -A m + forcing.
+
+    largest: `row_norm` of a dt for the largest of many steps that this one is among; see `phi_functions`.
+    """
+    halves = phi_functions(-a * dt / 2, 3, None if largest is None else largest / 2)
+    half, phi_half, *_ = halves
+    full, p1, p2, p3 = _double(halves)
+    ends = (dt * (p1 - 3 * p2 + 4 * p3), dt * 2 * (p2 - 2 * p3), dt * (4 * p3 - p2))
+    return Decay(half, full, dt / 2 * phi_half, ends)
+
+
+def etdrk4(rate: Callable, linear: Decay, t: Scalar, y: Any, m: Float[Array, " n"], dt: Scalar) -> tuple:
+    """One step of order 4 of y' = f(t, y, m), m' = -A m + g(t, y, m), exact in A: (y, m) at t + dt and stage outputs.
+
+    rate(t, y, m) returns (f, g, aux). With A = 0 it is `rk4`; however stiff A is, the step stays stable and exact
+    for a constant g. Returned besides: aux of the first and the third stage (start and middle of the step).
+    """
+
+    def ahead(slope: Any, step: Scalar) -> Any:
+        return jax.tree.map(lambda y, k: y + step * k, y, slope)
+
+    f1, g1, start = rate(t, y, m)
+    m2 = linear.half @ m + linear.stage @ g1
+    f2, g2, _ = rate(t + dt / 2, ahead(f1, dt / 2), m2)
+    m3 = linear.half @ m + linear.stage @ g2
+    f3, g3, middle = rate(t + dt / 2, ahead(f2, dt / 2), m3)
+    m4 = linear.half @ m2 + linear.stage @ (2 * g3 - g1)
+    f4, g4, _ = rate(t + dt, ahead(f3, dt), m4)
+    w1, w2, w4 = linear.ends
+    m_next = linear.full @ m + w1 @ g1 + w2 @ (g2 + g3) + w4 @ g4
+    y_next = jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, f1, f2, f3, f4)
+    return y_next, m_next, start, middle

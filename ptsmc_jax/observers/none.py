@@ -1,0 +1,46 @@
+"""No observer: the estimate is zero, and K switches against the whole disturbance."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.observers.base import ErrorBound, Observer
+
+Matrix = Float[Array, "k k"]
+Memory = Float[Array, " memory"]
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
+
+
+@pytree
+@dataclass(frozen=True)
+class NoObserver(Observer):
+    """No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
+
+    K of Assumption 1 bounds each component of d; the law scales the 2-norm of what it does not know, so K2 = sqrt(m) K.
+    """
+
+    disturbance_bound: Leaf  # K of Assumption 1 [N m]
+
+    def error_bound(self) -> ErrorBound:
+        """sqrt(m) K at all times."""
+        bound = jnp.sqrt(float(self.model.inputs)) * self.disturbance_bound
+        return ErrorBound(jnp.zeros_like(bound), bound, bound)
+
+    def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
+        """Zero."""
+        return jnp.zeros((self.model.inputs, self.model.inputs))
+
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
+        """Zero."""
+        return jnp.zeros_like(memory)
+
+    def update_matrix(self, dt: Scalar) -> Matrix:
+        """Zero."""
+        return jnp.zeros((self.model.inputs, self.model.inputs))
+
+    def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
+        """The estimate stays what it is."""
+        return memory

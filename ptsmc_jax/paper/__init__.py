@@ -1,0 +1,1 @@
+"""The paper's cases, claims, slips and Remark 2, measured."""

@@ -1,0 +1,237 @@
+"""The paper's slips that a number can show; the others are named in the docstrings of the laws that they touch."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from ptsmc_jax.campaigns import runs
+from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.numerics.pytrees import pytree
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.paper import claims
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.scenario import from_tables, study
+from ptsmc_jax.theory import rules
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A slip or gap of the paper, what it must be, and what shows it."""
+
+    where: str
+    paper: str
+    correct: str
+    shown: str
+    values: dict[str, float]
+
+
+def shown(flown: dict[str, Run]) -> list[Slip]:
+    """Each slip with what shows it; flown: what `claims.fly_cases` returns."""
+    return [
+        _expansion(),
+        _theorem_3(),
+        _missing_term(),
+        _factor_of_the_bound([flown[name] for name in claims.SPACECRAFT]),
+        _decay_of_the_bound(),
+        _initial_estimate(),
+        _effective_gain(),
+        _sign_of_q4(),
+        _grows_like_one_over_q4(),
+    ]
+
+
+def _expansion() -> Slip:
+    """(36) by automatic differentiation against (37) with the c_i."""
+    t_f, eta, t = 5.0, 4.3, 1.7
+
+    def x(time: Any) -> Any:
+        return 2.0 - 0.7 * time + 0.3 * time**2 - 0.1 * time**3
+
+    worst = 0.0
+    for n in (2, 3, 4, 5):
+        derivative, states = (lambda time: x(time) / (t_f - time) ** eta), x
+        whole = [x(t)]
+        for _ in range(n - 1):
+            derivative, states = jax.grad(derivative), jax.grad(states)
+            whole.append(states(t))
+        c = prescribed_time.expansion(jnp.asarray(eta), n)
+        tau = t_f - t
+        s = sum(c[i] * tau**i * whole[i] for i in range(n))
+        worst = max(worst, abs(float(derivative(t) * tau ** (eta + n - 1) / s - 1.0)))
+    return Slip(
+        "(37), (38), (40)",
+        'c_i is an "expansion parameter", sums of (38) and (40) end at n-1',
+        "c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i); the sums end at n-2, x_(n+1) does not exist",
+        f"orders 2 to 5: (37) with these c_i is (36) to {worst:.0e}",
+        {"largest_relative_difference": worst},
+    )
+
+
+def _theorem_3() -> Slip:
+    tables = claims.CASES["third_order"][2]
+    quiet = {"disturbance": {"kind": "none"}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
+    run = runs.fly(study(from_tables({**tables, **quiet})))
+    law, n = run.parts.controller, run.parts.controller.order
+    before = run.log.t < float(law.hand_over)
+    tau = float(law.t_f) - run.log.t[before]
+    bare = np.abs(run.log.s[before, 0]) / tau ** (float(law.eta) + n - 1)
+    growth = float(np.interp(-0.05, -tau, bare) / bare[0])
+    return Slip(
+        "Theorem 3",
+        "s = d^(n-1)/dt^(n-1) (x_1 / (t_f - t)^eta)",
+        "times (t_f - t)^(eta+n-1), as in (36)",
+        f"without the factor s grows like 1 / (t_f - t): {growth:.0f} times its first value 0.05 s before t_f = 5 s",
+        {"growth": growth},
+    )
+
+
+def _missing_term() -> Slip:
+    """X'' = -K1 s - F with and without F = x', from s = 0: x = 1, x' = -1, K1 = 1."""
+
+    def largest(factor: float) -> float:
+        def rate(_: float, y: np.ndarray) -> list[float]:
+            return [y[1], -(y[0] + y[1]) - factor * y[1]]
+
+        flown = solve_ivp(rate, (0.0, 10.0), [1.0, -1.0], rtol=1e-10, atol=1e-12)
+        return float(np.abs(flown.y.sum(axis=0)).max())
+
+    kept, left = largest(1.0), largest(0.0)
+    return Slip(
+        "(29), second branch",
+        "no term for the x_1' of s = x_1 + x_1'",
+        "F(x) inside the bracket, as (10) has x_2 and (60) 2 eps_1'",
+        f"from x_1 = 1 on the surface s = 0: |s| stays {kept:.0e} with it and reaches {left:.2f} without",
+        {"with": kept, "without": left},
+    )
+
+
+def _over_bound(run: Run, start: float) -> float:
+    """Largest estimation error over K2 later than `start` [s]."""
+    error = np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
+    bound = np.asarray(jax.vmap(run.parts.observer.error_bound())(jnp.asarray(run.log.t)))
+    later = run.log.t > start
+    return float((error[later] / bound[later]).max())
+
+
+def _factor_of_the_bound(cases: list[Run]) -> Slip:
+    corrected = max(_over_bound(run, 0.0) for run in cases)
+    printed = corrected * 3**0.5
+    return Slip(
+        "(55)",
+        "c bounds the components of d', and the 2-norm of the error by c / l_m",
+        "sqrt(3) c",
+        f"Cases I and II: the error reaches {printed:.2f} times the bound as printed, {corrected:.4f} of this one",
+        {"over_printed": printed, "over_corrected": corrected},
+    )
+
+
+def _decay_of_the_bound() -> Slip:
+    inertia = np.array([[12.0, 5.0, -2.0], [5.0, 11.0, 2.0], [-2.0, 2.0, 14.0]])
+    gain = np.array([10.0, 10.0, 10.0])
+    a = gain[:, None] * np.linalg.inv(inertia)
+    printed = float(np.diag(a).min())
+    bound = nonlinear.NonlinearObserver(
+        rigid_body.spacecraft(inertia), jnp.asarray(gain), jnp.asarray(0.0), jnp.asarray(1.0)
+    ).error_bound()
+    left = np.linalg.norm(expm(-10.0 * a), 2)
+    return Slip(
+        "(55)",
+        "l_m is the smallest diagonal element of l J^-1",
+        "the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound times sqrt(cond(l))",
+        f"a body with products of inertia: after 10 s the error is {left / np.exp(-10 * printed):.1f} times the "
+        f"paper's bound, {left / float(bound(jnp.asarray(10.0))):.4f} of the corrected one",
+        {"printed": printed, "corrected": float(bound.rate)},
+    )
+
+
+def _initial_estimate() -> Slip:
+    tables = {"disturbance": {"kind": "constant"}}
+    run = runs.fly(study(from_tables(tables)))
+    wide = runs.fly(study(from_tables({**tables, "controller": {"initial_estimate_error": 0.01 * 3**0.5}})))
+    ratios = [_over_bound(run, 1.0), _over_bound(wide, 1.0)]
+    return Slip(
+        "(57)",
+        "K2 needs |e_d(0)|, which no controller knows",
+        "an input, `initial_estimate_error`; 0 is right only where d(0) = d_hat(0)",
+        f"a constant disturbance of 0.01 N m: the error is up to {ratios[0]:.1f} times K2 from 1 s on with 0, "
+        f"{ratios[1]:.3f} of it with the true bound",
+        {"with_0": ratios[0], "with_true_bound": ratios[1]},
+    )
+
+
+def _effective_gain() -> Slip:
+    tables = {
+        "disturbance": {"kind": "none"},
+        "controller": {"disturbance_rate_bound": 0.0, "delta": 5.0, "k1": 1.6},
+    }
+    run = runs.fly(study(from_tables(tables)))
+    hold = (run.log.t > 26.0) & (run.log.t < 34.0)
+    rate = -float(np.polyfit(run.log.t[hold], np.log(np.linalg.norm(run.log.s[hold], axis=1)), 1)[0])
+    return Slip(
+        "(60)",
+        "K1",
+        "its effective gain is K1 / 2: s' = -K1 s / 2",
+        f"K1 = 1.6: s decays at {rate:.4f} 1/s after the hand-over",
+        {"k1": 1.6, "rate": rate},
+    )
+
+
+@pytree
+@dataclass(frozen=True)
+class _Unaligned(prescribed_time.PrescribedTime):
+    """The law as printed: the sign of q is taken as it comes."""
+
+    def align(self, x: rigid_body.AttitudeState, target: Any) -> rigid_body.AttitudeState:
+        return x
+
+    def clearance(self, x: rigid_body.AttitudeState, target: Any) -> Any:
+        return jnp.abs(x.q[3])
+
+
+def _sign_of_q4() -> Slip:
+    tables = {
+        "initial": {"quat_xyzw": [0.0, 0.0, 0.0, -1.0]},
+        "reference": {"rotvec_deg": [0.0, 0.0, 60.0]},
+        "disturbance": {"kind": "none"},
+        "controller": {"disturbance_rate_bound": 0.0},
+    }
+    ready = study(from_tables(tables))
+    law = ready.parts.controller
+    printed = _Unaligned(law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width, law.surface_rate)
+    found = []
+    for controller in (printed, law):
+        run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))
+        k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])
+        off = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))
+        found.append((float(np.linalg.norm(run.log.error[k])), float(np.rad2deg(off))))
+    return Slip(
+        "4",
+        "any sign of q",
+        "the sign of q4 at t = 0 must be that of q_f4: the law cannot cross q4 = 0",
+        f"a slew of 60 degrees from the other sign of q: eps_1 = {found[0][0]:.0e} at t_f, {found[0][1]:.0f} degrees "
+        f"away from the reference; from the right one {found[1][1]:.0e} degrees",
+        {"error": found[0][0], "angle_deg": found[0][1], "aligned_angle_deg": found[1][1]},
+    )
+
+
+def _grows_like_one_over_q4() -> Slip:
+    inertia = jnp.diag(jnp.asarray([10.0, 12.0, 14.0]))
+    peaks = {}
+    for angle in (90.0, 170.0, 179.0):
+        q = attitude.from_rotation_vector(jnp.deg2rad(angle) * jnp.asarray([0.0, 0.0, 1.0]))
+        torque = rules.first_torque(inertia, q, jnp.asarray(3.0), jnp.asarray(30.0))
+        peaks[f"{angle:g}"] = float(jnp.abs(torque).max())
+    return Slip(
+        "Theorem 2, Section 4",
+        "bounded control, globally",
+        "singular at q4 = 0, 180 degrees from the inertial frame's identity; the bound grows like 1 / q4",
+        f"first torque about axis 3 from 90, 170, 179 degrees: {', '.join(f'{v:.3g}' for v in peaks.values())} N m",
+        peaks,
+    )

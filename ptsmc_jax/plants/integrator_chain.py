@@ -1,0 +1,77 @@
+"""The chain of integrators of (6), (35)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics.pytrees import pytree
+from ptsmc_jax.plants.base import Plant, called
+
+Scalar = Float[Array, ""]
+
+
+@pytree
+@dataclass(frozen=True)
+class Chain(Plant):
+    """Integrator chain (35) of any order n >= 2: x_i' = x_(i+1), x_n' = f(x) + g(x) u + d; order 2 is (6).
+
+    Its state is (n,). f and g are pytrees that are called, such as `jax.tree_util.Partial(function, parameters)`,
+    x (n,) -> scalar; None: f = 0, g = 1. Build it with `chain`.
+    """
+
+    order: int = field(metadata={"static": True})
+    f: Any = None
+    g: Any = None
+
+    @property
+    def inertia(self) -> Float[Array, "1 1"]:
+        """1: the disturbance of (35) is an acceleration of x_n."""
+        return jnp.ones((1, 1))
+
+    inertia_inverse = inertia
+
+    def drift(self, x: Float[Array, " n"]) -> Float[Array, "1"]:
+        """f(x), (1,)."""
+        return jnp.zeros(1) if self.f is None else jnp.reshape(self.f(x), 1)
+
+    def input_gain(self, x: Float[Array, " n"]) -> Float[Array, "1"]:
+        """g(x), (1,)."""
+        return jnp.ones(1) if self.g is None else jnp.reshape(self.g(x), 1)
+
+    def velocity(self, x: Float[Array, " n"]) -> Float[Array, "1"]:
+        """x_n, (1,)."""
+        return x[-1:]
+
+    def known(self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"]) -> Float[Array, "1"]:
+        """f(x) + g(x) u, (1,)."""
+        return self.drift(x) + self.input_gain(x) * u
+
+    def rate(
+        self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"], disturbance: Float[Array, "1"]
+    ) -> Float[Array, " n"]:
+        """Time derivative of the state, (35)."""
+        return jnp.concatenate([x[1:], self.known(t, x, u) + disturbance])
+
+    def input_for(
+        self, t: Scalar, x: Float[Array, " n"], w_dot: Float[Array, "1"], d: Float[Array, "1"]
+    ) -> Float[Array, "1"]:
+        """(x_n' - f(x) - d) / g(x)."""
+        return (w_dot - d - self.drift(x)) / self.input_gain(x)
+
+    def speed(self, x: Float[Array, " n"]) -> Scalar:
+        """|x_2| = |x_1'|."""
+        return jnp.abs(x[1])
+
+    def columns(self, x: Any) -> dict[str, Any]:
+        """The states x1..xn."""
+        return {"x": x}
+
+
+def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> Chain:
+    """Integrator chain; f, g: see `Chain`, plain functions are wrapped. Raises ValueError where order is below 2."""
+    if order < 2:
+        raise ValueError(f"order is {order}, but must be at least 2")
+    return Chain(order, called(f), called(g))

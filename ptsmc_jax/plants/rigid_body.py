@@ -1,0 +1,92 @@
+"""The rigid spacecraft of (1), (2), with reaction wheels."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.formulas import check_inertia
+from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.plants.base import Plant
+
+Scalar = Float[Array, ""]
+
+
+class AttitudeState(NamedTuple):
+    """State of a rigid spacecraft."""
+
+    q: Array  # (4,) unit quaternion, scalar last, body relative to inertial [-]
+    w: Array  # (3,) body rate in body axes [rad/s]
+
+
+@pytree
+@dataclass(frozen=True)
+class Spacecraft(Plant):
+    """Rigid spacecraft, J w' = -w x J w + u + d (2); build it with `spacecraft`, which checks the inertia."""
+
+    inertia: Leaf  # (3, 3) J [kg m^2]
+    inertia_inverse: Leaf  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
+
+    def gyroscopic(self, w: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The torque w x J w [N m]."""
+        return jnp.cross(w, self.inertia @ w)
+
+    def velocity(self, x: AttitudeState) -> Float[Array, "3"]:
+        """The rate w [rad/s]; of a derivative, w' [rad/s^2]."""
+        return x.w
+
+    def known(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
+        """J w' without the disturbance, u - w x J w [N m]."""
+        return u - self.gyroscopic(x.w)
+
+    def rate(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
+        """Time derivative of the state under torque and disturbance [N m], (1) and (2)."""
+        w_dot = self.inertia_inverse @ (u + disturbance - self.gyroscopic(x.w))
+        return AttitudeState(attitude.derivative(x.q, x.w), w_dot)
+
+    def input_for(
+        self, t: Scalar, x: AttitudeState, w_dot: Float[Array, "3"], d: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """J w' + w x J w - d [N m]."""
+        return self.inertia @ w_dot + self.gyroscopic(x.w) - d
+
+    def normalise(self, x: AttitudeState) -> AttitudeState:
+        """The state with |q| = 1 again."""
+        return AttitudeState(attitude.normalise(x.q), x.w)
+
+    def moved(self, x: AttitudeState, by: Float[Array, "6"]) -> AttitudeState:
+        """The state turned by a small rotation in body axes [rad], its rate changed [rad/s]."""
+        return AttitudeState(attitude.multiply(x.q, attitude.from_rotation_vector(by[:3])), x.w + by[3:])
+
+    def apart(self, x: AttitudeState, other: AttitudeState) -> Float[Array, "6"]:
+        """Small rotation in body axes [rad] and change of the rate [rad/s]."""
+        return jnp.concatenate([2.0 * attitude.multiply(attitude.conjugate(x.q), other.q)[:3], other.w - x.w])
+
+    def speed(self, x: AttitudeState) -> Scalar:
+        """|w| [rad/s]."""
+        return guards.norm(x.w)
+
+    def momentum(self, x: AttitudeState) -> Float[Array, "3"]:
+        """Angular momentum in body axes, J w [N m s]."""
+        return self.inertia @ x.w
+
+    def too_fast(self, x: AttitudeState, dt: Scalar) -> Array:
+        """Whether the body turns more than 1 rad in a step of dt [s]."""
+        return jnp.sum(x.w * x.w) * dt * dt > 1.0
+
+    def columns(self, x: AttitudeState) -> dict[str, Any]:
+        """Quaternion q1..q4 and body rate w1..w3 [rad/s]."""
+        return {"q": x.q, "w": x.w}
+
+
+def spacecraft(inertia: object) -> Spacecraft:
+    """Spacecraft from three principal moments or a symmetric (3, 3) tensor [kg m^2].
+
+    Raises ValueError where no rigid body can have it: not symmetric, not positive definite, or one principal moment
+    larger than the sum of the other two.
+    """
+    tensor = check_inertia(inertia)
+    return Spacecraft(jnp.asarray(tensor), jnp.asarray(np.linalg.inv(tensor)))

@@ -1,0 +1,146 @@
+"""Second-order systems (25) of one's own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics import guards, matrices
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.plants.base import Plant, called
+
+Scalar = Float[Array, ""]
+
+
+@pytree
+@dataclass(frozen=True)
+class System(Plant):
+    """Second-order system (25) of one's own: x_1' = F, x_2' = H + G u + D d; all are functions of (t, x_1, x_2).
+
+    x_1, x_2, u and d are (n,), the state (2n,) is x_1 followed by x_2. Time is an argument, since x_1 is an error:
+    where the reference moves, F knows it. Its M is D^-1. Build it with `system`.
+    """
+
+    F: Any  # -> (n,)
+    H: Any  # -> (n,)
+    G: Any  # -> (n, n)
+    D: Any  # -> (n, n), or None for the identity
+    inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
+    inertia_inverse: Leaf  # (n, n)
+
+    def _at(self, function: Any, t: Scalar, x: Float[Array, " twice"]) -> Array:
+        n = self.inputs
+        return function(t, x[:n], x[n:])
+
+    def position(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_1."""
+        return x[: self.inputs]
+
+    def velocity(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_2."""
+        return x[self.inputs :]
+
+    def position_rate(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """x_1' = F."""
+        return self._at(self.F, t, x)
+
+    def slope(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """dF/dx2."""
+        n = self.inputs
+        return jax.jacfwd(self.F, argnums=2)(t, x[:n], x[n:])
+
+    def carried(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """What of x_1'' no acceleration makes: dF/dt + dF/dx1 F."""
+        n = self.inputs
+        x_1, x_2 = x[:n], x[n:]
+        moved = (jnp.ones_like(t), self.F(t, x_1, x_2))
+        return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), moved)[1]
+
+    def drift(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """H."""
+        return self._at(self.H, t, x)
+
+    def input_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """G."""
+        return self._at(self.G, t, x)
+
+    def disturbance_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """D."""
+        return jnp.eye(self.inputs) if self.D is None else self._at(self.D, t, x)
+
+    def mass(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """D^-1."""
+        one = jnp.eye(self.inputs)
+        return one if self.D is None else matrices.solve(self.disturbance_gain(t, x), one)
+
+    def known(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
+        """D^-1 (H + G u)."""
+        driven = self.drift(t, x) + self.input_gain(t, x) @ u
+        return driven if self.D is None else matrices.solve(self.disturbance_gain(t, x), driven)
+
+    def rate(
+        self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
+    ) -> Float[Array, " twice"]:
+        """Time derivative of the state, (25)."""
+        driven = self.drift(t, x) + self.input_gain(t, x) @ u + self.disturbance_gain(t, x) @ disturbance
+        return jnp.concatenate([self.position_rate(t, x), driven])
+
+    def input_for(
+        self, t: Scalar, x: Float[Array, " twice"], w_dot: Float[Array, " n"], d: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """G^-1 (x_2' - H - D d)."""
+        driven = w_dot - self.drift(t, x) - self.disturbance_gain(t, x) @ d
+        return matrices.solve(self.input_gain(t, x), driven)
+
+    def speed(self, x: Float[Array, " twice"]) -> Scalar:
+        """|x_2|."""
+        return guards.norm(self.velocity(x))
+
+    def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
+        """The matrix dx'/dx at an input that is held: its eigenvalues are what integration steps must follow [1/s]."""
+        return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
+
+    def columns(self, x: Any) -> dict[str, Any]:
+        """The states x_1 and x_2, one after the other."""
+        return {"x": x}
+
+
+def system(
+    n: int,
+    F: Callable,
+    H: Callable,
+    G: Callable,
+    D: Callable | None = None,
+    inertia: object = None,
+) -> System:
+    """Second-order system (25) with n inputs from JAX functions of (t, x_1, x_2); see `System`.
+
+    F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None, and must be
+    invertible for any observer. inertia: (n, n), symmetric and positive definite, that observers read their gains
+    against (A = l inertia^-1), the identity if None: gains are then in 1/s. Raises ValueError where a function does not
+    take such arguments or returns another shape.
+    """
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(f"n is {n}, but must be a whole number of at least 1")
+    one = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    vector = jax.ShapeDtypeStruct((n,), one.dtype)
+    for name, function, shape in (("F", F, (n,)), ("H", H, (n,)), ("G", G, (n, n)), ("D", D, (n, n))):
+        if function is None:
+            continue
+        try:
+            returned = jax.eval_shape(function, one, vector, vector)
+        except Exception as error:
+            said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {said}") from error
+        got = getattr(returned, "shape", type(returned).__name__)
+        if got != shape:
+            raise ValueError(f"{name}(t, x_1, x_2) returns {got}, but for n = {n} must return an array {shape}")
+    scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
+    definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
+    if not definite:
+        raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
+    return System(called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale)))

@@ -1,0 +1,30 @@
+"""Scenarios: read, checked as a whole and changed without JAX (`reading`); turned into what is flown (`flyable`)."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
+    from ptsmc_jax.scenario.flyable import Study as Study
+    from ptsmc_jax.scenario.flyable import catalogue as catalogue
+    from ptsmc_jax.scenario.flyable import margin_requirements as margin_requirements
+    from ptsmc_jax.scenario.flyable import requirements as requirements
+    from ptsmc_jax.scenario.flyable import study as study
+    from ptsmc_jax.scenario.reading import from_tables as from_tables
+    from ptsmc_jax.scenario.reading import read as read
+    from ptsmc_jax.scenario.reading import replace as replace
+    from ptsmc_jax.scenario.tables import Scenario as Scenario
+
+_EXPORTS = {
+    **dict.fromkeys(("Study", "catalogue", "margin_requirements", "requirements", "study"), "flyable"),
+    **dict.fromkeys(("from_tables", "read", "replace"), "reading"),
+    "ScenarioError": "errors",
+    "Scenario": "tables",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loaded when first used: reading a scenario does not load JAX."""
+    if name in _EXPORTS:
+        return getattr(importlib.import_module(f"ptsmc_jax.scenario.{_EXPORTS[name]}"), name)
+    raise AttributeError(f"module 'ptsmc_jax.scenario' has no attribute {name!r}")

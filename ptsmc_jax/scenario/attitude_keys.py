@@ -1,0 +1,78 @@
+"""Attitudes as a scenario file gives them: every key turned into a unit quaternion, or refused."""
+
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.scenario import errors, signal_tables
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+
+
+def unit(key: str, value: Any) -> np.ndarray:
+    """A quaternion of a scenario, normalised; refused where it is not a unit one already."""
+    array = np.array(value, dtype=float)
+    length = np.linalg.norm(array)
+    if abs(length - 1.0) > 1e-6:
+        raise wrong(key, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
+    return array / length
+
+
+def turn(table: signal_tables.SlewReference) -> np.ndarray:
+    """Rotation vector of a slew from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    start, end = quaternion(table, "reference"), unit("reference.to_quat_xyzw", table.to_quat_xyzw)
+    short = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+    angle = np.linalg.norm(short)
+    return short * (1.0 - 2.0 * np.pi / angle) if table.way == "long" and angle > 0.0 else short
+
+
+def quaternion(table: signal_tables.Attitude, name: str) -> np.ndarray:
+    """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
+    key, value = attitude_key(table)
+    full = f"{name}.{key}"
+    if table.sequence is not None and key != "euler_deg":
+        raise ScenarioError(f"{name}.sequence is {errors.brief(table.sequence)}, but goes with euler_deg only")
+    if key in ("quat_xyzw", "quat_wxyz"):
+        given = unit(full, value)
+        return given if key == "quat_xyzw" else np.roll(given, -1)
+    with np.errstate(all="ignore"):  # of numbers too large to be turned by, which are refused
+        found = _turned(table, name, full, np.array(value, dtype=float))
+    if not abs(np.linalg.norm(found) - 1.0) < 1e-6:
+        raise wrong(full, value, "an attitude in numbers whose squares are finite")
+    return found
+
+
+def _turned(table: signal_tables.Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
+    """The attitude of a key that holds no quaternion, as one."""
+    from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
+
+    key = full.removeprefix(f"{name}.")
+    if key == "rotvec_deg":
+        return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
+    if key == "mrp":
+        return Rotation.from_mrp(array).as_quat(canonical=True)
+    if key == "dcm_body_to_inertial":
+        off = np.abs(array @ array.T - np.eye(3)).max()
+        if not off <= 1e-6 or np.linalg.det(array) < 0:
+            raise wrong(full, array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
+        return Rotation.from_matrix(array).as_quat(canonical=True)
+    if table.sequence is None:
+        raise ScenarioError(f'{full} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"')
+    try:
+        return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
+    except ValueError:
+        raise wrong(
+            f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
+        ) from None
+
+
+def has_attitude(table: signal_tables.Attitude) -> bool:
+    """Whether a table gives an attitude at all."""
+    return any(getattr(table, key) is not None for key in signal_tables.ATTITUDE_KEYS)
+
+
+def attitude_key(table: signal_tables.Attitude) -> tuple[str, Any]:
+    """The attitude key that a table uses, and its value."""
+    key = next(key for key in signal_tables.ATTITUDE_KEYS if getattr(table, key) is not None)
+    return key, getattr(table, key)

@@ -1,0 +1,192 @@
+"""The tables of a scenario file that say what is drawn for each trial."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Table
+
+
+class UniformAttitude(Table, frozen=True):
+    """Any attitude at all, uniform on SO(3)."""
+
+    kind: Literal["uniform"] = "uniform"
+
+
+class AxisAngle(Table, frozen=True):
+    """A uniform angle about any axis: a body's from the reference at t = 0, a reference's from its own attitude.
+
+    Attributes:
+        min_deg: smallest angle [deg]
+        max_deg: largest angle [deg]
+    """
+
+    kind: Literal["axis_angle"] = "axis_angle"
+    min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
+    max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
+
+
+class NormalAttitude(Table, frozen=True):
+    """Turned by a normal rotation vector from what the scenario says.
+
+    Attributes:
+        std_deg: 1 sigma per axis [deg]
+    """
+
+    kind: Literal["normal"] = "normal"
+    std_deg: NotNegative = 1.0
+
+
+class NormalRate(Table, frozen=True):
+    """Each axis normal about initial.rate.
+
+    Attributes:
+        std: 1 sigma per axis [rad/s]
+    """
+
+    kind: Literal["normal"] = "normal"
+    std: NotNegative = 0.01
+
+
+class UniformRate(Table, frozen=True):
+    """Each axis uniform about initial.rate.
+
+    Attributes:
+        half_width: largest deviation per axis [rad/s]
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: NotNegative = 0.01
+
+
+class RelativeInertia(Table, frozen=True):
+    """The true body's principal moments off by a normal share, truncated at three sigma and to what a body can have.
+
+    Attributes:
+        std: 1 sigma of the share
+        axes_deg: 1 sigma of the small rotation of the principal axes [deg]
+    """
+
+    kind: Literal["relative_normal"] = "relative_normal"
+    std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
+    axes_deg: NotNegative = 0.0
+
+
+class UniformPhase(Table, frozen=True):
+    """Uniform over the circle."""
+
+    kind: Literal["uniform"] = "uniform"
+
+
+class RelativeNormal(Table, frozen=True):
+    """Times 1 + a normal number, truncated at three sigma.
+
+    Attributes:
+        std: 1 sigma of the share
+    """
+
+    kind: Literal["relative_normal"] = "relative_normal"
+    std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
+
+
+class RelativeUniform(Table, frozen=True):
+    """Times 1 + a uniform number.
+
+    Attributes:
+        half_width: largest share
+    """
+
+    kind: Literal["relative_uniform"] = "relative_uniform"
+    half_width: Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")] = 0.2
+
+
+class NormalBias(Table, frozen=True):
+    """Normal about what [disturbance] says.
+
+    Attributes:
+        std: 1 sigma of each component [N m, or unit of d]
+    """
+
+    kind: Literal["normal"] = "normal"
+    std: NotNegative = 1e-3
+
+
+class UniformBias(Table, frozen=True):
+    """Uniform about what [disturbance] says.
+
+    Attributes:
+        half_width: largest deviation of each component [N m, or unit of d]
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: NotNegative = 1e-3
+
+
+class UniformState(Table, frozen=True):
+    """Every state uniform about x0.
+
+    Attributes:
+        half_width: largest deviation, one number for each state; default: 1 each
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: NotNegatives = ()
+
+
+class NormalState(Table, frozen=True):
+    """Every state normal about x0.
+
+    Attributes:
+        std: 1 sigma, one number for each state; default: 1 each
+    """
+
+    kind: Literal["normal"] = "normal"
+    std: NotNegatives = ()
+
+
+class Dispersion(Table, frozen=True):
+    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says.
+
+    Attributes:
+        attitude: of the body at t = 0
+        rate: of the body at t = 0
+        inertia: of the true body, about true_inertia; the law keeps spacecraft.inertia
+        reference: the whole reference turned
+        disturbance_phase: of every sinusoid, and of the orbit
+        disturbance_amplitude: of each sinusoid and constant, an independent factor on each component
+        disturbance_bias: a constant torque, added
+        attitude_noise: factor on hardware.attitude_noise
+        rate_noise: factor on hardware.rate_noise
+        torque_limit: factor on hardware.torque_limit
+    """
+
+    attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
+    rate: NormalRate | UniformRate | None = None
+    inertia: RelativeInertia | None = None
+    reference: UniformAttitude | AxisAngle | NormalAttitude | None = None
+    disturbance_phase: UniformPhase | None = None
+    disturbance_amplitude: RelativeNormal | RelativeUniform | None = None
+    disturbance_bias: NormalBias | UniformBias | None = None
+    attitude_noise: RelativeNormal | RelativeUniform | None = None
+    rate_noise: RelativeNormal | RelativeUniform | None = None
+    torque_limit: RelativeNormal | RelativeUniform | None = None
+
+
+class StateDispersion(Table, frozen=True):
+    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says.
+
+    Attributes:
+        x0: initial state
+        disturbance_phase: of every sinusoid
+        disturbance_amplitude: of each sinusoid and constant, an independent factor on each component
+        disturbance_bias: a constant, added
+        state_noise: factor on hardware.state_noise
+        torque_limit: factor on hardware.torque_limit
+    """
+
+    x0: UniformState | NormalState | None = None
+    disturbance_phase: UniformPhase | None = None
+    disturbance_amplitude: RelativeNormal | RelativeUniform | None = None
+    disturbance_bias: NormalBias | UniformBias | None = None
+    state_noise: RelativeNormal | RelativeUniform | None = None
+    torque_limit: RelativeNormal | RelativeUniform | None = None

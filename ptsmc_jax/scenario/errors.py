@@ -1,0 +1,44 @@
+"""What is wrong in a scenario, in one sentence, and values as such a sentence says them."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+LONGEST_VALUE = 160  # characters of a value in an error
+MOST_BITS = 1023  # of a whole number, beyond which it is no finite float
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed."""
+
+    def _render_traceback_(self) -> list[str]:
+        """In a notebook that sentence, and nothing of how it came about: IPython asks for this."""
+        return [f"ScenarioError: {self}"]
+
+
+def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
+    """The error for a key whose value is not allowed."""
+    return ScenarioError(f"{key} is {brief(value)}, but must be {allowed}")
+
+
+def brief(value: Any) -> str:
+    """A value as an error says it: as `terminal` does, a long one cut."""
+    shown = show(value)
+    return shown if len(shown) <= LONGEST_VALUE else f"{shown[:LONGEST_VALUE]} ... ({len(shown)} characters)"
+
+
+def show(value: Any) -> str:
+    """A value as a scenario file would write it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(show, value)) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{k} = {show(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to write very long ones out
+        return f"a whole number of {value.bit_length()} bits"
+    return str(value)

@@ -1,0 +1,64 @@
+"""What a scenario's tables and keys mean, read from the docstrings, types and defaults of their structs."""
+
+import inspect
+import re
+import types
+import typing
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from ptsmc_jax.scenario.values import Table
+
+
+class Key(NamedTuple):
+    """One key of a table."""
+
+    name: str
+    meaning: str
+    unit: str  # empty where it has none
+    allowed: str  # in words
+    default: Any  # None: off, or said in `meaning`; NODEFAULT: needed
+
+    @property
+    def told(self) -> str:
+        """Meaning and unit."""
+        return self.meaning + (f" [{self.unit}]" if self.unit else "")
+
+
+def of(struct: type[Table]) -> list[Key]:
+    """The keys of a table, `kind` apart, in the order of the struct; a base's docstring speaks for what it declares."""
+    meanings: dict[str, str] = {}
+    for base in reversed(struct.__mro__):
+        meanings |= _attributes(base.__dict__.get("__doc__") or "")
+    hints = typing.get_type_hints(struct, include_extras=True)
+    found = []
+    for field in msgspec.structs.fields(struct):
+        if field.name != "kind":
+            parts = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name])
+            assert parts is not None
+            meaning, unit = parts.groups()
+            made = field.default_factory
+            default = field.default if made is msgspec.NODEFAULT else made()
+            found.append(Key(field.name, meaning, unit or "", allowed(hints[field.name]), default))
+    return found
+
+
+def about(struct: type[Table]) -> str:
+    """What a table, or a kind of it, is: its docstring without the keys."""
+    return " ".join(inspect.cleandoc(struct.__doc__ or "").split("\n\nAttributes:")[0].split())
+
+
+def allowed(kind: Any) -> str:
+    """What a type allows, in words."""
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return " or ".join(allowed(k) for k in typing.get_args(kind) if k is not type(None))
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(f'"{v}"' for v in typing.get_args(kind))
+    return next((m.description for m in getattr(kind, "__metadata__", ()) if m.description), "of another type")
+
+
+def _attributes(docstring: str) -> dict[str, str]:
+    """Name -> text of the section `Attributes` of a docstring in Google's style."""
+    _, _, section = inspect.cleandoc(docstring).partition("\nAttributes:\n")
+    return {name: " ".join(text.split()) for name, text in re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.M)}

@@ -1,0 +1,292 @@
+"""How fast things happen in a scenario, and the clock and steps that follow it."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import programs
+from ptsmc_jax.laws.base import SecondOrder
+from ptsmc_jax.observers import none
+from ptsmc_jax.plants.second_order import System
+from ptsmc_jax.scenario import attitude_keys, build, checks, dispersion_tables, law_tables, plant_tables, signal_tables
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.free_gains import MOST_STEPS, hand_over
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import solutions
+
+MOST_SUBSTEPS = 200
+BASELINES = 50  # substeps at most, that a law to compare with asks for: a run that turns faster is marked
+MOVING = 4  # steps a period at least where the torque changes within it
+_SMOOTHED = ("disturbance.frequency", "plant.system")
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far gains may move without another compilation: the clock's sizes are chosen for it."""
+
+    smallest_t_f: float  # [s]
+    t_f: float  # largest [s]
+    delta: float  # largest [s]
+    smallest_delta: float  # [s]
+    gain: float  # smallest observer gain [N m s]; of no meaning without an observer
+    largest_gain: float
+    k1: float  # largest [1/s]
+    sign_width: float  # smallest
+    surface_rate: float  # largest [1/s]
+
+
+def reach_of(scenario: Scenario) -> Reach:
+    """The reach of a scenario's own gains: none beyond them."""
+    table = scenario.controller
+    gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
+    k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
+    return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
+
+
+def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
+    """Clock for gains within `reach`, and integration steps a control period; saves: times that are nodes [s].
+
+    Raises ScenarioError where too many steps would be needed, naming what asks for them.
+    """
+    loop, frequencies, visited = scenario.loop, _frequencies(scenario, parts, reach), None
+    if isinstance(parts.plant, System):
+        hurried = parts.with_t_f(build.vector(reach.smallest_t_f))
+        visited = solutions.visited(hurried)
+        frequencies["plant.system"] = _fastest_of_system(hurried, visited)
+    if loop.mode == "continuous":
+        if "plant.system" in frequencies:
+            frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
+        return _grid(scenario, reach, parts, saves, frequencies, visited), 1
+    assert loop.t_end is not None
+    substeps = _substeps(scenario, frequencies)
+    last = loop.t_end + reach.t_f - scenario.controller.t_f
+    _check_steps(scenario, last, substeps)
+    if loop.clock == "flight":
+        return dataclasses.replace(clock.flight(loop.period, last), t_end=build.vector(loop.t_end)), substeps
+    late = loop.t_end - scenario.controller.t_f + reach.delta
+    return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
+
+
+def steps(parts: Parts) -> int:
+    """Integration steps of a run."""
+    ticks = parts.clock
+    count = ticks.count if isinstance(ticks, clock.Flight) else ticks.before + ticks.after
+    return count * parts.substeps
+
+
+def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
+    """Refuse a sampled loop of more integration steps until `last` [s] than a sensible number."""
+    period, needed = scenario.loop.period, last / scenario.loop.period * substeps
+    if needed > MOST_STEPS:
+        asks = (
+            f"the sampled loop would take {needed:.6g} steps, {substeps} a period, and at most {MOST_STEPS} are allowed"
+        )
+        if last > (scenario.loop.t_end or 0.0):
+            raise ScenarioError(f"tune.bounds.t_f asks for runs of {last:.6g} s, but must be lower: {asks}")
+        longer = f", or loop.period longer than {period}" if substeps <= MOVING else ""
+        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier{longer}: {asks}")
+
+
+def _frequencies(scenario: Scenario, parts: Parts, reach: Reach) -> dict[str, float]:
+    """How fast things happen [rad/s], by the key that says so."""
+    waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
+    found = {"disturbance.frequency": float(max(waves))}
+    if scenario.initial is not None:
+        found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
+        found |= _reference_frequencies(scenario.reference)
+        key, rate = _slew(scenario.controller, reach.smallest_t_f)
+        if isinstance(scenario.controller, law_tables.Baseline):
+            rate = min(rate, 0.5 * BASELINES * 0.025 / scenario.loop.period)
+        found[key] = rate
+        for key, rate in _nutation(scenario, parts).items():
+            found[key] = found.get(key, 0.0) + rate
+    return found
+
+
+def _nutation(scenario: Scenario, parts: Parts) -> dict[str, float]:
+    """How fast a body with wheels nutates at most [rad/s], by the key that says so: |H| over its two smallest moments.
+
+    J w' = -w x H + u, where H = J w + A h changes in inertial axes by disturbances only: wheels that give a body its
+    rate take as much.
+    """
+    if scenario.wheels is None or scenario.initial is None:
+        return {}
+    assert parts.actuators is not None
+    assert parts.actuators.wheels is not None
+    least, middle, largest = np.linalg.eigvalsh(np.asarray(parts.plant.inertia))
+    turning = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
+    stored = np.linalg.norm(np.asarray(parts.actuators.wheels.axes @ parts.actuators.wheels.initial))
+    shares = {
+        "wheels.momentum": stored,
+        "initial.rate": largest * turning,
+        "disturbance.amplitude": _impulse(scenario),
+    }
+    return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
+
+
+def _impulse(scenario: Scenario) -> float:
+    """What constant and sinusoidal disturbances add up to at most until t_end [N m s]."""
+    end, found = float(scenario.loop.t_end or 0.0), 0.0
+    for term in checks.terms(scenario):
+        swing, frequency, bias = (np.abs(getattr(term, key, (0.0,))) for key in ("amplitude", "frequency", "bias"))
+        lasting = np.minimum(end, 2.0 / np.maximum(frequency, 1e-12))
+        found += float(np.linalg.norm(swing * lasting) + np.linalg.norm(bias) * end)
+    return found
+
+
+def _slew(law: Any, t_f: float) -> tuple[str, float]:
+    """How fast a law turns the body [rad/s], at most, by the key that says so; on their surfaces the baselines."""
+    if isinstance(law, law_tables.PDController):  # all of the potential energy of its spring
+        return "controller.k_p", 2.0 * math.sqrt(law.k_p)
+    if isinstance(law, law_tables.TerminalController):
+        return "controller.b", 2.0 * law.b ** (1.0 / law.p)
+    if isinstance(law, law_tables.FixedTimeController):
+        return "controller.a1", 2.0 * (law.a1 + law.b1)
+    return "controller.eta", 2.0 * law.eta / t_f
+
+
+def _spread(scenario: Scenario) -> float:
+    """How much faster than initial.rate a drawn body may turn [rad/s]; a normal rate: all but one in 10 000."""
+    table = getattr(scenario.dispersion, "rate", None)
+    if table is None:
+        return 0.0
+    return 4.6 * table.std if isinstance(table, dispersion_tables.NormalRate) else np.sqrt(3.0) * table.half_width
+
+
+def _reference_frequencies(table: Any) -> dict[str, float]:
+    """How fast the reference turns and changes [rad/s], by the key that says so."""
+    if isinstance(table, signal_tables.SpinReference):
+        return {"reference.rate": float(np.linalg.norm(table.rate))}
+    if isinstance(table, signal_tables.SinusoidReference):
+        turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
+        return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
+    if isinstance(table, signal_tables.SlewReference):  # largest rate of the quintic, and the motion's own time
+        turning = 1.875 * float(np.linalg.norm(attitude_keys.turn(table)))
+        return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
+    return {}
+
+
+def _fastest(frequencies: Mapping[str, float]) -> float:
+    """Highest angular frequency of the motion [rad/s]."""
+    others = sum(value for key, value in frequencies.items() if key != "disturbance.frequency")
+    return max(frequencies["disturbance.frequency"], others)
+
+
+def _substeps(scenario: Scenario, frequencies: Mapping[str, float]) -> int:
+    """Integration steps a control period: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
+
+    At 0.1 rad of a disturbance, or of a system of one's own, 1e-7 of what it does.
+    """
+    frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
+    needed = scenario.loop.period * _fastest(frequencies) / 0.025
+    if needed > MOST_SUBSTEPS:
+        asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
+        raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
+    moving = any(getattr(scenario.hardware, key, None) is not None for key in ("torque_rate_limit", "torque_lag"))
+    return max(MOVING if moving else 1, math.ceil(needed))
+
+
+def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
+    if key == "plant.system":
+        return ScenarioError(f"plant.system is too fast, in its own modes or in time: {asks}")
+    table, _, name = key.partition(".")
+    if key == "controller.eta":  # over a short t_f: eta itself may have no room below
+        eta = f"with controller.eta = {scenario.controller.eta}"
+        shorter = ", or loop.period shorter" if scenario.loop.mode == "sampled" else ""
+        return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
+    value = getattr(getattr(scenario, table), name, None)
+    if value is None:  # of a term in a sum
+        value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
+    return wrong(key, value, f"{'longer' if key == 'reference.duration' else 'lower'}: {asks}")
+
+
+@programs.jit  # one program, where each of its operations would be one
+def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
+    """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
+    return controller.boundary_layer(observer.error_bound().largest, visited)
+
+
+@programs.jit
+def _rates_of_system(parts: Parts, visited: tuple) -> tuple:
+    """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
+    plant, law = parts.plant, parts.controller
+    assert isinstance(plant, System)
+    assert isinstance(law, SecondOrder)
+    none = jnp.zeros(plant.inputs)
+
+    def jacobian(t: Any, x: Any) -> Any:
+        u = law.invert(x, t, none, none)
+        return plant.jacobian(t, x, u)
+
+    def along(t: Any) -> Any:
+        return law.motion(t, parts.initial, none, none, none).w_dot
+
+    times = parts.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
+    steady = jax.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
+    return jax.vmap(jacobian)(*visited), steady
+
+
+def _fastest_of_system(parts: Parts, visited: tuple) -> float:
+    """Fastest rate of a system of one's own along its run [rad/s]: of its modes, and of what time does to it."""
+    jacobians, (acceleration, change) = _rates_of_system(parts, visited)
+    matrices = np.asarray(jacobians)
+    modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
+    size, quick = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, change))
+    return float(max(modes, quick / size if size > 1e-12 else 0.0))
+
+
+def _with_gain(observer: Any, gain: float) -> Any:
+    return dataclasses.replace(observer, gain=jnp.full_like(observer.gain, gain))
+
+
+def _grid(
+    scenario: Scenario, reach: Reach, parts: Parts, saves: object, frequencies: Mapping[str, float], visited: Any
+) -> clock.Graded:
+    """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
+    loop = scenario.loop
+    assert loop.t_end is not None
+    t_end = loop.t_end + reach.t_f - scenario.controller.t_f
+    controller, observer, resolved = parts.controller, parts.observer, 0.0
+    saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
+    if not isinstance(observer, none.NoObserver):  # K2 is largest with the smallest gain
+        resolved = _with_gain(observer, reach.largest_gain).fastest()
+        observer = _with_gain(observer, reach.gain)
+    names = ("t_f", "k1", "sign_width", "surface_rate")
+    widest = dataclasses.replace(controller, **{name: build.vector(getattr(reach, name)) for name in names})
+    layer = (0.0, 0.0)
+    if reach.sign_width > 0.0:
+        for t_f in (reach.smallest_t_f, reach.t_f):
+            law = dataclasses.replace(widest, t_f=build.vector(t_f))
+            before, after = (float(v) for v in _boundary_layer(law, observer, visited))
+            layer = (max(layer[0], before), max(layer[1], after))
+    layer = (max(layer[0], resolved), max(layer[1], resolved))
+    rates, frequency = widest.hold_rates(), _fastest(frequencies)
+    order = 1 if isinstance(scenario.plant, plant_tables.SpacecraftPlant) else controller.order
+
+    def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
+        taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
+        return taken if taken == taken else math.inf
+
+    rate = max(rates.values())
+    needed = steps(frequency, layer, rate)
+    if not needed <= MOST_STEPS:
+        asks = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
+        by_key = {key: steps(value) for key, value in frequencies.items()}
+        by_key |= {f"controller.{key}": steps(rate=value) for key, value in rates.items()}
+        by_key["controller.sign_width"] = steps(layer=layer)
+        worst = max(by_key, key=lambda key: by_key[key])
+        if by_key[worst] <= steps() * 1.5:
+            raise wrong("loop.t_end", t_end, f"earlier: {asks}")
+        if worst == "controller.sign_width":
+            raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
+        raise _lower(scenario, worst, asks)
+    grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
+    return dataclasses.replace(grid, t_end=build.vector(loop.t_end))

@@ -1,0 +1,60 @@
+"""Scenarios read, checked as a whole and changed; without JAX, so that a bad one is refused at once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ptsmc_jax.scenario import checks, free_gains, schema
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
+
+
+def read(path: str | Path) -> Scenario:
+    """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
+    return from_tables(schema.load(path))
+
+
+def from_tables(raw: Mapping[str, Any]) -> Scenario:
+    """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence."""
+    scenario = checks.resolve(schema.parse(raw, catalogues.CATALOGUES))
+    checks.check(scenario)
+    if scenario.tune is None:
+        return scenario
+    return msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+
+
+def replace(scenario: Scenario, **changes: Any) -> Scenario:
+    """The scenario with other values, keys written table__key, checked again: replace(s, controller__eta=4.0).
+
+    None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one.
+
+    >>> faster = replace(from_tables({}), controller__t_f=20.0)
+    >>> faster.controller.t_f, faster.loop.t_end
+    (20.0, 40.0)
+    >>> replace(faster, controller__eta=1.0)
+    Traceback (most recent call last):
+    ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
+    """
+    tables = schema.dump(scenario)
+    for name, value in changes.items():
+        table, _, key = name.partition("__")
+        if value is None and _is_known(scenario, table, key):
+            removed = tables if not key else tables.get(table, {})
+            removed.pop(key or table, None)
+        elif not key:
+            tables[table] = value
+        elif key == "kind" and tables.get(table, {}).get("kind") != value:
+            tables[table] = {"kind": value}
+        else:
+            tables[table] = {**tables.get(table, {}), key: value}
+    return from_tables(tables)
+
+
+def _is_known(scenario: Scenario, table: str, key: str) -> bool:
+    """Whether there is such a table or key; one that is not known is handed on, and refused as in a file."""
+    now = getattr(scenario, table) if table in scenario.__struct_fields__ else None
+    if not key or now is None:
+        return table in scenario.__struct_fields__
+    return key in now.__struct_fields__ if isinstance(now, msgspec.Struct) else True

@@ -1,0 +1,294 @@
+"""Scenario files read and written: what is wrong in one, in one sentence.
+
+Only single tables and keys are looked at here; `checks.py` looks at keys against each other.
+"""
+
+import difflib
+import math
+import os
+import re
+import tomllib
+import typing
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ptsmc_jax.scenario import keys, layouts, signal_tables
+from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
+from ptsmc_jax.scenario.layouts import TABLES, Kinds
+from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.scenario.values import Positive, Table, Truth
+
+DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
+LONGEST_KEY = 100  # characters
+
+
+_TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
+# a dotted key without end, for which the parser would take memory by the square of its length
+_DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
+
+
+def toml(text: str, name: str) -> dict[str, Any]:
+    """The raw tables of a TOML file, which errors call by this name; raises ScenarioError where it is none."""
+    try:
+        if _DOTTED.search(text):
+            raise RecursionError
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
+        raise ScenarioError(f"{name} is no valid TOML: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{name} has tables or arrays in each other, {_TOO_DEEP}") from None
+
+
+def load(path: str | Path) -> dict[str, Any]:
+    """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML.
+
+    A Python file that it names (plant.system) is looked for beside it, and not run.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
+    except FileNotFoundError:
+        raise ScenarioError(f"the scenario file {path} is not there") from None
+    except IsADirectoryError:
+        raise ScenarioError(f"the scenario file {path} is a folder, but must be a TOML file") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f"the scenario file {path} is no text in UTF-8, but must be a TOML file") from None
+    except OSError as error:
+        raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
+    raw = toml(text, f"the scenario file {path}")
+    plant = raw.get("plant")
+    where = plant.get("system") if isinstance(plant, dict) else None
+    file, _, name = where.rpartition(":") if isinstance(where, str) else ("", "", "")
+    if isinstance(plant, dict) and file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
+        plant["system"] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
+    return raw
+
+
+def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Scenario:
+    """Scenario from raw tables, absent keys at their defaults; raises ScenarioError.
+
+    metrics: names of the metrics by the kind of the plant.
+    """
+    _check_shape(raw)
+    for name, table in raw.items():
+        if name in Scenario.__struct_fields__ and not isinstance(table, Mapping):
+            raise wrong(name, table, "a table")
+    kind = _plant_kind(raw.get("plant", {}))
+    layout = TABLES[kind]
+    for name in raw:
+        if name in layout or name == "requirements":
+            continue
+        others = [other for other, theirs in TABLES.items() if name in theirs]
+        if others:
+            raise ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
+        if not isinstance(raw[name], Mapping):
+            place = _place(name, layout)
+            raise ScenarioError(f"{name} = {brief(raw[name])} stands outside a table; {place}")
+        known = (*layout, "requirements")
+        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, known, '[{}]')}")
+
+    plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
+    order = 0
+    if kind == "chain":  # x0 says the order where it is absent
+        given = raw.get("plant", {})
+        order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
+        if order < 2:
+            raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
+    fallback = layouts.defaults(kind, order)
+    found: dict[str, Any] = {}
+    for name in layout:
+        if name not in raw and name in layouts.OPTIONAL:
+            continue
+        given = raw.get(name, {})
+        if name == "dispersion":
+            found[name] = _dispersion(given, kind)
+        else:
+            found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name])
+    if kind == "chain" and "order" not in raw.get("plant", {}):
+        found["plant"] = msgspec.structs.replace(found["plant"], order=order)
+    for name in ("initial", "reference"):
+        if name in found:
+            one_attitude(name, found[name])
+    found["requirements"] = {
+        key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
+    }
+    return Scenario(**found)
+
+
+def _check_shape(raw: Mapping[str, Any]) -> None:
+    """Refuse what is nested without end and keys that no sentence can name, before anything walks through them."""
+    level: list[tuple[str, Any]] = [("", raw)]
+    for _ in range(DEEPEST):
+        inside: list[tuple[str, Any]] = []
+        for top, value in level:
+            if isinstance(value, Mapping):
+                for key, within in value.items():
+                    if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
+                        said = brief(key) if isinstance(key, str) else repr(key)
+                        raise ScenarioError(f"{top or 'the scenario'} has the key {said}, which is not a known one")
+                    inside.append((top or key, within))
+            elif isinstance(value, list | tuple):
+                inside += [(top, within) for within in value]
+        level = [(top, value) for top, value in inside if isinstance(value, Mapping | list | tuple)]
+    if level:
+        raise ScenarioError(f"{level[0][0]} has tables or arrays in each other, {_TOO_DEEP}")
+
+
+def _plant_kind(plant: Mapping[str, Any]) -> str:
+    kind = plant.get("kind", "spacecraft")
+    if not isinstance(kind, str) or kind not in TABLES:
+        raise wrong("plant.kind", kind, " or ".join(map(show, TABLES)))
+    return kind
+
+
+def _place(key: str, layout: Mapping[str, Any]) -> str:
+    """Where a key that stands outside a table may belong."""
+    homes = {field: name for name, table in layout.items() for struct in _structs(table)
+            for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
+    closest = difflib.get_close_matches(key, homes, n=1, cutoff=0.0)[0]
+    return f"the nearest known key is {homes[closest]}.{closest}"
+
+
+def _structs(table: type[Table] | Kinds) -> list[type[Table]]:
+    return [struct for struct in table.values() if struct is not None] if isinstance(table, dict) else [table]
+
+
+def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A table with what is absent filled in; an attitude that is given replaces the default one."""
+    if any(key in given for key in ATTITUDE_KEYS):
+        fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
+    return {**fallback, **given}
+
+
+def one_attitude(name: str, table: Any) -> None:
+    """Raise ScenarioError where a table gives its attitude twice."""
+    said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
+    if len(said) > 1:
+        two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
+        raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
+
+
+def dump(scenario: Scenario) -> dict[str, Any]:
+    """Tables that `parse` reads back to the same scenario; what is None is left out."""
+    own = getattr(scenario.plant, "system", None)
+    if own is None or isinstance(own, str):
+        return plain(scenario)
+    rest = dump(msgspec.structs.replace(scenario, plant=msgspec.structs.replace(scenario.plant, system="")))
+    return {**rest, "plant": {**rest["plant"], "system": own}}  # made in Python: stays what it is
+
+
+def plain(table: Table) -> dict[str, Any]:
+    """A table as a scenario file would have it; what is None is left out."""
+    return typing.cast(dict, _without_none(msgspec.to_builtins(table)))
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        kept = {k: _without_none(v) for k, v in value.items() if v is not None}
+        return {k: v for k, v in kept.items() if v != {} or k not in ("requirements", "bounds")}
+    if isinstance(value, list | tuple):
+        return [_without_none(v) for v in value]
+    return value
+
+
+def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
+    """What a name may have been meant for: the known one most like it, or, where none is like it, all of them."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"the nearest known one is {form.format(close[0])}"
+    return f"known are {', '.join(form.format(one) for one in known)}"
+
+
+def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Table:
+    if not isinstance(kinds, dict):
+        return _fields(name, raw, kinds)
+    kind = raw.get("kind", next(iter(kinds)))
+    if not isinstance(kind, str) or kind not in kinds:
+        raise wrong(f"{name}.kind", kind, " or ".join(map(show, kinds)))
+    struct = kinds[kind]
+    if struct is signal_tables.SumDisturbance:
+        return _sum(name, raw, kinds)
+    return _fields(name, raw, struct)
+
+
+def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds) -> Table:
+    """A table whose `terms` are tables of the other kinds."""
+    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, signal_tables.SumDisturbance)
+    terms = raw.get("terms", ())
+    if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
+        raise wrong(f"{name}.terms", terms, signal_tables.TERMS)
+    single = {kind: struct for kind, struct in kinds.items() if struct is not signal_tables.SumDisturbance}
+    found = tuple(_table(f"{name}.terms[{k}]", term, single) for k, term in enumerate(terms))
+    return signal_tables.SumDisturbance(terms=found)
+
+
+def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
+    struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
+    found = {}
+    for key, table in raw.items():
+        if key not in struct.__struct_fields__:
+            known = nearest(key, struct.__struct_fields__, "dispersion.{}")
+            raise ScenarioError(f"dispersion.{key} is not a known key; {known}")
+        if not isinstance(table, Mapping):
+            raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
+        found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key])
+    return struct(**found)
+
+
+def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
+    key = f"requirements.{metric}"
+    if metric not in metrics and metric not in layouts.MARGINS:
+        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *layouts.MARGINS))}")
+    if isinstance(value, Mapping):
+        if metric in layouts.MARGINS:
+            raise wrong(key, value, "a number greater than 0, which every loop must keep")
+        if "limit" not in value:
+            raise wrong(key, value, "a number greater than 0 or a table with `limit`")
+        return typing.cast(Limit, _fields(key, value, Limit))
+    return _value(key, value, Positive)
+
+
+def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
+    hints = typing.get_type_hints(struct, include_extras=True)
+    known = struct.__struct_fields__
+    for key in raw:
+        if key not in known:
+            raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
+    return struct(**{key: _value(f"{name}.{key}", value, hints[key]) for key, value in raw.items()})
+
+
+def _value(key: str, value: Any, kind: Any) -> Any:
+    value = _plain(value)
+    bad = _not_finite(value)
+    if bad is not None:
+        raise wrong(key, value, f"{keys.allowed(kind)}, and {show(bad)} is no finite number")
+    if _holds_truth(value) and kind is not Truth:  # numpy, which reads the inertia, takes true for 1
+        raise wrong(key, value, keys.allowed(kind))
+    try:
+        return msgspec.convert(value, kind, strict=True)
+    except msgspec.ValidationError:
+        raise wrong(key, value, keys.allowed(kind)) from None
+
+
+def _plain(value: Any) -> Any:
+    """Python numbers and tuples for lists and numpy's."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
+def _holds_truth(value: Any) -> bool:
+    return isinstance(value, bool) or (isinstance(value, tuple) and any(map(_holds_truth, value)))
+
+
+def _not_finite(value: Any) -> float | int | None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return value
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        return value
+    inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    return next((bad for bad in map(_not_finite, inside) if bad is not None), None)

@@ -1,0 +1,152 @@
+"""Systems and functions of one's own by where they stand, "FILE.py:NAME" or "package.module:NAME".
+
+A scenario that names one is a program. `named` looks at the text alone; `digest`, `item` and `load` run what it names.
+"""
+
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from ptsmc_jax import configure
+
+if TYPE_CHECKING:
+    from ptsmc_jax.plants.second_order import System
+
+WHERE = '"FILE.py:NAME" or "package.module:NAME"'
+
+ALLOWED = f"{WHERE}, a system made with plants.system"
+
+LONGEST = 4096  # characters of a path, on Linux
+
+_ran: dict[tuple[str, str], ModuleType] = {}  # files by path and SHA-256: what has changed is run anew
+
+
+def named(where: str, allowed: str) -> tuple[str, str]:
+    """The file or module, and the name in it; looks at the text only. Raises ValueError where it is neither."""
+    place, _, name = where.rpartition(":")
+    file = place.endswith(".py")
+    if not name.isidentifier() or len(where) > LONGEST or not where.isprintable():
+        place = ""
+    if not place or not (file or all(part.isidentifier() for part in place.split("."))):
+        raise ValueError(f"it names nothing; allowed is {allowed}")
+    return place, name
+
+
+def location(where: str) -> str:
+    """What would be run, as one may look at it: the file with its whole path, links followed, or the module."""
+    place = where.rpartition(":")[0]
+    return os.path.realpath(place) if place.endswith(".py") else f"the module {place}"
+
+
+def load(where: object) -> "System":
+    """The system that stands there, the same object as long as its file stays the same, see `item`; or is there."""
+    from ptsmc_jax.plants.second_order import System  # scenarios without one are checked without JAX
+
+    if not isinstance(where, str):
+        if not isinstance(where, System):
+            raise ValueError(f"allowed is {ALLOWED}")
+        return where
+    found = item(where, ALLOWED)
+    if not isinstance(found, System):
+        place = where.rpartition(":")[0]
+        raise ValueError(f"{place} has a {type(found).__name__} of that name; allowed is {ALLOWED}")
+    return found
+
+
+def item(where: str, allowed: str) -> object:
+    """What stands there under its name.
+
+    Runs the file, as Python does with any import; it may import from its own folder, a module from where the command
+    was called. Raises ValueError that says what is wrong in one line.
+    """
+    place, name = named(where, allowed)
+    path = Path(place)
+    content = _content(path) if place.endswith(".py") else b""
+    try:
+        with _importing_from(_home(place)):
+            module = _run(path, content) if place.endswith(".py") else importlib.import_module(place)
+    except (Exception, SystemExit) as error:
+        first = (str(error).splitlines() or [""])[0]
+        raise ValueError(f"running {place} fails: {type(error).__name__}: {first}") from error
+    if not hasattr(module, name):
+        raise ValueError(f"{place} has no such name; allowed is {allowed}")
+    return getattr(module, name)
+
+
+def digest(where: object) -> str | None:
+    """SHA-256 of the file in which a system or a function stands, not of what it imports; None: it stands in none.
+
+    Runs the packages around a module, as Python does to find it.
+    """
+    place = where.rpartition(":")[0] if isinstance(where, str) else ""
+    file: str | None = place
+    if place and not place.endswith(".py"):
+        try:
+            with _importing_from(_home(place)):
+                spec = importlib.util.find_spec(place)
+        except (Exception, SystemExit):  # which `item` says
+            spec = None
+        file = None if spec is None else spec.origin
+    try:
+        return None if not file else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return None
+
+
+def source(where: object, key: str = "system_sha256") -> dict[str, str]:
+    """What a result depends on besides its scenario: the digest of the system, or the function, that it names."""
+    found = digest(where)
+    return {} if found is None else {key: found}
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"the file {path} is not there") from None
+    except OSError as error:
+        raise ValueError(f"it cannot be read: {error.strerror}") from None
+
+
+def _home(place: str) -> str:
+    """The folder from which it may import."""
+    return os.path.realpath(Path(place).parent if place.endswith(".py") else Path.cwd())
+
+
+@contextlib.contextmanager
+def _importing_from(folder: str) -> Iterator[None]:
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+
+
+def _run(path: Path, content: bytes) -> ModuleType:
+    """The file as a module of a name of its own; two files with one name do not meet.
+
+    What is run is what was read and can be read: no compiled copy from a __pycache__ that came with it.
+    """
+    known = os.path.realpath(path), hashlib.sha256(content).hexdigest()
+    if known in _ran:
+        return _ran[known]
+    unique = hashlib.sha256("".join(known).encode(errors="surrogateescape")).hexdigest()[:12]
+    spec = importlib.util.spec_from_file_location(f"_ptsmc_jax_{path.stem}_{unique}", path)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up there
+    configure.programs = None  # what they are made of may be patched from here on
+    try:
+        exec(compile(content, str(path), "exec", dont_inherit=True), module.__dict__)
+    except BaseException:
+        del sys.modules[spec.name]
+        raise
+    _ran[known] = module
+    return module

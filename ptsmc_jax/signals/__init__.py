@@ -1,0 +1,1 @@
+"""What the loop is given: reference attitudes and disturbance torques."""

@@ -1,0 +1,157 @@
+"""Requirements: "peak_torque at most 0.5 N m in 99 % of trials", one declaration for verdict and loss.
+
+On metrics of what is flown, and on margins of its loop, most of which are to be at least so large.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.simulation.catalogues import CATALOGUE
+
+
+def least_within(trials: int, quantile: float | None, confidence: float | None) -> int | None:
+    """How many of so many trials must keep a limit; None: so few trials cannot show it.
+
+    All of them where no quantile is asked for; with a confidence, the least k for which the one-sided lower bound of
+    Clopper and Pearson (Biometrika 26, 1934) on the share of all trials, beta(1 - confidence; k, trials - k + 1),
+    reaches the quantile.
+    """
+    if quantile is None:
+        return trials
+    if confidence is None:
+        return max(1, math.ceil(quantile * trials - 1e-9))
+    if trials < fewest_trials(quantile, confidence):
+        return None
+    from scipy.stats import beta  # takes a while to import, which most runs need not wait for
+
+    within = np.arange(1, trials + 1)
+    reached = beta.ppf(1.0 - confidence, within, trials - within + 1) >= quantile
+    reached[-1] = True  # whatever rounding says: there are as many as it takes
+    return int(within[np.argmax(reached)])
+
+
+def fewest_trials(quantile: float, confidence: float) -> int:
+    """Trials with which a quantile can be shown at all: quantile^n <= 1 - confidence.
+
+    >>> fewest_trials(quantile=0.9973, confidence=0.9)
+    852
+    """
+    return math.ceil(math.log(1.0 - confidence) / math.log(quantile) - 1e-9)
+
+
+def over(values: Any, limit: Any, *, at_least: bool) -> Any:
+    """How near arrays, NumPy's or JAX's, come to a limit, which is 1: as a share of it, or 2 less that.
+
+    The latter where they are to be larger; one that is infinite is then as far from the limit as there is: 0.
+    """
+    share = values / limit
+    return 2.0 - share.clip(max=2.0) if at_least else share
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a requirement fared over some trials."""
+
+    metric: str
+    limit: float
+    unit: str
+    worst: float  # largest value, NaN if a trial failed
+    margin: float  # how near it comes to the limit, see `over`: met up to 1; NaN or infinite: never
+    failures: int  # trials beyond the limit or without a value
+    trials: int
+    quantile: float | None = None  # share of trials that must keep the limit; None: every one
+    confidence: float | None = None  # with which that is shown for all trials there could be
+    at_least: bool = False  # the limit is the smallest value allowed, and `worst` the smallest there is
+
+    @property
+    def met(self) -> bool:
+        """As many trials within the limit as are asked for."""
+        least = least_within(self.trials, self.quantile, self.confidence)
+        return least is not None and self.trials - self.failures >= least
+
+    def __str__(self) -> str:
+        return verdict_text(
+            self.metric,
+            self.limit,
+            self.unit,
+            self.worst,
+            self.failures,
+            self.trials,
+            self.quantile,
+            self.confidence,
+            at_least=self.at_least,
+        )
+
+
+def verdict_text(
+    metric: str,
+    limit: float,
+    unit: str,
+    worst: float | None,
+    failures: int,
+    trials: int,
+    quantile: float | None = None,
+    confidence: float | None = None,
+    *,
+    at_least: bool = False,
+) -> str:
+    """A verdict in one line; worst: None or NaN where a trial failed or has no value, or is infinite."""
+    wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -")
+    if quantile is not None:
+        wanted += f" in {100 * quantile:g} % of trials"
+        wanted += f" with {100 * confidence:g} % confidence" if confidence is not None else ""
+    if at_least and not failures and (worst is None or math.isinf(worst)):
+        seen = "unlimited"  # an infinite margin, which JSON has no number for
+    elif worst is None or worst != worst:
+        seen = "no value" if trials == 1 else "no worst value"
+    else:
+        seen = f"worst {worst:.4g}" if trials > 1 else f"{worst:.4g}"
+    least = least_within(trials, quantile, confidence)
+    if least is None:
+        assert quantile is not None
+        assert confidence is not None
+        return f"{wanted}: {seen}: NOT shown, which takes at least {fewest_trials(quantile, confidence)} trials"
+    if trials - failures >= least:
+        return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} trials" if failures else "")
+    allowed = f", at most {trials - least} allowed" if trials > least else ""
+    return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} trials{allowed}" if trials > 1 else "")
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """metric <= limit in every trial, or in a share of them; or metric >= limit.
+
+    >>> limit = Requirement("peak_torque", 0.5, quantile=0.75)
+    >>> print(limit.verdict(np.array([0.3, 0.4, 0.45, 0.7]), np.array([True, True, True, True])))
+    peak_torque at most 0.5 N m in 75 % of trials: worst 0.7: met, beyond it 1 of 4 trials
+    """
+
+    metric: str
+    limit: float
+    unit: str | None = None  # of the metric; None: as for a spacecraft
+    quantile: float | None = None
+    confidence: float | None = None
+    at_least: bool = False
+
+    def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
+        """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
+
+        A single run, numbers (), is judged by the limit alone.
+        """
+        single = np.ndim(values) == 0
+        values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
+        within = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
+        known = np.where(ok, values, np.nan)
+        worst = float(np.min(known) if self.at_least else np.max(known))
+        share = (None, None) if single else (self.quantile, self.confidence)
+        least = least_within(values.size, *share)
+        ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
+        deciding = float(ordered[least - 1]) if least is not None else np.nan
+        margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)
+        unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
+        failures = int(np.sum(~within))
+        count = int(values.size)
+        return Verdict(self.metric, self.limit, unit, worst, float(margin), failures, count, *share, self.at_least)

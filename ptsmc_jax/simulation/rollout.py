@@ -1,0 +1,323 @@
+"""The one time loop: parts in, metrics, status and (if asked for) the history out. It knows no law and no plant.
+
+`simulate` is pure and composes with jit, vmap, grad and jvp; every number in `Parts` is a leaf, so another gain,
+inertia or noise is the same compiled program.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax import programs
+from ptsmc_jax.devices.actuators import Actuators, Drive
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import draws, guards, integrators, matrices
+from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.simulation import metrics
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.clock import Graded
+from ptsmc_jax.simulation.computer import Computer, boot, decide, schedule, told
+
+Scalar = Float[Array, ""]
+
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED = range(6)
+# code: (status, reason)
+STATUS = {
+    OK: ("ok", ""),
+    DIVERGED: ("diverged", "the state is not finite"),
+    TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
+    SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
+    MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
+    UNBOUNDED: ("diverged", "a metric is not finite"),
+}
+FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
+SINGULAR_CLEARANCE = 1e-3
+LEFT = 0.05  # share of the initial angle, and SETTLED settling angles, beyond which a run has missed t_f
+SETTLED = 10.0
+DISTURBANCE_WALK = "disturbance_walk"
+
+
+class Log(NamedTuple):
+    """History at the start of each interval and at t_end; arrays (time, component), time (time,)."""
+
+    t: Array  # [s]
+    x: Any  # true state
+    d_hat: Array  # estimated disturbance [N m]
+    u: Array  # delivered torque, from this time on [N m]
+    commanded: Array  # [N m]
+    s: Array  # sliding variable that the law used
+    disturbance: Array  # true disturbance [N m]
+    reference: Any  # what the reference is then
+    error: Array  # what the law drives to zero: the attitude error vector [-], for a chain x_1
+    wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
+    lasts: Array  # bool: the row starts an interval of positive length, or is the last
+
+
+class Result(NamedTuple):
+    """What a run returns: its metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s]."""
+
+    metrics: metrics.Metrics
+    status: Array
+    bad_time: Array
+    log: Log | None
+
+
+class _State(NamedTuple):
+    x: Any
+    u: Array  # delivered at the end of the last interval
+    sight: metrics.Sight
+    running: metrics.Running
+    status: Array
+    bad_time: Array
+
+
+class _Course(NamedTuple):
+    """What a run begins with and is judged by."""
+
+    judged: metrics.Judged
+    x0: Any
+    first: Any  # the reference at t = 0
+    arrival: Any  # and at t_f
+    whole: Array  # what clearances from the law's singularity are counted in
+
+
+class _World(NamedTuple):
+    """What the sampled loop carries besides."""
+
+    computer: Computer
+    acting: Any  # state of the actuators
+    pushed: Array | None  # random walk of the disturbance [N m]
+
+
+def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False) -> Result:
+    """One closed-loop run. seed, trial: whole numbers below 2^32 that name its noise; record: return the history too.
+
+    A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.
+    """
+    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
+    target = parts.reference(jnp.zeros_like(parts.t_end))
+    x0 = parts.controller.align(parts.initial, target)
+    whole = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
+    course = _Course(judged, x0, target, parts.reference(judged.t_f), jax.lax.stop_gradient(whole))
+    loop = _continuous if isinstance(parts.clock, Graded) else _sampled
+    return loop(parts, ticks, course, seed, trial, record)
+
+
+# One compiled program for all parts of the same structure.
+simulate_jit = programs.jit(simulate, static_argnames="record")
+
+
+def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
+    """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
+    observer: Observer = parts.observer
+    actuators = Actuators() if parts.actuators is None else parts.actuators
+    k2 = observer.error_bound()
+    listed, about, started = schedule(parts, ticks)
+    walk = draws.stream(seed, trial, DISTURBANCE_WALK)
+
+    def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
+        return over_period(parts, t, x, drive, pushed, dt)
+
+    def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
+        (now, *_), (state, world) = tick, carry
+        dt = now.t_next - now.t
+        computer = world.computer._replace(told=(state.u, None)) if actuators.holds else world.computer
+        (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, state.x)
+        drive, queue = actuators.command(world.acting, u, w, dt, now.noise_weight)
+        pushed = world.pushed
+        if parts.walk_rate is not None:
+            pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
+        zero, stored = jnp.zeros_like(dt), None
+        delivered = actuators.torque(drive, zero)
+        wheels = None if actuators.wheels is None else actuators.wheels_at(drive, zero)
+        row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels) if record else None
+        start = state.x
+        x = fly(start, now.t, drive, pushed, dt)
+        weights, torques = (1.0,), (delivered,)
+        if actuators.moves:
+            weights = (1 / 6, 4 / 6, 1 / 6)
+            torques = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
+        if wheels is not None:  # in the middle too: a lag may turn the torque around within the period
+            stored = jnp.stack([actuators.wheels_at(drive, s)[0] for s in (dt / 2, dt)])
+        span = _Torques((u,) * len(torques), torques, weights, drive.limited, stored)
+
+        def until(t: Scalar) -> Any:
+            return fly(start, now.t, drive, pushed, t - now.t)
+
+        state = _advance(parts, course, state, now, target, x, span, until, dt / parts.substeps)
+        computer = computer._replace(told=None if actuators.holds else told(actuators, drive, dt))
+        return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
+
+    acting = actuators.begin(parts.plant.inputs)
+    state = _begin(parts, course, acting.h)
+    first = state.sight
+    pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+    computer = boot(parts, seed, trial, course.x0, started)
+    if actuators.holds:  # the state has it
+        computer = computer._replace(told=None)
+    world = _World(computer, acting, pushed)
+    (state, world), rows = jax.lax.scan(period, (state, world), listed)
+    return _finish(parts, course, first, state, world.computer.memory, k2, rows, world)
+
+
+def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | None, dt: Scalar) -> Any:
+    """The true plant's state dt [s] into a control period from t [s], under the period's drive and a torque besides.
+
+    pushed: that torque, constant over the period, (m,) [N m]; None: no random walk.
+    """
+    actuators = Actuators() if parts.actuators is None else parts.actuators
+    step = dt / parts.substeps
+
+    def substep(k: Scalar, x: Any) -> Any:
+        start, push = t + k * step, actuators.over(drive, k * step, step)
+
+        def rate(time: Scalar, y: Any) -> Any:
+            d = parts.disturbance(time, y)
+            acting = push.at(time - start, parts.plant.velocity(y))
+            return parts.plant.rate(time, y, acting, d if pushed is None else d + pushed)
+
+        return integrators.rk4(rate, start, x, step)
+
+    if parts.substeps == 1:
+        return parts.plant.normalise(substep(jnp.zeros_like(dt), x))
+    starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+    return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
+
+
+def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
+    """Law and observer inside the integrator's stages; the observer's linear part exact in every step."""
+    del seed, trial  # nothing is drawn
+    controller = parts.controller
+    observer: Observer = parts.observer
+    model = observer.model
+    k2 = observer.error_bound()
+    lengths = ticks.t_next - ticks.t
+    slopes = jax.vmap(observer.decay_matrix)(ticks.t, ticks.t_next)
+    largest = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(slopes, lengths))
+    decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest))(slopes, lengths)
+
+    def step(carry: tuple[_State, Array], tick: tuple) -> tuple[tuple[_State, Array], Any]:
+        (now, linear), (state, before) = tick, carry
+        dt, target = now.t_next - now.t, parts.reference(now.t)
+
+        def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
+            u, s = controller.torque(t, now.hold, x, parts.reference(t), observer.estimate(memory), k2(t))
+            x_dot = parts.plant.rate(t, x, u, parts.disturbance(t, x))
+            seen = model.unexplained(t, x, x_dot, u)
+            return x_dot, observer.forcing(t, (now.t, now.t_next), memory, seen), (u, s)
+
+        x, memory, (u, s), (u_middle, _) = integrators.etdrk4(rate, linear, now.t, state.x, before, dt)
+        d_hat = observer.estimate(before)
+        row = _row(parts, now.t, state.x, target, d_hat, u, u, s, dt > 0.0) if record else None
+        x = parts.plant.normalise(x)
+        _, _, (u_end, _) = rate(now.t_next, x, memory)
+        torques = (u, u_middle, u_end)
+        span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
+        return (_advance(parts, course, state, now, target, x, span, lambda t: x, dt), memory), row
+
+    state = _begin(parts, course)
+    first = state.sight
+    (state, memory), rows = jax.lax.scan(step, (state, observer.begin()), (ticks, decays))
+    return _finish(parts, course, first, state, memory, k2, rows, None)
+
+
+def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State:
+    judged, x0 = course.judged, course.x0
+    zero, none = jnp.zeros_like(judged.t_f), jnp.zeros(parts.plant.inputs)
+    sight = _sight(parts, course.first, x0)
+    state = _State(
+        x=x0,
+        u=none,
+        sight=sight,
+        running=metrics.begin(sight, judged, parts.plant.inputs, wheels),
+        status=jnp.int32(OK),
+        bad_time=jnp.full_like(zero, jnp.nan),
+    )
+    status, bad_time = _watch(parts, course, state, course.first, zero, zero, none)
+    return state._replace(status=status, bad_time=bad_time)
+
+
+class _Torques(NamedTuple):
+    """Torques of an interval at the quadrature nodes of `weights`, the last one at its end."""
+
+    commanded: tuple[Array, ...]
+    delivered: tuple[Array, ...]
+    weights: tuple[float, ...]
+    limited: Array
+    wheel_momentum: Array | None
+
+
+def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step) -> _State:
+    """The state after an interval: metrics and status. until: time in it -> the plant's state then.
+
+    step: longest integration step taken in it [s].
+    """
+    law, judged, target_next = parts.controller, course.judged, parts.reference(now.t_next)
+    sight = _sight(parts, target_next, x)
+
+    def errors() -> tuple:
+        return law.errors(state.x, target), law.errors(x, target_next)
+
+    def arrival() -> tuple:
+        reached = until(judged.t_f)
+        return law.errors(reached, course.arrival)[0], law.angle(reached, course.arrival)
+
+    span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
+    after = state._replace(
+        x=x,
+        u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
+        sight=sight,
+        running=metrics.update(state.running, span, judged),
+    )
+    status, bad_time = _watch(parts, course, after, target_next, now.t_next, step, torques.delivered[-1])
+    return after._replace(status=status, bad_time=bad_time)
+
+
+def _finish(parts: Parts, course, first, state: _State, memory: Array, k2, rows, world: _World | None) -> Result:
+    judged = course.judged
+    log, angle_at_t_f = None, state.running.late.angle_at_t_f
+    acting = None if world is None else world.acting
+    if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
+        target = parts.reference(judged.t_end)
+        hold = judged.t_end >= parts.controller.hand_over
+        d_hat = parts.observer.estimate(memory)
+        u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
+        u = u if world is None else state.u  # sampled: held
+        pushed = None if world is None else world.pushed
+        wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
+        last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
+        log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
+    found = metrics.finish(state.running, judged)
+    begun = metrics.begin(first, judged, parts.plant.inputs, None if acting is None else acting.h)
+    unbounded = (state.status == OK) & metrics.unbounded(found, begun)
+    missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
+    bad_time = jnp.where(unbounded, judged.t_end, jnp.where(missed, judged.t_f, state.bad_time))
+    return Result(found, status, bad_time, log)
+
+
+def _sight(parts: Parts, target: Any, x: Any) -> metrics.Sight:
+    angle = parts.controller.angle(x, target)
+    return metrics.Sight(angle, parts.plant.speed(x), guards.norm(parts.plant.momentum(x)))
+
+
+def _watch(
+    parts: Parts, course: _Course, state: _State, target: Any, t: Scalar, dt: Scalar, u: Array
+) -> tuple[Array, Array]:
+    """Status and first bad time of the state at t; the first thing that goes wrong stays."""
+    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
+    fast = parts.plant.too_fast(state.x, dt)
+    near = ~(parts.controller.clearance(state.x, target) / course.whole >= SINGULAR_CLEARANCE)
+    code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
+    first = (state.status == OK) & (code != OK)
+    return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)
+
+
+def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, lasts, pushed=None, wheels=None) -> Log:
+    d = parts.disturbance(t, x)
+    error, _ = parts.controller.errors(x, target)
+    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, wheels, lasts)

@@ -1,0 +1,229 @@
+"""The floor: what no controller can beat, since no estimator knows the state better at the time of acting.
+
+The true state differs from the target by at least what the samples do not say of it. With Gaussian noise and everything
+else known, the covariance of the Kalman filter along the run is the least that any estimator leaves: the posterior
+Cramer-Rao bound (Tichavsky, Muravchik, Nehorai, IEEE Trans. Signal Processing 46(5), 1998), at every sample
+P+ = P - P H' (H P H' + R)^-1 H P and P <- F P F' + Q between them; F is the derivative of a period of the true plant.
+
+Known are the plant, its true inertia, the disturbance but for its random walk, the torque on the body, and how large
+every noise is. The state is not, but by the samples: the bound is on whoever does as well from every start. Behind an
+attitude filter its steady state is known at t = 0, a gyro's bias by its 1 sigma. The torque in a period can use samples
+up to `delay` periods before its start: from there on the error is predicted.
+
+It bounds the mean over trials. A single run, or a small campaign, may come out below it by chance.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax import programs
+from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.devices.sensors import Reading
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.simulation import metrics, rollout
+from ptsmc_jax.simulation.clock import Graded
+from ptsmc_jax.simulation.rollout import Log, Parts
+
+UNKNOWN = 1e5  # 1 sigma of a state at t = 0, in those of its sensor: of no weight beside the first sample
+EXACT = 1e-10  # 1 sigma of a sensor without noise, in those of what is read before the first sample
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What no controller can beat; 0 where nothing is unknown."""
+
+    window_error: float  # RMS over the window after t_f, in the unit of the metric
+    t: np.ndarray  # (time,) ends of the control periods [s]
+    error: np.ndarray  # (time,) RMS of the error's 2-norm then
+
+
+class Model(NamedTuple):
+    """A linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n.
+
+    In a period the sample comes first, then v acts, then the state moves. v, n: independent, of 1 sigma each as said.
+    """
+
+    start: np.ndarray  # (n, k) factor of the covariance before the first sample: S S'
+    rows: np.ndarray  # (m, n) H
+    noise: np.ndarray  # (periods, m) 1 sigma of each reading; infinite: there is none
+    kick: np.ndarray  # (periods, n, v) B, times 1 sigma
+    move: np.ndarray  # (periods, n, n) F
+    output: np.ndarray  # (periods, outputs, n) what is asked, of z + B v
+
+
+def along(parts: Parts, log: Log) -> Floor:
+    """The floor along a run with this history (`rollout.simulate`, record=True)."""
+    ticks, log = _lasting(parts, log)
+    if isinstance(parts.clock, Graded) or (parts.sensors is None and parts.walk_rate is None):
+        return Floor(0.0, ticks.t_next, np.zeros_like(ticks.t_next))
+    delay = 0 if parts.actuators is None else parts.actuators.delay
+    seen = deviations(_model(parts, log, ticks), delay)
+    squares = np.sum(seen.reshape(len(seen), 3, -1) ** 2, axis=2)
+    judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
+    total = float(_total(ticks.t, ticks.t_next, squares, judged))
+    return Floor(float(np.sqrt(total / float(parts.window))), ticks.t_next, np.sqrt(squares[:, 2]))
+
+
+def pooled(floors: Iterable[Floor]) -> float | None:
+    """RMS of the floors of several runs, as window errors pool; None: there is no run."""
+    squares = [one.window_error**2 for one in floors]
+    return float(np.sqrt(np.mean(squares))) if squares else None
+
+
+def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
+    """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays."""
+    ticks = jax.tree.map(np.asarray, _ticks(parts))
+    times, least = np.asarray(log.t), 1e-9 * float(np.max(ticks.t_next - ticks.t))
+    there, kept = ticks.t_next - ticks.t > least, np.append(np.diff(times) > least, True)
+    return jax.tree.map(lambda v: v[there], ticks), jax.tree.map(lambda v: np.asarray(v)[kept], log)
+
+
+@programs.jit
+def _ticks(parts: Parts) -> Any:
+    return parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+
+
+@programs.jit
+def _total(t: Array, t_next: Array, squares: Array, judged: metrics.Judged) -> Array:
+    """Over the window, of squares (periods, 3) at start, middle and end."""
+    return jnp.sum(metrics.in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), judged))
+
+
+def deviations(model: Model, delay: int = 0) -> np.ndarray:
+    """1 sigma of each output (periods, outputs) given all samples up to `delay` periods before.
+
+    Factors S of P = S S' are carried by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC 16(6), 1971):
+    nothing is subtracted or inverted, so that noises of any sizes go together.
+    """
+    found = np.zeros(model.output.shape[:2])
+    factor, largest = model.start, np.zeros(len(model.rows))
+    known = deque([(0, factor)], maxlen=delay + 1)  # period, and what the samples up to it say
+
+    def moved(k: int, factor: np.ndarray) -> np.ndarray:
+        return _triangular(model.move[k] @ np.hstack([factor, model.kick[k]]))
+
+    for k in range(len(model.move)):
+        read, there = model.rows @ factor, np.isfinite(model.noise[k])
+        largest = np.maximum(largest, _sizes(read))
+        noise = np.maximum(model.noise[k], EXACT * largest)[there]
+        factor = _corrected(factor, read[there], np.diag(noise))
+        known.append((k, factor))
+        period, late = known[0]
+        for j in range(period, k):
+            late = moved(j, late)
+        found[k] = _sizes(model.output[k] @ np.hstack([late, model.kick[k]]))
+        factor = moved(k, factor)
+    return found
+
+
+def _triangular(factor: np.ndarray) -> np.ndarray:
+    """A lower triangular factor (n, n) of the same covariance as a factor (n, k), k >= n."""
+    return np.asarray(np.linalg.qr(factor.T, mode="r")).T
+
+
+def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Factor of the covariance after readings; read: their rows by the factor, (m, n); noise: a factor of theirs."""
+    m, n = read.shape
+    both = np.zeros((m + len(factor), m + n))
+    both[:m, :m], both[:m, m:], both[m:, m:] = noise, read, factor
+    return _triangular(both)[m:, m:]
+
+
+def _sizes(rows: np.ndarray) -> np.ndarray:
+    """2-norms of the rows."""
+    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
+
+
+def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
+    """What a run's samples say, and its error, of (the plant's local coordinates, the sensor's, the walk's torque)."""
+    linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
+    periods, n, m = linear.push.shape
+    clock: Any = parts.clock
+    exact = Reading(np.eye(n), np.zeros(n), np.ones(n, int), np.zeros(0), np.zeros(0))
+    said: Reading = exact if parts.sensors is None else parts.sensors.reading(float(clock.period))
+    size = n + said.own.size + m
+    torque = slice(size - m, size)
+
+    def wide(rows: np.ndarray) -> np.ndarray:
+        return np.pad(rows, [(0, 0), (0, size - rows.shape[1])])
+
+    # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
+    off = np.hypot(said.noise, np.linalg.norm(said.rows[:, n:] * said.own, axis=1))
+    unknown = UNKNOWN * np.max(np.abs(said.rows[:, :n]) * off[:, None], axis=0)
+    start = np.diag(np.concatenate([unknown, said.own, np.zeros(m)]))
+    if said.start is not None:
+        rows, covariance = said.start
+        start = _corrected(start, wide(rows) @ start, root(covariance))
+    walk = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
+    drift = np.diag(np.concatenate([np.zeros(n), said.own_drift, walk]))[:, n:]
+    move = np.tile(np.eye(size), (periods, 1, 1))
+    move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
+    output = np.zeros((periods, linear.seen.shape[1], size))
+    output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
+    return Model(
+        start=start,
+        rows=wide(said.rows),
+        noise=np.where(ticks.sample[:, None] % said.every == 0, said.noise, np.inf),
+        kick=np.asarray(ticks.t_next - ticks.t)[:, None, None] * drift,
+        move=move,
+        output=output,
+    )
+
+
+def root(covariance: np.ndarray) -> np.ndarray:
+    """A factor (n, n) of a covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+class _Linear(NamedTuple):
+    """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
+
+    seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
+    cubic that `metrics` draws.
+    """
+
+    move: Array  # (periods, n, n)
+    push: Array  # (periods, n, m)
+    seen: Array  # (periods, 3 m, n)
+    seen_push: Array  # (periods, 3 m, m)
+
+
+@programs.jit(compiler_options=programs.QUICKLY)
+def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
+    """Every period of a run linearised, by the code that flies it."""
+    actuators = Actuators() if parts.actuators is None else parts.actuators
+    law, plant = parts.controller, parts.plant
+    before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
+
+    def acted(state: Any, now: tuple) -> tuple:
+        tick, x, wanted = now
+        dt = tick.t_next - tick.t
+        drive, queue = actuators.command(state, wanted, plant.velocity(x), dt, tick.noise_weight)
+        return actuators.end(state, drive, queue, dt), drive
+
+    _, drives = jax.lax.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))
+
+    def period(tick: Ticks, x: Any, x_next: Any, drive: Any, disturbance: Array) -> _Linear:
+        dt, target, target_next = tick.t_next - tick.t, parts.reference(tick.t), parts.reference(tick.t_next)
+        pushed = disturbance - parts.disturbance(tick.t, x)
+
+        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array]:
+            near = plant.moved(x, z)
+            near_next = rollout.over_period(parts, tick.t, near, drive, pushed + push, dt)
+            (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
+            middle = (start + end) / 2 + dt / 8 * (rate - rate_next)
+            return plant.apart(x_next, near_next), jnp.concatenate([start, middle, end])
+
+        still = jnp.zeros_like(plant.apart(x, x))
+        (move, push), (seen, seen_push) = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
+        return _Linear(move, push, seen, seen_push)
+
+    return jax.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])

@@ -1,0 +1,377 @@
+"""The sampled loop linearised by the code that flies it, and opened: at the plant's input and at the sensors.
+
+A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of `computer.decide` and
+`rollout.over_period`): the true state x, the state of the actuators, and what the flight computer keeps, its own model
+of the actuators among it. Closed are
+
+    z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
+
+with x_seen = x, the state that the sensors see; u_new, u_old = u, `delay` periods ago, which acts from `late` on, and a
+period before that, until then; d a torque on the plant. The flight computer is told what its own model of the actuators
+makes of u: a gain or a delay at the plant's input is one that it does not know. About the nominal run: no noise and no
+disturbance; of a star tracker that is slower than the loop the mean over its interval.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
+
+from ptsmc_jax import programs
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState
+from ptsmc_jax.devices.sensors import Sensors, StateSensor
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, boot, decide, schedule, told
+
+Scalar = Float[Array, ""]
+
+NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
+_WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # of Lagrange's polynomials
+
+
+class Carry(NamedTuple):
+    """What the loop carries from sample to sample."""
+
+    x: Any  # true state of the plant
+    acting: ActuatorState  # true state of the actuators, without commands on their way
+    computer: Computer
+    model: ActuatorState  # the flight computer's own of its actuators, with them
+
+
+@pytree
+@dataclass(frozen=True)
+class Loop:
+    """A period of the loop, opened, see above: z (n,), of which the first k are x; u (m,)."""
+
+    a: Leaf  # (n, n) A
+    seen: Leaf  # (n, k) B
+    new: Leaf  # (nodes, n, m) N, for `late` at NODES of a period
+    old: Leaf  # (nodes, n, m) O
+    command: Leaf  # (m, n) C
+    direct: Leaf  # (m, k) D
+    disturbed: Leaf  # (n, m) E
+    period: Leaf  # h [s]
+    delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
+
+    def closed_at_sensors(self) -> tuple[Float[Array, "n n"], Float[Array, "m n"]]:
+        """A (n, n) and C (m, n) with x_seen = x, in the units of the coordinates: rad, rad/s, [N m]."""
+        k = self.seen.shape[1]
+        return self.a.at[:, :k].add(self.seen), self.command.at[:, :k].add(self.direct)
+
+
+class Nominal(NamedTuple):
+    """The nominal run: arrays over the control periods first."""
+
+    period: Period
+    carry: Carry  # before the period
+    after: Carry
+    command: Array  # u that arrives in it
+
+
+def quiet(parts: Parts) -> Parts:
+    """The parts without noise and disturbance; a sensor of one's own keeps its noise, of trial 0."""
+    sensors: Any = parts.sensors
+    if isinstance(sensors, Sensors):
+        known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)
+        none = jnp.zeros_like(jnp.asarray(sensors.attitude_noise))
+        sensors = replace(sensors, attitude_noise=none, rate_noise=none, rate_bias=None, bias_rate=None, filter=known)
+    elif isinstance(sensors, StateSensor):
+        sensors = replace(sensors, sigma=0.0 * sensors.sigma)
+    nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
+    return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
+
+
+def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
+    return zero
+
+
+def nominal(parts: Parts) -> Nominal:
+    """The nominal run of sampled parts."""
+    assert not isinstance(parts.clock, clock.Graded)
+    parts = quiet(parts)
+    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    listed, about, started = schedule(parts, ticks)
+    k2, actuators = parts.observer.error_bound(), _actuators(parts)
+    x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    model = actuators.begin(parts.plant.inputs)
+    computer = boot(parts, np.uint32(0), np.uint32(0), x0, started)
+
+    def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
+        period = about(tick)
+        decision, computer, model = _computed(parts, k2, period, carry, carry.x)
+        wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
+        x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
+        after = Carry(x, acting, computer, model)
+        return after, Nominal(period, carry, after, wanted)
+
+    first = Carry(x0, model._replace(queue=None), computer, model)
+    return jax.lax.scan(step, first, listed)[1]
+
+
+nominal_jit = programs.jit(nominal)
+
+
+def _actuators(parts: Parts) -> Actuators:
+    return Actuators() if parts.actuators is None else parts.actuators
+
+
+def _computed(
+    parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
+) -> tuple[Decision, Computer, ActuatorState]:
+    """The flight computer's part of a period; seen: the state as the sensors see it."""
+    actuators, dt = _actuators(parts), period.length
+    decision, computer = decide(parts, k2, period, carry.computer, seen)
+    drive, queue = actuators.command(carry.model, decision.u, decision.w, dt, period.now.noise_weight)
+    computer = computer._replace(told=told(actuators, drive, dt))
+    return decision, computer, actuators.end(carry.model, drive, queue, dt)
+
+
+def _acted(
+    parts: Parts,
+    period: Period,
+    carry: Carry,
+    w: Array,
+    commands: Sequence[tuple[Array, Scalar, Scalar]],
+    pushed: Array | None = None,
+) -> tuple[Any, ActuatorState]:
+    """What actuators and plant make of commands that arrive, each with its time and how long it acts [s].
+
+    pushed: a torque on the plant besides, (m,).
+    """
+    prompt, x, acting = replace(_actuators(parts), delay=0), carry.x, carry.acting
+    for command, t, length in commands:
+        drive, _ = prompt.command(acting, command, w, length, period.now.noise_weight)
+        x = rollout.over_period(parts, t, x, drive, pushed, length)
+        acting = prompt.end(acting, drive, None, length)
+    return x, acting
+
+
+class _Local:
+    """Local coordinates of carries about one: x, then the state last seen, the sensors' memory, and all the rest."""
+
+    def __init__(self, parts: Parts, base: Carry):
+        self._plant, self._sensors, self._base = parts.plant, parts.sensors, base
+        self._turned = hasattr(parts.sensors, "moved")
+        start = jnp.zeros_like(parts.plant.apart(base.x, base.x))
+        inside = parts.sensors.apart(base.computer.sensing, base.computer.sensing) if self._turned else jnp.zeros(0)
+        rest, self._unravel = ravel_pytree(self._rest(base))
+        self.sizes = [start.size, start.size, inside.size, rest.size]
+
+    def _rest(self, carry: Carry) -> Any:
+        computer = carry.computer
+        kept = None if self._turned else _numbers(computer.sensing)
+        return carry.acting, computer.memory, computer.told, carry.model, kept
+
+    def moved(self, z: Array) -> Carry:
+        x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
+        base, plant = self._base, self._plant
+        acting, memory, told, model, kept = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
+        inside = base.computer.sensing
+        inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
+        computer = Computer(inside, plant.moved(base.computer.seen, seen), memory, told)
+        return Carry(plant.moved(base.x, x), acting, computer, model)
+
+    def apart(self, other: Carry) -> Array:
+        base, plant = self._base, self._plant
+        seen = plant.apart(base.computer.seen, other.computer.seen)
+        inside = jnp.zeros(0)
+        if self._turned:
+            inside = self._sensors.apart(base.computer.sensing, other.computer.sensing)
+        rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
+        return jnp.concatenate([plant.apart(base.x, other.x), seen, inside, rest])
+
+
+def _numbers(memory: Any) -> list[Array]:
+    """The numbers of a sensor's memory that can change by a little."""
+    return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+
+
+def _with_numbers(memory: Any, numbers: list[Array]) -> Any:
+    leaves, structure = jax.tree.flatten(memory)
+    given = iter(numbers)
+    new = [next(given) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
+    return jax.tree.unflatten(structure, new)
+
+
+class Opened(NamedTuple):
+    """A control period of the nominal run: the loop, and what is asked of it."""
+
+    loop: Loop
+    error: Array  # (m, k) of what the law drives to zero, by x
+    s_command: Array  # (components, n) of s by z
+    s_direct: Array  # (components, k) and by x_seen
+
+
+def opened(parts: Parts, during: Nominal) -> Opened:
+    """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock."""
+    parts = quiet(parts)
+    period, before, after, arriving = during
+    k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
+    here, there, now, dt = _Local(parts, before), _Local(parts, after), period.now, period.length
+    z0, x0, u0 = jnp.zeros(sum(here.sizes)), jnp.zeros(here.sizes[0]), jnp.zeros(plant.inputs)
+    target = parts.reference(now.t)
+
+    def flown(z: Array, seen: Array) -> tuple[Array, Array, Array]:
+        carry = here.moved(z)
+        decision, computer, model = _computed(parts, k2, period, carry, plant.moved(before.x, seen))
+        x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
+        return there.apart(Carry(x, acting, computer, model)), decision.u, decision.s
+
+    def pushed(late: Scalar) -> tuple[Array, Array, Array]:
+        def ended(old: Array, new: Array, d: Array) -> Array:
+            commands = [(arriving + old, now.t, late * dt), (arriving + new, now.t + late * dt, (1.0 - late) * dt)]
+            x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
+            return there.apart(after._replace(x=x, acting=acting))
+
+        return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
+
+    (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, x0)
+    old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
+    loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=_actuators(parts).delay)
+    error = jax.jacfwd(lambda by: law.errors(plant.moved(before.x, by), target)[0])(x0)
+    return Opened(loop, error, s_command, s_direct)
+
+
+TOGETHER = 32  # periods that one call of the compiled program opens
+
+
+def opened_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Opened:
+    """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s].
+
+    By one program, however many they are and however many the run has.
+    """
+    parts = replace(parts, clock=clock.flight(1.0, 1.0))
+    run = jax.tree.map(np.asarray, run)
+    calls = []
+    for k in range(0, len(indices), TOGETHER):
+        some = np.resize(indices[k : k + TOGETHER], TOGETHER)
+        calls.append(jax.tree.map(np.asarray, _opened(parts, jax.tree.map(lambda v, some=some: v[some], run))))
+    return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
+
+
+@programs.jit(compiler_options=programs.QUICKLY)
+def _opened(parts: Parts, during: Nominal) -> Opened:
+    return jax.vmap(partial(opened, parts))(during)
+
+
+def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
+    """The loops opened in these periods, by their numbers (periods,), arrays over them first, h in [s].
+
+    Of a star tracker that is slower than the loop means over its interval.
+    """
+    several = _interval(parts, indices)
+    loops = jax.tree.map(jnp.asarray, opened_in(parts, run, several.reshape(-1)).loop)
+    return _means(loops, several.shape)
+
+
+def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
+    """The same `loops_in`, h in [s], of indices (periods,), for any transformation."""
+    several = _interval(parts, indices)
+    loops = jax.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
+    return _means(loops, several.shape)
+
+
+def _interval(parts: Parts, indices: Any) -> Any:
+    """(periods, every): those since the star tracker's sample before."""
+    every = getattr(parts.sensors, "every", 1)
+    return (indices[:, None] - np.arange(every)[None]).clip(0)
+
+
+def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
+    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
+
+
+def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
+    """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
+    ticks, period = run.period.now, parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
+    return np.flatnonzero(whole & (np.asarray(ticks.hold) == hold))
+
+
+def acting(loop: Loop, late: Scalar) -> tuple[Array, Array]:
+    """N and O, (n, m) each, for a command [N m] that is late by a share of a period, by polynomials through NODES."""
+    gap = late - jnp.asarray(NODES)
+    on = jnp.abs(gap) < 1e-14
+    weights = jnp.asarray(_WEIGHTS) / jnp.where(on, 1.0, gap)
+    weights = jnp.where(jnp.any(on), on.astype(float), weights / jnp.sum(weights))
+    return jnp.tensordot(weights, loop.new, 1), jnp.tensordot(weights, loop.old, 1)
+
+
+class Opening(NamedTuple):
+    """L(z) = -C (z - A)^-1 B of a loop opened somewhere: what comes back there, its sign changed.
+
+    Its states are z and the commands on their way. 1 + L = 0 is the border of stability.
+    """
+
+    a: Array  # (n, n)
+    b: Array  # (n, m)
+    c: Array  # (m, n)
+
+    def closed(self, gain: Any = 1.0) -> Array:
+        """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
+        return self.a + self.b @ (gain * self.c if jnp.ndim(gain) == 0 else gain @ self.c)
+
+    def response(self, z: Array, *, triangular: bool = False) -> Complex[Array, "m m"]:
+        """L(z) [-], (m, m), what comes back by what acts; triangular: A is, see `in_triangles`."""
+        system, b = z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j
+        return -self.c @ (jax.scipy.linalg.solve_triangular(system, b) if triangular else jnp.linalg.solve(system, b))
+
+    def in_triangles(self) -> "Opening":
+        """The same L [-] with a triangular A (n, n), by Schur's decomposition: many of its values cost little."""
+        a, turned = jax.scipy.linalg.schur(self.a, output="complex")
+        return Opening(a, jnp.conj(turned.T) @ self.b, self.c @ turned)
+
+
+def at_input(loop: Loop, late: float = 0.0) -> Opening:
+    """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
+    a, command = loop.closed_at_sensors()
+    m, n = command.shape
+    total = loop.delay + late
+    whole = int(np.floor(total + 1e-12))
+    part = max(total - whole, 0.0)
+    new, old = (loop.new[0], None) if part == 0.0 else acting(loop, jnp.asarray(part))
+    kept = (whole + (part > 0.0)) * m  # states that hold commands on their way, the newest first
+    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(a)
+    full = full.at[n + m :, n : n + kept - m].set(jnp.eye(max(kept - m, 0)))
+    b = jnp.zeros((n + kept, m)).at[n : n + m].set(jnp.eye(min(kept, m), m))
+    for back, push in ((whole, new), (whole + 1, old)):  # the command of so many periods ago
+        if push is not None and back == 0:
+            b = b.at[:n].add(push)
+        elif push is not None:
+            full = full.at[:n, n + (back - 1) * m : n + back * m].add(push)
+    return Opening(full, b, jnp.zeros((m, n + kept)).at[:, :n].set(command))
+
+
+def at_sensors(loop: Loop) -> Opening:
+    """The loop opened at the sensors, B (n, k): the state that follows, in rad and rad/s, of what they see."""
+    (n, k), (m, _) = loop.seen.shape, loop.command.shape
+    push, kept = loop.new[0], loop.delay * m
+    if not kept:
+        return Opening(loop.a + push @ loop.command, loop.seen + push @ loop.direct, jnp.eye(k, n))
+    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(push)
+    full = full.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + kept - m].set(jnp.eye(kept - m))
+    b = jnp.zeros((n + kept, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
+    return Opening(full, b, jnp.eye(k, n + kept))
+
+
+def one_late(loop: Loop, z: Array, late: Scalar, axis: Any) -> Complex[Array, "m m"]:
+    """L(z) [-] at the plant's input, (m, m), one axis late by any number of periods more."""
+    a, command = loop.closed_at_sensors()
+    whole = jnp.floor(late)
+    new, old = acting(loop, late - whole)
+    delayed = (new + old / z) * z**-whole
+    sent = jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0])
+    return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent))
+
+
+def radius(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> float:
+    """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1."""
+    return float(np.abs(np.linalg.eigvals(at_input(loop, late).closed(gain))).max())

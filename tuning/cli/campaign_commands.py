@@ -1,0 +1,232 @@
+"""The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tuning.cli.options import (
+    INTERRUPTED,
+    Device,
+    Figures,
+    Force,
+    Out,
+    Quiet,
+    ScenarioFile,
+    Seed,
+    Trust,
+    between,
+    prepare,
+    whole,
+)
+from tuning.errors import UsageError
+from tuning.output import campaign_terminal, terminal
+
+MOST = 2**32  # trials: their numbers have 32 bits
+
+CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
+
+
+def montecarlo(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    trials: Annotated[str, Parameter(help="Trials, a whole number from 1 to 4294967296.")] = "10000",
+    seed: Seed = "0",
+    out: Out = None,
+    until_confident: Annotated[
+        str | None,
+        Parameter(help="Stop once every requirement's share is known to within this width, a number between 0 and 1."),
+    ] = None,
+    metrics: Annotated[
+        str | None, Parameter(help="FILE.py:NAME of a function that adds metrics of your own to the rows.")
+    ] = None,
+    shard: Annotated[
+        str, Parameter(help="I/N: fly the I-th of N shares only, for batch queues; they may share a folder.")
+    ] = "1/1",
+    cluster: Annotated[
+        str | None, Parameter(help="Fly on a Dask cluster: address or scheduler file; or local:N, N processes here.")
+    ] = None,
+    tls_ca: Annotated[Path | None, Parameter(help="TLS: certificate authority's file.")] = None,
+    tls_cert: Annotated[Path | None, Parameter(help="TLS: this client's certificate.")] = None,
+    tls_key: Annotated[Path | None, Parameter(help="TLS: this client's private key.")] = None,
+    device: Device = "cpu",
+    precision: Annotated[
+        str, Parameter(help="Bits of every number, 64 or 32; what 32 put out of reach stands in docs/python.md.")
+    ] = "64",
+    dry_run: Annotated[
+        bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
+    ] = False,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly a campaign: many trials of a scenario, every one counted, kept and replayable.
+
+    Interrupted or killed, the same command goes on from there; with more trials it adds to what is there.
+
+    Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
+    input or a full disk, 130 interrupted.
+    """
+    count, key = whole("--trials", trials, 1, MOST), whole("--seed", seed)
+    width = None if until_confident is None else between("--until-confident", until_confident, 0.0, 1.0)
+    share = _shard(shard)
+    tls = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
+    tls = {name: str(path) for name, path in tls.items() if path is not None}
+    if tls and cluster is None:
+        raise UsageError("--tls-ca, --tls-cert and --tls-key go with --cluster only")
+    if width is not None and (share != (1, 1) or dry_run):
+        raise UsageError("--until-confident looks at all rows, and does not go with --shard or --dry-run")
+    if cluster is not None and (share != (1, 1) or dry_run):
+        raise UsageError("--cluster does not go with --shard or --dry-run")
+    if precision not in ("64", "32"):
+        raise UsageError(f"--precision is {precision}, but must be 64 or 32")
+    bits = 32 if precision == "32" else 64
+    if (bits, device) != (64, "cpu") and cluster is not None:
+        raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
+    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
+    from ptsmc_jax.scenario import layouts
+
+    if width is not None and set(loaded.requirements) <= set(layouts.MARGINS):
+        raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
+    from tuning.studies import campaign_folder
+
+    folder = campaign_folder.Folder(path, loaded, key, count, metrics, bits)
+    _ = folder.campaign  # what it refuses, it refuses before anything is written
+    if cluster is not None:
+        from ptsmc_jax.campaigns import cluster as clusters
+
+        elsewhere = clusters.connected(cluster, tls)
+    else:
+        elsewhere = None
+    campaign_folder.begin(folder, force)
+    try:
+        with campaign_terminal.Progress(quiet) as told:
+            if dry_run:
+                campaign_folder.write_plan(folder, told)
+            elif width is not None:
+                from tuning.studies import campaign_summary  # takes a second to import, which flying need not wait for
+
+                stopped = campaign_summary.until_confident(
+                    folder, width, lambda first: campaign_folder.fly(folder, share, told, elsewhere, first)
+                )
+                folder = campaign_folder.settle(folder, stopped)
+            else:
+                campaign_folder.fly(folder, share, told, elsewhere)
+            if not dry_run:
+                campaign_folder.find_floor(folder)
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        if elsewhere is not None:
+            elsewhere.close()
+    if dry_run or share != (1, 1):
+        if not quiet:
+            campaign_terminal.share_done(folder, share, planned=dry_run)
+        return 0
+    return _summarised(folder, quiet, figures)
+
+
+def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
+    """Verdicts, quantiles with intervals and figures of a campaign, from its rows.
+
+    Exit status: 0 every requirement met (without any: no trial failed or missed t_f), 1 not so or not all trials flown
+    yet, 2 bad input, among it rows that are damaged.
+    """
+    _configured(folder)
+    from tuning.studies import campaign_folder
+
+    return _summarised(campaign_folder.opened(folder), quiet, figures)
+
+
+def worst(
+    folder: CampaignFolder,
+    /,
+    *,
+    by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
+    n: Annotated[str, Parameter(name=["--n", "-n"], help="Trials, a whole number from 1 to 10000.")] = "5",
+    quiet: Quiet = False,
+) -> int:
+    """The worst trials of a campaign, failed ones first; leaves worst.csv in its folder.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    count = whole("--n", n, 1, 10_000)
+    _configured(folder)
+    from ptsmc_jax.campaigns import store
+    from tuning.studies import campaign_folder, campaign_summary
+
+    frame = campaign_summary.worst(campaign_folder.opened(folder), by, count)
+    store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
+    if not quiet:
+        campaign_terminal.worst(frame, by, folder)
+    return 0
+
+
+def replay(
+    folder: CampaignFolder,
+    /,
+    *,
+    trial: Annotated[str, Parameter(help="Number of the trial.")],
+    out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly one trial of a campaign again, with its whole history, and compare it with its row.
+
+    Exit status: 0 the run equals its row to 1e-12 (or has none yet), 1 it does not, 2 bad input.
+    """
+    number = whole("--trial", trial)
+    _configured(folder)
+    from ptsmc_jax.campaigns import store
+    from tuning.search import own_parts
+    from tuning.studies import campaign_folder, campaign_summary, single
+
+    opened = campaign_folder.opened(folder)
+    if number >= opened.trials:
+        raise UsageError(f"--trial is {number}, but must be a whole number from 0 to {opened.trials - 1}")
+    place = out if out is not None else folder / "replay" / str(number)
+    store.check(place, force or out is None)  # a replay of the same trial is the same
+    own_parts.allow(opened.programs, folder, opened.told, trust)
+    opened = replace(opened, trusted=True)
+    found = campaign_summary.replay(opened, number)
+    store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, number, figures))
+    if not quiet:
+        terminal.run(single.summary(found.run), opened.scenario.plant.kind, place)
+        campaign_terminal.replayed(found.off, found.rounding)
+    return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
+
+
+def _configured(folder: Path) -> None:
+    """Set JAX up with as many bits as the campaign was flown with."""
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.configure import configure
+
+    configure(keep_programs=True, device="cpu", bits=32 if store.made(folder).get("precision") == 32 else 64)
+
+
+def _summarised(folder, quiet: bool, figures: bool) -> int:
+    from tuning.studies import campaign_summary
+
+    found = campaign_summary.summarise(folder)
+    campaign_summary.write_summary(folder, found, figures)
+    if not quiet:
+        campaign_terminal.campaign(found, folder.path)
+    return 0 if found["status"] == "met" else 1
+
+
+def _shard(value: str) -> tuple[int, int]:
+    number, _, of = value.partition("/")
+    try:
+        share = int(number), int(of)
+    except ValueError:
+        share = (0, 0)
+    if not 1 <= share[0] <= share[1]:
+        raise UsageError(f"--shard is {value}, but must be I/N with I from 1 to N")
+    return share

@@ -1,0 +1,395 @@
+"""The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+import ptsmc_jax
+from tuning.cli import campaign_commands, writing_commands
+from tuning.cli.options import (
+    INTERRUPTED,
+    Device,
+    Figures,
+    Force,
+    Out,
+    Quiet,
+    SampledFile,
+    ScenarioFile,
+    Seed,
+    Trust,
+    prepare,
+    whole,
+)
+from tuning.errors import UsageError
+from tuning.output import terminal
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
+
+app = App(
+    name="ptsmc",
+    help="Prescribed-time sliding mode control: reproduce the paper, simulate, tune the gains.",
+    version=ptsmc_jax.__version__,
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+)
+
+LONG = 20_000  # integration steps of a run that takes more than a moment
+_STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
+
+
+@app.command
+def simulate(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = "0",
+    trial: Annotated[
+        str | None,
+        Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
+    ] = None,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly one run and write its history, metrics and figures.
+
+    Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
+    """
+    key = whole("--seed", seed)
+    number = None if trial is None else whole("--trial", trial)
+    loaded, folder = prepare(scenario, "simulate", out, trust=trust)
+    from ptsmc_jax.campaigns import store
+
+    store.check(folder, force)
+    from ptsmc_jax.campaigns import runs
+    from ptsmc_jax.scenario import pace, study
+    from tuning.studies import single
+
+    ready = study(loaded, drawn=number is not None)
+    if pace.steps(ready.parts) > LONG and not quiet:
+        terminal.say(f"flying {pace.steps(ready.parts)} integration steps, with their history")
+    run = runs.fly(ready, key, number)
+    store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
+    if not quiet:
+        terminal.run(single.summary(run), loaded.plant.kind, folder)
+    return 0 if run.met else 1
+
+
+@app.command
+def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, figures: Figures = True) -> int:
+    """Fly every figure of the paper, and set its claims and its slips beside what is measured.
+
+    Exit status: 0 done, 1 a run failed, 2 bad input.
+    """
+    from ptsmc_jax.campaigns import store
+
+    folder = out if out is not None else Path("out") / "reproduce"
+    store.check(folder, force)
+    from ptsmc_jax.configure import configure
+
+    configure(keep_programs=True)
+    from tuning.studies import reproduction
+
+    made = reproduction.reproduce()
+    store.write(folder, lambda making: reproduction.write(making, made, figures))
+    if not quiet:
+        terminal.reproduction(reproduction.summary(made), folder)
+    return 0 if made.ok else 1
+
+
+@app.command(name="map")
+def map_(
+    scenario: SampledFile = None,
+    /,
+    *,
+    x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
+    y: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "controller.delta=0.05:5:9",
+    trials: Annotated[str, Parameter(help="Trials of each pair, a whole number from 1 to 1000000.")] = "32",
+    out: Out = None,
+    seed: Seed = "0",
+    device: Device = "cpu",
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Fly the scenario over two of its keys: window error and peak torque, with the borders of linear theory.
+
+    Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
+    """
+    key, count = whole("--seed", seed), whole("--trials", trials, 1, 1_000_000)
+    loaded, folder = prepare(scenario, "map", out, device, trust=trust)
+    from ptsmc_jax.campaigns import store
+
+    store.check(folder, force)
+    from tuning.studies import mapping
+
+    try:
+        across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
+    except mapping.AxisError as error:
+        raise UsageError(str(error)) from None
+    if across.key == up.key:
+        raise UsageError(f"--y is {y}, but must be another key than --x")
+    with terminal.Progress(quiet) as told:
+        cells = mapping.fly(loaded, across, up, key, count, lambda done, total: told("flying pairs", done, total))
+    store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, key, figures))
+    if not quiet:
+        terminal.grid(cells, folder)
+    return 0
+
+
+@app.command
+def margins(
+    scenario: SampledFile = None,
+    /,
+    *,
+    out: Out = None,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find what gain, phase, delay and sensitivity the loop leaves: in hold, and frozen on the way to the hand-over.
+
+    Exit status: 0 done and stable in hold, 1 done but not stable, 2 bad input.
+    """
+    loaded, folder = prepare(scenario, "margins", out, trust=trust)
+    from ptsmc_jax.campaigns import store
+
+    store.check(folder, force)
+    from tuning.studies import stability
+
+    ready, course = stability.find(loaded)
+    store.write(folder, lambda making: stability.write(making, ready, course, figures))
+    found = stability.summary(ready, course)
+    if not quiet:
+        terminal.margins(found, folder)
+    return 0 if found["stable"] else 1
+
+
+@app.command
+def tune(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = "0",
+    global_check: Annotated[
+        bool, Parameter(negative="", help="Compare with differential evolution, and report the distance.")
+    ] = False,
+    device: Device = "cpu",
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find the gains with the smallest error after t_f that keep every limit, and prove them on fresh trials.
+
+    Ctrl-C ends the search and judges the best gains so far; the same command goes on from there, and so it does after
+    a kill.
+
+    Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
+    """
+    key = whole("--seed", seed)
+    loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
+    from tuning.studies import tune_files, tuner
+
+    loaded = _with_tune(loaded)
+    goal = tuner.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
+    known_by = tune_files.told(loaded, key, globally=global_check)
+    return _search(
+        loaded, folder, known_by, force, quiet, goal,
+        work=lambda told, journal: tuner.tune(loaded, key, told, journal, globally=global_check),
+        write=lambda making, found: tune_files.write(making, loaded, found, figures, known_by),
+        summary=tune_files.summary,
+        shown=terminal.tuning,
+    )  # fmt: skip
+
+
+@app.command
+def pareto(
+    scenario: ScenarioFile = None,
+    /,
+    *,
+    points: Annotated[str, Parameter(help="Limits on the torque to tune for, a whole number from 3 to 100.")] = "20",
+    out: Out = None,
+    seed: Seed = "0",
+    device: Device = "cpu",
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Find the front of accuracy against peak torque, every point of it judged on fresh trials.
+
+    Interrupted or killed, the same command goes on from there.
+
+    Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
+    interrupted.
+    """
+    key, count = whole("--seed", seed), whole("--points", points, 3, 100)
+    loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
+    from tuning.studies import pareto as fronts
+
+    loaded = _with_tune(loaded)
+    fronts.check(loaded)
+    known_by = fronts.told(loaded, key, count)
+    return _search(
+        loaded, folder, known_by, force, quiet, "window error",
+        work=lambda told, journal: fronts.trace(loaded, key, count, told, journal),
+        write=lambda making, found: fronts.write(making, loaded, found, figures, known_by),
+        summary=lambda found: fronts.summary(found, loaded),
+        shown=terminal.front,
+    )  # fmt: skip
+
+
+@app.command
+def compare(
+    scenario: SampledFile = None,
+    /,
+    *,
+    out: Out = None,
+    seed: Seed = "0",
+    device: Device = "cpu",
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    figures: Figures = True,
+) -> int:
+    """Tune the paper's law and three others to the same requirements, and judge all on the same fresh trials.
+
+    The others are quaternion PD, nonsingular terminal and fixed-time sliding mode. Interrupted or killed, the same
+    command goes on from there.
+
+    Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
+    interrupted.
+    """
+    key = whole("--seed", seed)
+    loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
+    from tuning.studies import compare as comparing
+
+    comparing.check(loaded)
+    loaded = _with_tune(loaded)
+    known_by = comparing.told(loaded, key)
+    return _search(
+        loaded, folder, known_by, force, quiet, "",
+        work=lambda told, journal: comparing.compare(loaded, key, told, journal),
+        write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
+        summary=comparing.summary,
+        shown=terminal.comparison,
+    )  # fmt: skip
+
+
+@app.command
+def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fish or powershell.")], /) -> int:
+    """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).
+
+    Exit status: 0 done, 2 bad input.
+    """
+    if shell not in ("bash", "zsh", "fish", "powershell"):
+        raise UsageError(f"the shell is {shell}, but must be bash, zsh, fish or powershell")
+    terminal.say(app.generate_completion(shell=shell))
+    return 0
+
+
+for _command in (
+    writing_commands.report,
+    writing_commands.new,
+    writing_commands.convert_attitude,
+    campaign_commands.montecarlo,
+    campaign_commands.summarize,
+    campaign_commands.worst,
+    campaign_commands.replay,
+):
+    app.command(_command)
+
+
+def main() -> None:
+    """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
+    status: object = None
+    try:
+        status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        _fail(" ".join(str(error).split()))
+    except ValueError as error:
+        if not _expected(error):
+            raise
+        _fail(str(error))
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; nothing was written", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except OSError as error:
+        _fail(f"{error.strerror or error}: {error.filename}")
+    finally:
+        if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
+            programs.stop()  # exiting waits for what is being compiled
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _expected(error: ValueError) -> bool:
+    from ptsmc_jax.campaigns.store import RefusedError
+    from ptsmc_jax.scenario.errors import ScenarioError
+
+    return isinstance(error, ScenarioError | RefusedError | UsageError)
+
+
+def _fail(sentence: str) -> None:
+    print(f"ptsmc: {sentence}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _with_tune(scenario: "Scenario") -> "Scenario":
+    """The scenario with a `tune` table, the default one where it has none."""
+    from ptsmc_jax.scenario import replace
+
+    return scenario if scenario.tune is not None else replace(scenario, tune={})
+
+
+def _search(
+    loaded: "Scenario",
+    folder: Path,
+    known_by: dict[str, Any],
+    force: bool,
+    quiet: bool,
+    goal: str,
+    *,
+    work: Callable[..., Any],
+    write: Callable[[Path, Any], None],
+    summary: Callable[[Any], dict[str, Any]],
+    shown: Callable[[dict[str, Any], Path, str], None],
+) -> int:
+    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.scenario import schema, study
+
+    tables = schema.dump(loaded)
+    done = None if force else store.previous(folder, tables, known_by)
+    if done is not None and done["status"] != "interrupted":
+        if not quiet:
+            shown(done, folder, "already done")
+        return _STATUS[done["status"]]
+    going_on = not force and store.begun(folder, tables, known_by)
+    if not going_on:
+        store.check(folder, force)
+    study(loaded)  # what it refuses, it refuses before the search
+    from tuning.search.journal import Journal
+
+    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
+    try:
+        with terminal.Progress(quiet, goal) as told:
+            found = work(told, journal)
+    except KeyboardInterrupt:
+        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
+        return _STATUS["interrupted"]
+    store.write(folder, lambda making: write(making, found))
+    if found.status != "interrupted":
+        store.end(folder)
+    if not quiet:
+        shown(summary(found), folder, "interrupted" if found.status == "interrupted" else "done")
+    return _STATUS[found.status]

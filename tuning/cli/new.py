@@ -1,0 +1,185 @@
+"""`ptsmc new`: a scenario with every key that its plant has, its value, unit and meaning; what is off is commented."""
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+
+from ptsmc_jax import scenario
+from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, schema
+from ptsmc_jax.scenario.law_tables import Prescribed
+from ptsmc_jax.scenario.signal_tables import Attitude
+from ptsmc_jax.scenario.tables import Scenario, Tune
+from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.simulation import catalogues
+from tuning.errors import UsageError
+
+COLUMN, WIDTH = 36, 120
+# Values shown for keys that are off and have none of their own; a system's own name is what a user puts there.
+EXAMPLES: dict[str, Any] = {
+    "plant.system": "my_plant.py:my_plant",
+    "spacecraft.true_inertia": [10.5, 12.6, 14.7],
+    "initial.quat_xyzw": [0.0, 0.0, 0.0, 1.0],
+    "initial.quat_wxyz": [1.0, 0.0, 0.0, 0.0],
+    "initial.rotvec_deg": [0.0, 0.0, 120.0],
+    "initial.mrp": [0.0, 0.0, 0.5],
+    "initial.dcm_body_to_inertial": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+    "initial.euler_deg": [90.0, 0.0, 0.0],
+    "initial.sequence": "ZYX",
+    "disturbance.terms": [{"kind": "constant"}, {"kind": "sinusoid"}],
+    "hardware.torque_limit": 0.5,
+    "hardware.torque_rate_limit": 5.0,
+    "hardware.torque_lag": 0.1,
+    "hardware.torque_step": 1e-4,
+    "hardware.delay": 1,
+    "hardware.attitude_noise": 2e-5,
+    "hardware.rate_noise": 1e-6,
+    "hardware.rate_noise_density": 2e-7,
+    "hardware.rate_bias": 1e-6,
+    "hardware.rate_bias_walk": 1e-8,
+    "hardware.star_tracker_every": 4,
+    "hardware.state_noise": 1e-4,
+    "wheels.torque_limit": 0.2,
+    "wheels.momentum_limit": 4.0,
+    "wheels.momentum": 0.0,
+    "filter.bandwidth": 0.05,
+    "dispersion.half_width": 1.0,
+    "dispersion.std": 1.0,
+    "tune.level": 0.9,
+}
+REQUIREMENTS = {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}, "peak_torque": 0.5}
+INTRODUCTION = """\
+A scenario for ptsmc. Every key is optional; what is left out has the value shown here, but [tables] that are off, like
+#[hardware], stay off. To use a line such as #delay = 1, take its # away, and that of its table. Units stand in
+brackets. The keys of another kind follow it, and take the place of those of the kind in use."""
+
+
+class _File:
+    """The lines of one scenario file."""
+
+    def __init__(self, said: Scenario, resolved: Scenario):
+        self.resolved, self.plant = resolved, resolved.plant.kind
+        self.live = schema.dump(said)
+        self.values = schema.dump(resolved)
+        self.values.setdefault("tune", schema.plain(free_gains.resolve(resolved, Tune())))
+
+    def lines(self) -> Iterator[str]:
+        """All of them."""
+        yield from _prose(INTRODUCTION)
+        for name, table in layouts.TABLES[self.plant].items():
+            if name == "tune":
+                yield from ("", *self.requirements())
+            yield from ("", *(self.dispersion() if name == "dispersion" else self.table(name, table)))
+
+    def table(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
+        """A table as it is, and below it what its other kinds have."""
+        live, values = self.live.get(name), self.values.get(name, {})
+        kinds = table if isinstance(table, dict) else {}
+        kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
+        struct = table if isinstance(table, type) else kinds[kind]
+        if kind is None:
+            yield from _prose(keys.about(struct))
+        yield f"{'#' if live is None else ''}[{name}]"
+        if kind is not None:
+            yield from _line(live is None, "kind", kind, keys.about(struct))
+        values = {**self.defaults(name, struct), **values}
+        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # which [initial] explains
+        for key in keys.of(struct):
+            off = live is None or key.name not in live
+            if not (off and key.name in borrowed):
+                value = values[key.name] if key.name in values else self.example(name, kind, key)
+                yield from _line(off, key.name, value, _meaning(key))
+        if issubclass(struct, Attitude) and borrowed:
+            yield from _prose("its attitude by any one of the keys that [initial] has")
+        for other, alternative in kinds.items():
+            if other != kind:
+                yield ""
+                yield from _line(True, "kind", other, keys.about(alternative))
+                defaults = self.defaults(name, alternative)
+                for key in keys.of(alternative):
+                    if key.name not in borrowed:
+                        value = defaults[key.name] if key.name in defaults else self.example(name, other, key)
+                        yield from _line(True, key.name, value, _meaning(key))
+
+    def dispersion(self) -> Iterator[str]:
+        """A line for each kind of each thing drawn."""
+        struct, live = layouts.TABLES[self.plant]["dispersion"], self.live.get("dispersion")
+        assert isinstance(struct, type)
+        yield from _prose(keys.about(struct))
+        yield f"{'#' if live is None else ''}[dispersion]"
+        for key in keys.of(struct):
+            yield from _prose(f"{key.meaning}:")
+            chosen = (live or {}).get(key.name, {})
+            for kind, drawn in layouts.DISPERSIONS[key.name].items():
+                table = {"kind": kind, **{k.name: self.example("dispersion", kind, k) for k in keys.of(drawn)}}
+                mine = chosen.get("kind") == kind
+                yield from _line(not mine, key.name, chosen if mine else table, keys.about(drawn))
+
+    def requirements(self) -> Iterator[str]:
+        """Those that are there, or two of the many."""
+        catalogue, live = catalogues.CATALOGUES[self.plant], self.live.get("requirements")
+        yield from _prose(
+            "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
+            f"The metrics are {', '.join(catalogue)}. "
+            f"Of the sampled loop also {', '.join(layouts.MARGINS)}: the least allowed, but for the last, which is the "
+            "largest sensitivity."
+        )
+        yield f"{'#' if live is None else ''}[requirements]"
+        for name, limit in (live or REQUIREMENTS).items():
+            unit, meaning = catalogue[name]
+            yield from _line(live is None, name, limit, f"{meaning} [{unit}]")
+
+    def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
+        """What the keys of a table of this kind are where they are absent, as far as they are anything."""
+        table: Any = struct()
+        if name in ("observer", "disturbance"):
+            table = checks.filled(name, table, self.resolved)
+        if isinstance(table, Prescribed):
+            t_o, delta_o = checks.prescribed_times(self.resolved, table)
+            table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
+        return {key: value for key, value in schema.plain(table).items() if value not in ([], {})}
+
+    def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
+        """A value for a key that is off, or drawn: its default, or what it might be."""
+        if key.default not in (None, ()):
+            return key.default
+        value = EXAMPLES[f"{table}.{key.name}"]
+        if key.allowed.endswith("for each state"):
+            return [value] * len(checks.initial_state(self.resolved))
+        return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
+
+
+def text(plant: str | None, raw: Mapping[str, Any]) -> str:
+    """A commented scenario file: that of `raw`, tables as `schema.load` reads them, or the default one of this plant.
+
+    Raises ScenarioError where raw is no scenario, UsageError where there is no such plant or raw has another one.
+    """
+    if plant is not None and plant not in layouts.TABLES:
+        raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
+    kind = plant or "spacecraft"
+    given = raw or {"plant": {"kind": kind, **({"system": EXAMPLES["plant.system"]} if kind == "system" else {})}}
+    said = schema.parse(given, catalogues.CATALOGUES)
+    if plant not in (None, said.plant.kind):
+        raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
+    # a system stands in a file that its user has yet to write: it cannot be checked
+    resolved = checks.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
+    return "\n".join(_File(said, resolved).lines()) + "\n"
+
+
+def _meaning(key: keys.Key) -> str:
+    choice = f"{key.allowed.replace(' or ', ' | ')}: " if key.allowed.startswith('"') and " or " in key.allowed else ""
+    return choice + key.told
+
+
+def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
+    """`key = value  # meaning`; a meaning too long for that stands above."""
+    shown = f"{'#' if off else ''}{key} = {errors.show(value)}"
+    line = f"{shown:<{COLUMN - 1}} # {meaning}"
+    if len(line) > WIDTH:
+        yield from _prose(meaning)
+    yield line if len(line) <= WIDTH else shown
+
+
+def _prose(words: str) -> list[str]:
+    return [f"# {line}" for line in textwrap.wrap(words, WIDTH - 2)]

@@ -1,0 +1,84 @@
+"""What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from tuning.errors import UsageError
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
+
+ScenarioFile = Annotated[
+    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
+]
+SampledFile = Annotated[
+    Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
+]
+Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
+Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
+Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
+Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
+Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
+
+Device = Annotated[str, Parameter(help="What it is flown on: cpu or gpu.")]
+Trust = Annotated[
+    bool,
+    Parameter(
+        negative="",
+        help="Run the Python file that results name (plant.system, --metrics): read it before, it can do what you can.",
+    ),
+]
+
+INTERRUPTED = 130  # exit status
+
+
+def whole(option: str, value: str, least: int = 0, most: int = 2**32 - 1) -> int:
+    """A whole number."""
+    if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
+        raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
+    return int(value)
+
+
+def between(option: str, value: str, least: float, most: float) -> float:
+    """A number between two others."""
+    try:
+        found = float(value)
+    except ValueError:
+        found = float("nan")
+    if not least < found < most:
+        raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
+    return found
+
+
+def prepare(
+    scenario: Path | None,
+    command: str,
+    out: Path | None,
+    device: str = "cpu",
+    bits: Literal[32, 64] = 64,
+    *,
+    trust: bool,
+) -> "tuple[Scenario, Path]":
+    """The checked scenario, which may be flown, and the folder for the results; the backend is configured on the way.
+
+    trust: code that the scenario names may be run where it lies in results.
+    """
+    if device != "cpu" and device != "gpu":
+        raise UsageError(f"--device is {device}, but must be cpu or gpu")
+    from ptsmc_jax.scenario import reading
+
+    loaded = reading.from_tables({}) if scenario is None else reading.read(scenario)
+    from ptsmc_jax.configure import NoDeviceError, configure
+
+    try:
+        configure(device=device, bits=bits, keep_programs=True)
+    except NoDeviceError as error:
+        raise UsageError(f"--device is {device}, but {error}") from None
+    name = "default" if scenario is None else scenario.stem
+    if scenario is not None:
+        from tuning.search import own_parts
+
+        own_parts.allow_scenario(scenario, loaded, trust)
+    return loaded, out if out is not None else Path("out") / f"{command}-{name}"

@@ -1,0 +1,82 @@
+"""The commands that fly nothing: a page from results, a new scenario file, an attitude in every form."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tuning.cli.options import Quiet
+from tuning.output import terminal
+
+
+def report(
+    folder: Annotated[Path, Parameter(name="DIR", help="Folder that a command left.")], /, *, quiet: Quiet = False
+) -> int:
+    """Make one page of HTML, DIR/report.html, from the results in a folder: to be sent, opened and printed anywhere.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax.campaigns import store
+    from tuning.output import page
+
+    made = page.build(folder)
+    store.write(folder, lambda making: store.write_text(making / "report.html", made))
+    if not quiet:
+        terminal.say(f"page in {folder / 'report.html'}")
+    return 0
+
+
+def new(
+    file: Annotated[Path, Parameter(name="FILE", help="Scenario file to write.")] = Path("scenario.toml"),
+    /,
+    *,
+    plant: Annotated[
+        str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; without it spacecraft.")
+    ] = None,
+    like: Annotated[Path | None, Parameter(help="Scenario to begin with; without it the defaults.")] = None,
+    force: Annotated[bool, Parameter(negative="", help="Write over a file that is there already.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Write a scenario file with every key, its value, unit and meaning, to be changed at will.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.scenario import schema
+    from tuning.cli import new as templates
+
+    store.check_file(file, force)
+    raw = schema.load(like) if like is not None else {}
+    store.write_text(file, templates.text(plant, raw))
+    if not quiet:
+        terminal.say(f"scenario in {file}")
+    return 0
+
+
+_Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.")]
+
+
+def convert_attitude(
+    *,
+    quat_xyzw: _Numbers = None,
+    quat_wxyz: _Numbers = None,
+    rotvec_deg: _Numbers = None,
+    mrp: _Numbers = None,
+    dcm_body_to_inertial: Annotated[str | None, Parameter(help="Nine numbers, row by row.")] = None,
+    euler_deg: _Numbers = None,
+    sequence: Annotated[
+        str | None, Parameter(help="Three axes in SciPy's notation, of euler_deg and of what is printed; default ZYX.")
+    ] = None,
+) -> int:
+    """Print one attitude, of the body relative to the inertial frame, in every form that a scenario takes.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from tuning.cli import convert
+
+    given = {
+        "quat_xyzw": quat_xyzw, "quat_wxyz": quat_wxyz, "rotvec_deg": rotvec_deg, "mrp": mrp,
+        "dcm_body_to_inertial": dcm_body_to_inertial, "euler_deg": euler_deg, "sequence": sequence,
+    }  # fmt: skip
+    terminal.say(*convert.lines(convert.quaternion(given), sequence))
+    return 0

@@ -1,0 +1,1 @@
+"""What is said of a result: sentences, tables, the terminal, the page."""

@@ -1,0 +1,94 @@
+"""What the commands of a campaign print."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from tuning.output import sentences, terminal
+
+
+class Progress:
+    """A progress bar on the error stream: trials, trials a second, failures so far, time left; silent if told to be."""
+
+    def __init__(self, quiet: bool):
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(20),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._task = self._bar.add_task("compiling", total=None)
+        self._started: tuple[float, int] | None = None
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, standing: Any) -> None:
+        """standing: a `campaign.Tally`."""
+        now = time.monotonic()
+        if self._started is None:
+            self._started = now, standing.done
+        since, before = self._started
+        rate = (standing.done - before) / (now - since) if standing.done > before else 0.0
+        text = f"{standing.done} of {standing.total} trials"
+        text += f", {rate:,.0f} a second" if rate else ""
+        text += f", {standing.failed} failed or missed" if standing.failed else ""
+        self._bar.update(self._task, completed=standing.done, total=standing.total, description=text)
+
+
+def campaign(found: dict[str, Any], folder: Path) -> None:
+    """Counts, quantiles and verdicts, as `summary.json` says."""
+    terminal.say(*sentences.campaign_counts(found))
+    terminal.table(sentences.campaign(found))
+    terminal.say(
+        *sentences.campaign_error(found),
+        *map(sentences.verdict, found["verdicts"]),
+        *sentences.campaign_drivers(found),
+        f"results in {folder}",
+    )
+
+
+def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
+    """A share of a campaign, or its plan, is done."""
+    if planned:
+        print(f"plan of {folder.trials} trials in {folder.plan.folder}; nothing was flown")
+        return
+    parts, _ = folder.rows.parts()
+    there = sum(part.count for part in parts)
+    print(f"shard {share[0]}/{share[1]} done: {there} of {folder.trials} trials are in {folder.path}")
+    print("when all are there, in this folder or gathered into one: ptsmc summarize DIR")
+
+
+def worst(frame: Any, by: str, folder: Path) -> None:
+    """The worst trials."""
+    from rich.console import Console
+    from rich.table import Table
+
+    wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
+    names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
+    table = Table(*names, box=None, pad_edge=False)
+    for row in frame.select(names).iter_rows():
+        table.add_row(*("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
+    console = Console(highlight=False)
+    console.print(table)
+    one = f"ptsmc replay {folder} --trial {frame['trial'][0]}"
+    console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
+
+
+def replayed(off: float | None, rounding: float) -> None:
+    """How far a trial flown again is off its row, and the run with its history off both."""
+    if off is None:
+        print("the campaign has no row of this trial yet")
+    else:
+        print("equal to its row, to the last digit" if off == 0.0 else f"off its row by {off:.1e} at most, relative")
+    print(f"the history is another program's: its metrics differ by {rounding:.0e} at most, relative, by rounding")

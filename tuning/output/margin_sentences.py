@@ -1,0 +1,76 @@
+"""Margins as a table and in words: those of `ptsmc margins`, and those that tuned gains leave."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from ptsmc_jax.scenario.layouts import MARGINS
+from tuning.output.cells import Summary, Table
+
+ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
+COLUMNS = {
+    "gain_up": "gain up",
+    "gain_down": "down [dB]",
+    "phase": "phase [deg]",
+    "delay": "delay [s]",
+    "modulus": "|S| [dB]",
+}
+
+
+def table(summary: Summary) -> Table:
+    """Margins in hold: of each axis of the plant's input alone, of all at once, and of what each sensor sees."""
+
+    def row(where: str, found: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
+        known = (found.get(name, "-") for name in COLUMNS)
+        return where, *(none if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in known)
+
+    rows = [row(f"input {name}", found) for name, found in summary["hold"].items()]
+    rows.append(row("all inputs", summary["together"], "none" if summary["stable"] else "-"))
+    rows += [row(name, found) for name, found in summary["sensors"].items()]
+    return Table(("in hold", *COLUMNS.values()), rows)
+
+
+def lines(summary: Summary) -> Iterator[str]:
+    """Whether the loop is stable, and what is least where it is judged."""
+    yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
+    for counts in (True, False):
+        times = sorted(one["time_to_go"] for one in summary["before"] if not one["stable"] and one["judged"] == counts)
+        if not times:
+            continue
+        when = f"at {times[0]:.3g}" if len(times) == 1 else f"at {len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
+        yield f"frozen before the hand-over it is unstable {when} s to go" + (
+            "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
+        )
+    if summary["stable"]:
+        yield f"worst in hold and where judged before the hand-over: {_shown(summary['worst'])}"
+    if summary["said"]:
+        yield summary["said"]
+
+
+def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
+    """What tuned gains leave, see `stability.worst`, and whether an engineer would ask for more."""
+    places = {"hold": "in hold", "before": "before the hand-over"}
+    for where, place in places.items():
+        if found is None or where not in found:
+            continue
+        known = found[where]
+        if not known["stable"]:
+            yield f"the frozen loop is NOT stable {place}: what the model leaves out may cost the stability"
+            continue
+        yield f"margins {place}: {_shown(known)}"
+        few = [
+            f"{least:g} {MARGINS[name][0]} of {_short(name)}"
+            for name, least in ENOUGH.items()
+            if known[name] is not None and known[name] < least
+        ]
+        if few:
+            yield f"less than {' and '.join(few)} {place}: what the model leaves out may cost the stability"
+
+
+def _shown(found: Mapping[str, Any]) -> str:
+    """Those that are limited, in words."""
+    known = {name: found[name] for name in MARGINS if found[name] is not None}
+    return ", ".join(f"{_short(name)} {value:.3g} {MARGINS[name][0]}" for name, value in known.items())
+
+
+def _short(name: str) -> str:
+    return name.removesuffix("_margin")

@@ -1,0 +1,390 @@
+"""`ptsmc report`: a result folder as one page of HTML that needs nothing else and runs nothing that a user typed.
+
+Made from the files in the folder alone. The page's policy allows its own two scripts, known by their digests, and
+nothing from elsewhere; every text is escaped.
+"""
+
+import base64
+import csv
+import hashlib
+import json
+import shlex
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.scenario import schema
+from tuning.errors import UsageError
+from tuning.output import margin_sentences, page_charts, sentences
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Block:
+    """A piece of a section: a table, bars, a picture, a chart, code or lines of text."""
+
+    kind: str
+    note: str = ""  # below it
+    head: tuple[str, ...] = ()
+    rows: list[tuple[str, ...]] = field(default_factory=list)
+    bars: list[dict[str, Any]] = field(default_factory=list)
+    alt: str = ""
+    source: str = ""
+    caption: str = ""
+    name: str = ""
+    shape: str = ""
+    text: str = ""
+    lines: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it."""
+
+    title: str
+    blocks: list[Block]
+
+
+@dataclass(frozen=True)
+class Heading:
+    """What is said first; mood: good, bad or calm."""
+
+    mood: str
+    headline: str
+    lines: list[str]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result folder as read."""
+
+    folder: Path
+    versions: dict[str, Any]
+    summary: dict[str, Any]
+    scenario: dict[str, Any]  # as the file has it; empty: there is none
+    charts: dict[str, page_charts.Chart] = field(default_factory=dict)  # filled while sections are made
+
+    @property
+    def kind(self) -> str:
+        """Of the plant."""
+        return self.scenario.get("plant", {}).get("kind", "spacecraft")
+
+    def chart(self, name: str, made: page_charts.Chart, caption: str, shape: str = "") -> Block:
+        """A chart of the page."""
+        self.charts[name] = made
+        return Block("chart", name=name, caption=caption, shape=shape)
+
+
+def read(folder: Path) -> Result:
+    """A result folder. Raises RefusedError where it holds no finished result."""
+    if not folder.is_dir():
+        raise RefusedError(f"{folder} is no folder; allowed is one that a ptsmc command left")
+    versions = store.made(folder)
+    command = versions.get("command")
+    if str(command) not in SECTIONS:
+        raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command left")
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8")) if command != "map" else {}
+        path = folder / "scenario.toml"
+        scenario = schema.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
+    except FileNotFoundError:
+        raise _unfinished(folder, versions) from None
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
+    return Result(folder, versions, summary, scenario)
+
+
+def _unfinished(folder: Path, versions: dict[str, Any]) -> RefusedError:
+    said = f"{folder} holds a {versions['command']} that is not finished"
+    return RefusedError(f"{said}; run the same command to its end")
+
+
+def build(folder: Path) -> str:
+    """The page of a result folder. Raises RefusedError where there is none, UsageError without plotly or jinja2."""
+    result = read(folder)
+    try:
+        from jinja2 import Environment
+        from markupsafe import Markup
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
+    try:
+        heading, sections = SECTIONS[result.versions["command"]](result)
+    except FileNotFoundError:
+        raise _unfinished(folder, result.versions) from None
+    except KeyError as error:
+        by = result.versions.get("ptsmc-jax")
+        raise RefusedError(f"{folder} lacks {error}, as results of another version do ({by}); make it again") from None
+    sections = [*sections, *_pictures(result), *_origin(result)]
+    drawing = (HERE / "page.js").read_text(encoding="utf-8")
+    library = get_plotlyjs() if result.charts else ""
+    scripts = " ".join(f"'sha256-{_digest(script)}'" for script in (library, drawing)) if result.charts else "'none'"
+    # no < in the data: nothing in it can end its element
+    charts = json.dumps(result.charts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
+    return template.render(
+        title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
+        verdict=heading,
+        sections=sections,
+        policy=Markup(f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {scripts}"),
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        charts=Markup(charts) if result.charts else "",
+        library=Markup(library),
+        drawing=Markup(drawing),
+    )
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+
+
+def _table(made: sentences.Table, note: str = "") -> Block:
+    return Block("table", head=made.head, rows=made.rows, note=note)
+
+
+def _text(lines: Iterable[str]) -> Block:
+    return Block("text", lines=[line.strip() for line in lines])
+
+
+def _limits(verdicts: list[dict[str, Any]]) -> list[Section]:
+    """Each requirement as a bar on its limit, and in words."""
+    if not verdicts:
+        return []
+    bars = []
+    for one in verdicts:
+        share = np.nan_to_num(_value(one["margin"]), nan=np.inf)
+        bars.append({
+            "label": one["metric"].replace("_", " "), "text": sentences.verdict(one) + _distance(one),
+            "met": one["met"], "limit": 300, "width": round(min(400.0, 300.0 * share), 1),
+        })  # fmt: skip
+    note = "The line is the limit; a bar that ends before it keeps the limit."
+    return [Section("Requirements", [Block("bars", bars=bars, note=note)])]
+
+
+def _verdict(summary: dict[str, Any], lines: Iterable[str], requirements: bool) -> Heading:
+    status = summary["status"]
+    headline = {
+        "met": "Every requirement is met" if requirements else "Done",
+        "not met": "NOT every requirement is met" if requirements else "NOT every trial ended well",
+        "interrupted": "Interrupted: the best so far",
+        "unfinished": "NOT finished",
+        "ok": "Done",
+    }.get(status, f"The run failed: {status}")
+    mood = {"met": "good", "ok": "calm"}.get(status, "bad")
+    return Heading(mood if requirements or mood == "bad" else "calm", headline, list(lines))
+
+
+def _simulate(result: Result) -> tuple[Heading, list[Section]]:
+    summary, spacecraft = result.summary, result.kind == "spacecraft"
+    verdicts = sentences.run_verdicts(summary, result.kind)
+    if summary["status"] == "ok" and verdicts:
+        summary = {**summary, "status": "met" if all(v["met"] for v in verdicts) else "not met"}
+    lines = [*sentences.run_lines(result.summary), *map(sentences.verdict, verdicts)]
+    columns = _columns(result.folder / "trajectory.csv")
+    law = result.scenario["controller"]
+    marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
+    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would lie on each other
+        del marks["t_f - delta"]
+    drawn = page_charts.history(columns, spacecraft, marks)
+    charts = [
+        result.chart("history", drawn, "Drag to zoom, double-click to see all; dotted: the hand-over and t_f.", "tall")
+    ]
+    if spacecraft:
+        q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
+        caption = "The body with its axes as it turns; dashed: the inertial axes. Drag to look from elsewhere."
+        charts.append(result.chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
+    sections = [*_limits(verdicts), Section("Metrics", [_table(sentences.run(result.summary, result.kind))])]
+    return _verdict(summary, lines, bool(verdicts)), [*sections, Section("History", charts)]
+
+
+def _tune(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
+    farthest = max(summary["verdicts"], key=lambda v: np.nan_to_num(_value(v["margin"]), nan=np.inf), default=None)
+    lines = [f"gains: {gains}", *sentences.accuracy(summary)]
+    if farthest is not None:
+        lines.insert(1, sentences.verdict(farthest) + _distance(farthest))
+    with (result.folder / "history.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    goal = list(rows[0])[2]
+    caption = "The way of every start to the optimum next to it, by the slopes of what flies; hollow: beyond a limit."
+    sections = [
+        *_limits(summary["verdicts"]),
+        Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
+        Section(
+            "Can it be trusted?",
+            [_text([*sentences.search(summary), *sentences.trust(summary), *sentences.shortest(summary)])],
+        ),
+        Section("Search", [result.chart("search", page_charts.search(rows, goal), caption)]),
+    ]
+    return _verdict(summary, lines, bool(summary["verdicts"])), sections
+
+
+def _value(known: float | None) -> float:
+    return np.nan if known is None else known
+
+
+def _distance(verdict: dict[str, Any]) -> str:
+    margin = _value(verdict["margin"])
+    return "" if np.isnan(margin) or verdict.get("at_least") else f", {100 * margin:.3g} % of the limit"
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8") as file:
+        head, *rows = csv.reader(file)
+    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
+    return dict(zip(head, values.T, strict=True))
+
+
+def _pareto(result: Result) -> tuple[Heading, list[Section]]:
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    summary, units = result.summary, {name: unit for name, (unit, _) in CATALOGUES[result.kind].items()}
+    known = result.scenario.get("requirements", {}).get("peak_torque")
+    limit = known.get("limit") if isinstance(known, dict) else known
+    caption = "Smaller is better in both. Point at one for its gains; bars are 95 % intervals, dashed is the limit."
+    sections = [
+        Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
+        Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
+    ]
+    met = {
+        "met": "Gains on the front meet every requirement",
+        "not met": "No gains on the front meet every requirement",
+    }
+    wanted = bool(summary["requirements"])
+    heading = _verdict(summary, [sentences.front_heading(summary)], wanted)
+    headline = met.get(summary["status"], heading.headline) if wanted else heading.headline
+    return Heading(heading.mood, headline, heading.lines), sections
+
+
+def _compare(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    lines = [f"each law tuned alike, all of its gains free, judged on {summary['trials']} fresh trials, flight clock"]
+    best = min(summary["laws"], key=lambda law: _error(summary["laws"][law]))
+    lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
+    meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}
+    mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
+    headline = meets.get(summary["status"], "Interrupted: the best so far")
+    blocks = [_table(sentences.comparison(summary)), _text(sentences.comparison_lines(summary))]
+    return Heading(mood, headline, lines), [Section("Laws side by side", blocks)]
+
+
+def _error(law: dict[str, Any]) -> float:
+    return law["window_error"] if law["met"] and law["window_error"] is not None else np.inf
+
+
+def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    note = "Quantiles between order statistics, with 95 % intervals; a failed trial stands beyond every quantile."
+    sections = [
+        *_limits(summary["verdicts"]),
+        Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),
+    ]
+    lines = [*sentences.campaign_counts(summary), *sentences.campaign_error(summary)]
+    return _verdict(summary, lines, bool(summary["verdicts"])), sections
+
+
+def _map(result: Result) -> tuple[Heading, list[Section]]:
+    with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    lines = [f"{len(rows) - 1} pairs"]
+    table = sentences.Table(tuple(rows[0]), [tuple(_short(cell) for cell in row) for row in rows[1:]])
+    return Heading("calm", "Accuracy and peak torque over two keys", lines), [Section("Pairs", [_table(table)])]
+
+
+def _margins(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    mood, headline = (
+        ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
+    )
+    return Heading(mood, headline, list(margin_sentences.lines(summary))), [
+        Section("Margins", [_table(margin_sentences.table(summary))])
+    ]
+
+
+def _short(cell: str) -> str:
+    try:
+        return f"{float(cell):.4g}"
+    except ValueError:
+        return cell
+
+
+def _reproduce(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    counted = ", ".join(f"{count} {word}" for word, count in summary["verdicts"].items())
+    sections = [
+        Section("Claims of the paper", [_table(sentences.claims(summary))]),
+        Section("Its slips, and what shows them", [_table(sentences.slips(summary))]),
+    ]
+    return Heading("calm", "The paper's claims beside what was measured", [counted]), sections
+
+
+SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
+    "simulate": _simulate,
+    "tune": _tune,
+    "pareto": _pareto,
+    "compare": _compare,
+    "montecarlo": _montecarlo,
+    "map": _map,
+    "margins": _margins,
+    "reproduce": _reproduce,
+}
+
+OPTIONS = ("x", "y", "trials", "trial", "points", "metrics", "seed", "global_check")  # kept in `versions.json`
+CAPTIONS = {
+    "history": "Gains and goal of every start over the steps of the descent.",
+    "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",
+    "sensitivities": "Percent by which each metric moves for a percent of each gain.",
+    "profiles": "The goal along each gain between its bounds, the others as found; what breaks a limit is marked.",
+    "front": "The same front as a picture.",
+    "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
+    "nichols": "The loop opened at each axis of the plant's input, the others closed.",
+    "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",
+    "margins": "Margins of the frozen loop on the way to the hand-over.",
+    "fan": "How the error goes with time: the share of trials inside each band.",
+    "distributions": "The share of the trials up to each value; the scale stretches both ends.",
+    "inputs": "What was drawn against what came of it.",
+    "torque_by_angle": "Peak torque by the angle that a trial starts from.",
+    "settling": "Time to settle by the angle that a trial starts from.",
+    "error": "Attitude error, or the first state, over time.",
+    "sliding": "Sliding variable over time.",
+    "torque": "Delivered torque over time.",
+    "attitude": "Attitude over time.",
+    "rate": "Body rate over time.",
+    "states": "States over time.",
+}
+
+
+def _pictures(result: Result) -> Iterator[Section]:
+    """The figures of the folder."""
+    blocks = []
+    for path in sorted((result.folder / "figures").glob("*.png")):
+        source = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+        name = path.stem.replace("_", " ")
+        blocks.append(Block("picture", alt=name, source=source, caption=CAPTIONS.get(path.stem, "")))
+    if blocks:
+        yield Section("Figures", blocks)
+
+
+def _origin(result: Result) -> Iterator[Section]:
+    """The scenario, how to make the result again, and what made it."""
+    versions = result.versions
+    path = result.folder / "scenario.toml"
+    if path.exists():
+        yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"))])
+    command = ["ptsmc", versions["command"], *(["scenario.toml"] if path.exists() else [])]
+    for key in OPTIONS:
+        if versions["command"] != "reproduce" and versions.get(key) is not None:
+            option = f"--{key.replace('_', '-')}"
+            command += [option] if versions[key] is True else [option, str(versions[key])]
+    note = "Where the scenario above is the file scenario.toml." if path.exists() else ""
+    yield Section("How to make this again", [Block("code", text=shlex.join(command), note=note)])
+    rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
+    yield Section("Made by", [_table(sentences.Table(("", "version"), rows))])

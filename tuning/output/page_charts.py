@@ -1,0 +1,184 @@
+"""Interactive charts of a result, as Plotly's JSON: histories, a turning body, a front, a search."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.figures.animation import SIDES, turned
+from ptsmc_jax.figures.style import STYLES
+
+Chart = dict[str, Any]
+
+COLOURS = [colour for colour, _ in STYLES]
+DASHES = ("solid", "dash", "dashdot", "dot", "longdashdot")
+POINTS = 3000  # of a history, at most
+FRAMES = 60  # of a turning body
+_DECADES = {"type": "log", "dtick": "D2", "tickformat": ".0e"}
+# of a spacecraft's history: what, unit; other plants have states without units
+BLOCKS = {
+    "q": ("attitude quaternion", "-"), "w": ("body rate", "rad/s"), "x": ("state", ""),
+    "d_hat": ("disturbance estimate", "N m"), "u": ("delivered torque", "N m"), "s": ("sliding variable", "-"),
+}  # fmt: skip
+
+
+def _layout(**others: Any) -> Chart:
+    return {
+        "template": {"layout": {"font": {"family": "system-ui, sans-serif", "size": 13}, "colorway": COLOURS}},
+        "margin": {"l": 70, "r": 50, "t": 40, "b": 50},
+        "hovermode": "closest",
+        "modebar": {"orientation": "v"},
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
+        **others,
+    }
+
+
+def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[str, float]) -> Chart:
+    """The columns of a `trajectory.csv` over time, one panel each for state, estimate, input and sliding variable.
+
+    marks: times to draw a line at, by what happens then.
+    """
+    t = columns["t"]
+    kept = np.unique(np.linspace(0, t.size - 1, min(POINTS, t.size)).round().astype(int))
+    blocks: dict[str, list[str]] = {}
+    for name in columns:
+        if name != "t":
+            blocks.setdefault(name.rstrip("0123456789"), []).append(name)
+    above = {"yref": "paper", "yanchor": "bottom", "showarrow": False}
+    notes = [{**above, "x": at, "y": 1.0, "text": what} for what, at in marks.items()]
+    data, axes = [], {}
+    for row, (block, names) in enumerate(blocks.items()):
+        number = "" if row == 0 else str(row + 1)
+        for k, name in enumerate(names):
+            data.append({
+                "type": "scatter", "mode": "lines", "name": name, "yaxis": f"y{number}", "showlegend": False,
+                "x": numbers(t[kept]), "y": numbers(columns[name][kept]),
+                "hovertemplate": f"{name} %{{y:.5g}} at %{{x:.4g}} s<extra></extra>",
+                "line": {"color": COLOURS[k % len(COLOURS)], "dash": DASHES[k % len(DASHES)], "width": 1.6},
+            })  # fmt: skip
+        what, unit = BLOCKS.get(block, (block, "")) if spacecraft else (block, "")
+        top = 1.0 - (row + 0.18) / len(blocks)
+        place = [1.0 - (row + 0.94) / len(blocks), top]
+        axes[f"yaxis{number}"] = {"domain": place, "exponentformat": "e"}
+        text = f"{what} [{unit}]: {', '.join(names)}" if unit else ", ".join(names)
+        notes.append({**above, "x": 0.0, "xref": "paper", "xanchor": "left", "y": top, "text": text})
+    shapes = [
+        {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
+         "line": {"color": "#777", "dash": "dot", "width": 1}}
+        for at in marks.values()
+    ]  # fmt: skip
+    anchor = "y" if len(blocks) == 1 else f"y{len(blocks)}"
+    time = {"title": {"text": "time [s]"}, "anchor": anchor}
+    return {"data": data, "layout": _layout(**axes, xaxis=time, shapes=shapes, annotations=notes)}
+
+
+def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
+    """The body as a box with its axes, turning; q (time, 4) scalar last, body relative to inertial."""
+    shown = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], FRAMES) * (1.0 - 1e-12)))
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
+    edges = [(i, j) for i, j in combinations(range(8), 2) if np.sum(corners[i] != corners[j]) == 1]
+
+    def lines(at: np.ndarray) -> list[Chart]:
+        box = np.full((3 * len(edges), 3), np.nan)
+        turned_corners = turned(at, corners)
+        for k, (i, j) in enumerate(edges):
+            box[3 * k : 3 * k + 2] = turned_corners[[i, j]]
+        made = [_line(box, "body", "#888", 3)]
+        for k, axis in enumerate(turned(at, np.eye(3))):
+            made.append(_line(np.stack([np.zeros(3), axis]), f"body axis {k + 1}", COLOURS[k], 7))
+        return made
+
+    fixed = [
+        _line(np.stack([np.zeros(3), 1.2 * axis]), f"inertial axis {k + 1}", COLOURS[k], 2, "dash")
+        for k, axis in enumerate(np.eye(3))
+    ]
+    frames = [{"name": f"{t[k]:.4g}", "data": lines(q[k]), "traces": [0, 1, 2, 3]} for k in shown]
+    still = {"mode": "immediate", "transition": {"duration": 0}, "frame": {"duration": 60, "redraw": True}}
+    at_once = {**still, "frame": {"duration": 0, "redraw": True}}
+    steps = [{"method": "animate", "label": f["name"], "args": [[f["name"]], at_once]} for f in frames]
+    play = {"type": "buttons", "direction": "left", "x": 0, "y": -0.02, "xanchor": "left", "yanchor": "top",
+            "buttons": [{"method": "animate", "label": "play", "args": [None, {**still, "fromcurrent": True}]},
+                        {"method": "animate", "label": "pause", "args": [[None], still]}]}  # fmt: skip
+    slider = {"steps": steps, "x": 0.25, "len": 0.75, "y": -0.02, "currentvalue": {"prefix": "t = ", "suffix": " s"}}
+    axis = {"range": [-1.25, 1.25], "showticklabels": False, "title": {"text": ""}}
+    camera = {"eye": {"x": 1.0, "y": 1.0, "z": 0.7}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
+    scene = {"xaxis": axis, "yaxis": axis, "zaxis": axis, "aspectmode": "cube", "camera": camera}
+    layout = _layout(scene=scene, updatemenus=[play], sliders=[slider])
+    return {"data": [*lines(q[shown[0]]), *fixed], "layout": layout, "frames": frames}
+
+
+def _line(points: np.ndarray, name: str, colour: str, width: int, dash: str = "solid") -> Chart:
+    x, y, z = (numbers(points[:, k]) for k in range(3))
+    return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "hoverinfo": "name",
+            "line": {"color": colour, "width": width, "dash": dash}}  # fmt: skip
+
+
+def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None) -> Chart:
+    """Error against peak torque: the front, what is beaten, and the paper's and the scenario's own gains."""
+    points = summary["points"]
+    kept = [p for p in points if not p["dominated"]]
+    groups = [
+        ("front", kept, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
+        ("knee", [p for p in kept if p["knee"]], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
+        ("beaten by others", [p for p in points if p["dominated"]], {"mode": "markers", "marker": {"symbol": "x"}}),
+        *((name, [summary[name]], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
+          for name in ("paper", "before") if name in summary),
+    ]  # fmt: skip
+    data = []
+    for k, (name, group, style) in enumerate(groups):
+        if group:
+            data.append({
+                "type": "scatter", "name": name, "x": [p["peak"] for p in group], "y": [p["rms"] for p in group],
+                "text": [", ".join(f"{g} {v:.4g}" for g, v in p["gains"].items()) for p in group],
+                "hovertemplate": "%{text}<br>error %{y:.3e}, peak %{x:.4g}<extra>" + name + "</extra>",
+                "error_y": _bars(group), **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
+            })  # fmt: skip
+    along = {"title": {"text": f"peak torque [{units['peak_torque']}]"}, "type": "log"}
+    up = {"title": {"text": f"RMS window error [{units['window_error']}]"}, **_DECADES}
+    shapes = [] if limit is None else [
+        {"type": "line", "x0": limit, "x1": limit, "yref": "paper", "y0": 0, "y1": 1, "line": {"dash": "dash"}}
+    ]  # fmt: skip
+    said = []
+    if summary.get("floor"):
+        level = {"y0": summary["floor"], "y1": summary["floor"], "xref": "paper", "x0": 0, "x1": 1}
+        shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
+        said.append({"text": "floor", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(summary["floor"]),
+                     "yanchor": "bottom", "showarrow": False})  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=said)}
+
+
+def _bars(points: Sequence[dict[str, Any]]) -> Chart:
+    intervals = [p["interval"] or (p["rms"], p["rms"]) for p in points]
+    return {
+        "type": "data", "symmetric": False, "visible": True, "thickness": 1,
+        "array": [high - p["rms"] for p, (_, high) in zip(points, intervals, strict=True)],
+        "arrayminus": [p["rms"] - low for p, (low, _) in zip(points, intervals, strict=True)],
+    }  # fmt: skip
+
+
+def search(rows: Sequence[Mapping[str, str]], goal: str) -> Chart:
+    """The goal of every start over the steps of a `history.csv`; hollow: beyond a limit."""
+    starts: dict[str, list[Mapping[str, str]]] = {}
+    for row in rows:
+        starts.setdefault(row["start"], []).append(row)
+    over = [name for name in rows[0] if name.endswith("_over_limit")]
+    gains = [name for name in rows[0] if name not in ("step", "start", goal, *over)]
+    data = []
+    for k, (start, own) in enumerate(starts.items()):
+        met = [all(float(row[name] or "nan") <= 1.0 for name in over) for row in own]
+        data.append({
+            "type": "scatter", "mode": "lines+markers", "name": f"start {start}",
+            "x": [int(row["step"]) for row in own], "y": numbers(np.array([float(row[goal] or "nan") for row in own])),
+            "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in own],
+            "hovertemplate": "step %{x}: %{y:.3e}<br>%{text}<extra></extra>",
+            "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
+            "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
+        })  # fmt: skip
+    up = {"title": {"text": goal.replace("_", " ")}, **_DECADES}
+    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the descent"}}, yaxis=up)}
+
+
+def numbers(values: np.ndarray) -> list[float | None]:
+    """JSON knows neither NaN nor infinity."""
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]

@@ -1,0 +1,372 @@
+"""What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from tuning.output import margin_sentences
+from tuning.output.cells import Summary, Table
+
+AGREE = 0.01  # slopes off from differences by more than this share say little
+WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
+
+
+def verdict(told: Summary) -> str:
+    """A verdict in one line; over many trials with the share of them that keeps the limit."""
+    from ptsmc_jax.simulation.requirements import verdict_text
+
+    fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
+    values: list[Any] = [told.get(field) for field in fields]
+    text = verdict_text(*values, at_least=told.get("at_least", False))
+    if "share_interval" not in told:
+        return text
+    low, high = told["share_interval"]
+    text += f"; within it {100 * told['share']:.6g} % (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
+    if told["quantile"] is not None and told["confidence"] is not None:
+        text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
+        if told["share"] > told["quantile"]:
+            text += f"; with so many failures {told['fewest_trials']} trials would do"
+    return text
+
+
+def run(summary: Summary, kind: str) -> Table:
+    """Metrics of one run; kind: of its plant."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    none = "never" if summary["status"] in ("ok", "missed") else "-"
+    known = {name: said for name, said in CATALOGUES[kind].items() if name in summary}
+    rows = [
+        (name, none if (value := summary[name]) is None or value != value else f"{value:.5g}", unit, meaning)
+        for name, (unit, meaning) in known.items()
+    ]
+    return Table(("metric", "value", "unit", "meaning"), rows)
+
+
+def run_lines(summary: Summary) -> list[str]:
+    """Status of one run, and its error beside the floor."""
+    bad_time = summary["bad_time"]
+    when = "" if bad_time is None or bad_time != bad_time else f", at {bad_time:.4g} s"
+    what = f", {summary['reason']}{when}" if summary["reason"] else ""
+    beside = floor(summary.get("window_error"), summary.get("floor"))
+    error = [f"window error {summary['window_error']:.3e}{beside}"] if beside else []
+    return [f"status: {summary['status']}{what}", *error]
+
+
+def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
+    """The verdicts of one run, as those over many trials are told."""
+    from ptsmc_jax.scenario.layouts import MARGINS
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    units = {**CATALOGUES[kind], **MARGINS}
+    return [
+        {"metric": name, "worst": summary.get(name), "at_least": False, **told, "unit": units[name][0], "trials": 1,
+         "failures": int(not told["met"])}
+        for name, told in summary["verdicts"].items()
+    ]  # fmt: skip
+
+
+def tuning(summary: Summary) -> Table:
+    """Gains and what they do, beside the paper's and those before."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+    from tuning.search.gains import UNITS, base
+
+    groups = {"paper": summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
+    groups = {name: group for name, group in groups.items() if group is not None}
+    rows: list[tuple[str, ...]] = []
+    kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
+    for gain in dict.fromkeys(name for group in groups.values() for name in group["gains"]):
+        cells = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
+        if len(set(cells)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):
+            rows.append((gain, *("-" if v is None else f"{v:.6g}" for v in cells), UNITS[kind][base(gain)]))
+    trials = summary["fresh"]["trials"]
+    for label, metric, statistic in (
+        ("RMS window error", "window_error", "rms"),
+        ("largest window error", "window_error", "max"),
+        ("mean peak torque", "peak_torque", "mean"),
+        ("largest peak torque", "peak_torque", "max"),
+        ("mean effort", "effort", "mean"),
+    ):
+        found = (group[metric][statistic] if group[metric] else None for group in groups.values())
+        rows.append((label, *("-" if v is None else f"{v:.4g}" for v in found), CATALOGUES[kind][metric][0]))
+        if label == "RMS window error" and summary["fresh"].get("floor"):
+            rows.append(("times the floor", *(_times(group) for group in groups.values()), ""))
+    rows.append(("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), ""))
+    return Table(("", *groups, "unit"), rows)
+
+
+def tuning_heading(summary: Summary) -> str:
+    """On what the gains were judged."""
+    judged = summary.get("judged_on", "flight clock")
+    return f"judged on {summary['fresh']['trials']} fresh trials, {judged}"
+
+
+def accuracy(summary: Summary) -> Iterator[str]:
+    """How accurate the tuned gains are."""
+    times = summary["accuracy_gain_over_paper"]
+    if times is not None:
+        yield f"accuracy: {times:.3g} times the paper's gains'" + _between(summary.get("accuracy_gain_interval"), ".3g")
+    yield from paper_refused(summary)
+    trained, fresh = summary["training"]["window_error"], summary["fresh"]["window_error"]
+    before = summary.get("before")
+    if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
+        yield "the scenario's own gains are more accurate than these: see tune.bounds and the requirements"
+    if trained and fresh:
+        both = [f"{where} {one['rms']:.3e}" + _between(one.get("rms_interval"), ".3e")
+                for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
+        yield f"RMS window error: {', '.join(both)}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
+
+
+def floor(error: float | None, least: float | None) -> str:
+    """How many times the error is what no controller can beat; nothing where there is no such floor."""
+    times = over_floor(error, least)
+    return "" if times is None else f", {times:.3g} times the floor {least:.2e}"
+
+
+def over_floor(error: float | None, least: float | None) -> float | None:
+    """How many times the error is what no controller can beat; None where there is no such floor."""
+    return error / least if error and least else None
+
+
+def _times(group: Summary) -> str:
+    times = over_floor(group["window_error"] and group["window_error"]["rms"], group.get("floor"))
+    return "-" if times is None else f"{times:.3g}"
+
+
+def paper_refused(summary: Summary) -> Iterator[str]:
+    """Why nothing is set beside the paper's gains, if so."""
+    if summary.get("paper_refused"):
+        yield f"the paper's gains cannot fly this, and are left out: {summary['paper_refused']}"
+
+
+def _between(interval: Sequence[float] | None, digits: str) -> str:
+    return "" if interval is None else f" (95 %: {interval[0]:{digits}} to {interval[1]:{digits}})"
+
+
+def search(summary: Summary) -> Iterator[str]:
+    """How the search went."""
+    found = summary["search"]
+    for metric, ratio in found.get("largest_over_limit", {}).items():
+        if ratio is None or ratio > 1.0:
+            lost = ratio is None or math.isinf(ratio)
+            far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
+            yield f"no gains found within the bounds keep every limit: with these {far} in training"
+    for one in found.get("confirmed", []):
+        most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
+        yield (
+            f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
+            f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
+            f"probability of {100 * one['probability']:.3g} %"
+        )
+    hardest = found.get("hardest")
+    if hardest is not None and hardest["unbounded"]:
+        moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
+        reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
+        yield (
+            f"worst case: {hardest['metric']} has none over {moved}, which {reach}; "
+            f"ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
+        )
+    elif hardest is not None:
+        far = "has no value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+        advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
+        yield f"worst case inside the dispersions: {hardest['metric']} {far}{advice}"
+    if "rollouts" in found:
+        yield (
+            f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
+            f"{found['seconds']:.0f} s"
+            + "".join(
+                f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
+            )
+        )
+    checked = summary.get("differential_evolution")
+    if checked is not None:
+        kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
+        beside = {
+            (True, True): f"the search is {100 * checked['distance']:+.2f} % from it",
+            (True, False): "breaks a limit, which the search keeps",
+            (False, True): "keeps every limit, unlike the search",
+            (False, False): "keeps not every limit either",
+        }[kept, checked["kept"]]
+        yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
+
+
+def trust(summary: Summary) -> Iterator[str]:
+    """What the gains do, and whether the slopes are right."""
+    believed = summary.get("trust")
+    influence = {} if believed is None else believed["influence"]
+    for gain, side in summary["at_bound"].items():
+        if influence.get(gain) == "none":
+            continue
+        yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
+    for gain, how in influence.items():
+        if how == "none":
+            yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
+    if believed is None:
+        return
+    yield from margin_sentences.tuned(believed.get("margins"))
+    if believed["slopes_off_central_differences"] is None:
+        yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
+        return
+    off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
+    shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
+    if max(off.values(), default=0.0) <= AGREE:
+        yield f"slopes by automatic differentiation agree with differences to {shown}"
+    else:
+        yield (
+            f"slopes by automatic differentiation are off from differences by {shown}: the loop chatters or breaks off "
+            "there, and the descent had little to go by; trust the global check (--global-check) instead"
+        )
+
+
+def shortest(summary: Summary) -> Iterator[str]:
+    """The t_f that the limit on the torque would allow."""
+    from tuning.search import design
+
+    found = summary.get("shortest_t_f")
+    if found is not None:
+        yield design.text(found["limit"], found["theory"], found["simulated"])
+
+
+def comparison(summary: Summary) -> Table:
+    """Laws side by side."""
+    laws = summary["laws"]
+    rows: list[tuple[str, ...]] = []
+
+    def row(label: str, unit: str, value: Callable[[Summary], float | None], digits: str = ".3g") -> None:
+        cells = (value(found) for found in laws.values())
+        rows.append((label, *("-" if cell is None else f"{cell:{digits}}" for cell in cells), unit))
+
+    row("RMS window error", "-", lambda found: found["window_error"], ".2e")
+    if any(found.get("floor") for found in laws.values()):
+        row("times the floor", "", lambda found: over_floor(found["window_error"], found.get("floor")))
+    row("mean peak torque", "N m", lambda found: found["peak_torque"])
+    row("largest", "N m", lambda found: found["largest_peak_torque"])
+    row("mean effort", "N m s", lambda found: found["effort"])
+    row("mean chattering", "N m/s", lambda found: found["chattering"])
+    row("settles, median", "s", lambda found: (found["settling_time"] or {}).get("0.5"), ".1f")
+    row("  nearest fifth", "s", lambda found: (found["settling_near_far"] or [None])[0], ".1f")
+    row("  farthest fifth", "s", lambda found: (found["settling_near_far"] or [None])[-1], ".1f")
+    row("  never", "", lambda found: found["unsettled"], "d")
+    rows.append(("all limits met", *("yes" if found["met"] else "no" for found in laws.values()), ""))
+    return Table(("", *(law.replace("_", " ") for law in laws), "unit"), rows)
+
+
+def comparison_lines(summary: Summary) -> Iterator[str]:
+    """The gains of each law, and trials that went wrong."""
+    yield from paper_refused(summary)
+    for law, found in summary["laws"].items():
+        gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
+        bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
+        yield f"{law}: {gains}{bound}"
+        missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
+        if missed:
+            yield f"  of {summary['trials']} trials {', '.join(missed)}"
+    yield f"settles: from when the angle stays below {summary['settling_angle']:g} rad"
+
+
+def front(summary: Summary) -> Table:
+    """Points that no other one beats, and the paper's and the scenario's own gains."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+    from tuning.search.gains import base
+
+    units = CATALOGUES[summary["plant"]]
+    kept = [point for point in summary["points"] if not point["dominated"]]
+    names = list(kept[0]["gains"]) if kept else []
+    rows: list[tuple[str, ...]] = []
+    for name, point in [("", p) for p in kept] + [(n, summary[n]) for n in ("paper", "before") if n in summary]:
+        low, high = point["interval"] or (None, None)
+        marks = [word for word in ("knee", "meets") if point[word]]
+        if point["failures"]:
+            marks.append(f"{point['failures']} failed or missed")
+        gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
+        cells = ["-" if value is None else f"{value:.4g}" for value in gains]
+        if summary.get("floor"):
+            cells.insert(0, "-" if point["rms"] is None else f"{point['rms'] / summary['floor']:.3g}")
+        within = "-" if low is None or high is None else f"{50 * (high - low) / point['rms']:.1f} %"
+        numbers = (_digits(point["peak"], ".4g"), _digits(point["mean_peak"], ".4g"), _digits(point["rms"], ".3e"))
+        rows.append((name, *numbers, within, *cells, ", ".join(marks)))
+    torque, error = units["peak_torque"][0], units["window_error"][0]
+    beside = ("times the floor",) if summary.get("floor") else ()
+    return Table(("", f"peak {torque}", "mean", f"error {error}", "+-", *beside, *names, ""), rows)
+
+
+def front_lines(summary: Summary) -> Iterator[str]:
+    """What is left out of a front, and whether anything on it will do."""
+    yield from paper_refused(summary)
+    if summary.get("floor"):
+        yield f"floor {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
+    kept = [point for point in summary["points"] if not point["dominated"]]
+    lost = len(summary["points"]) - len(kept)
+    if lost:
+        yield f"{lost} more left out: others are better in both, beyond the interval"
+    if summary["requirements"] and not any(point["meets"] for point in kept):
+        yield "no gains on the front meet every requirement"
+
+
+def front_heading(summary: Summary) -> str:
+    """How many points, and on what they were judged."""
+    kept = sum(not point["dominated"] for point in summary["points"])
+    return f"{kept} points, each judged on {summary['trials']} fresh trials"
+
+
+def campaign(summary: Summary) -> Table:
+    """Quantiles of every metric."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    rows: list[tuple[str, ...]] = []
+    for name, told in summary["quantiles"].items():
+        far = told["0.9973"]
+        between = f"{_number(far['low'])}..{_number(far['high'])}"
+        cells = (told["0.5"]["value"], far["value"])
+        unit = CATALOGUES[summary["plant"]].get(name, ("",))[0]
+        rows.append((name, *(_number(v) for v in cells), between, _number(told.get("max")), unit))
+    return Table(("", "median", "99.73 %", "95 % interval", "largest", "unit"), rows)
+
+
+def _number(value: float | None) -> str:
+    return "none" if value in (float("inf"), float("-inf")) else _digits(value, ".3g")
+
+
+def _digits(value: float | None, form: str) -> str:
+    return "-" if value is None or value != value else f"{value:{form}}"
+
+
+def campaign_counts(summary: Summary) -> Iterator[str]:
+    """How the trials ended, and why."""
+    if summary["status"] == "unfinished":
+        yield f"NOT finished: {summary['flown']} of {summary['trials']} trials are flown"
+    counts = ", ".join(f"{count} {status}" for status, count in summary["counts"].items() if count)
+    yield f"{summary['flown']} trials of seed {summary['seed']}: {counts}"
+    for reason in summary["reasons"]:
+        first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
+        yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
+
+
+def campaign_error(summary: Summary) -> Iterator[str]:
+    """The RMS of the window errors, beside what no controller can beat."""
+    error = summary["quantiles"]["window_error"].get("rms")
+    beside = floor(error, summary.get("floor"))
+    if beside:
+        yield f"RMS window error {error:.3e}{beside}"
+
+
+def campaign_drivers(summary: Summary) -> Iterator[str]:
+    """What drives the error and the metrics of the requirements."""
+    for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
+        driven = summary["drivers"].get(name, {}).items()
+        driven = [(key, found) for key, found in driven if max(map(abs, found.values())) >= WEAK]
+        driven = sorted(driven, key=lambda item: -max(map(abs, item[1].values())))[:3]
+        if driven:
+            said = (f"{key} {d['rank_correlation']:+.2f} ({100 * d['first_order']:.0f} %)" for key, d in driven)
+            yield f"{name} goes with {', '.join(said)}: rank correlation (share of the variance)"
+
+
+def claims(summary: Summary) -> Table:
+    """Claims of the paper."""
+    rows = [(claim["verdict"], f"{claim['where']}: {claim['claim']}", claim["measured"]) for claim in summary["claims"]]
+    return Table(("verdict", "the paper", "measured"), rows)
+
+
+def slips(summary: Summary) -> Table:
+    """Slips of the paper."""
+    rows = [(slip["where"], slip["correct"], slip["shown"]) for slip in summary["slips"]]
+    return Table(("where", "what it must be", "shown by"), rows)

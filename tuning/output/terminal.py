@@ -1,0 +1,133 @@
+"""What the commands print: progress while they work, results when they are done."""
+
+from pathlib import Path
+from typing import Any
+
+from tuning.output import margin_sentences, sentences
+
+
+class Progress:
+    """A progress bar on the error stream with the best so far and the time left; silent where told to be."""
+
+    def __init__(self, quiet: bool, goal: str = ""):
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        self._goal = goal
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(20),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._total, self._task = 0, self._bar.add_task("compiling", total=None)
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
+        """What is being done, steps done and in all; the best goal so far, how far it is beyond a limit."""
+        if total != self._total:
+            self._total = total
+            self._bar.reset(self._task, total=total or None)
+        limits = "limits met" if over == 0.0 else f"{100 * over:.3g} % beyond a limit"
+        best = f": {self._goal} {value:.4g}, {limits}" if value == value else ""
+        self._bar.update(self._task, completed=done, total=total or None, description=what + best)
+
+
+def reproduction(summary: dict[str, Any], folder: Path) -> None:
+    """Claims and slips of the paper."""
+    from rich.box import SIMPLE
+
+    box: Any = {"box": SIMPLE, "title_justify": "left"}
+    table(sentences.claims(summary), title="Claims", **box)
+    table(sentences.slips(summary), title="Slips", **box)
+    say("why, and the slips as printed: claims.md", f"results in {folder}")
+
+
+def grid(cells: list[Any], folder: Path) -> None:
+    """What was flown over two keys."""
+    flown = [cell for cell in cells if cell.status == "flown"]
+    print(f"{len(flown)} of {len(cells)} pairs flown, {sum(cell.failures > 0 for cell in flown)} with failed trials")
+    known = [cell for cell in flown if cell.window_error == cell.window_error]
+    if known:
+        best = min(known, key=lambda cell: (cell.failures, cell.window_error))
+        where = f"{best.x:.4g} (across) and {best.y:.4g} (up)"
+        failed = f", where {best.failures} trials failed" if best.failures else ""
+        print(f"smallest RMS window error {best.window_error:.3g} at {where}, mean peak {best.peak_torque:.3g}{failed}")
+    print(f"results in {folder}")
+
+
+def margins(summary: dict[str, Any], folder: Path) -> None:
+    """Margins of a loop, as their `summary.json` says."""
+    table(margin_sentences.table(summary))
+    say(*margin_sentences.lines(summary), f"results in {folder}")
+
+
+def run(summary: dict[str, Any], kind: str, folder: Path) -> None:
+    """Metrics and verdicts of one run, as its `summary.json` says; kind: of its plant."""
+    say(*sentences.run_lines(summary))
+    table(sentences.run(summary, kind))
+    say(*map(sentences.verdict, sentences.run_verdicts(summary, kind)), f"results in {folder}")
+
+
+def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """What a tuning run found, as its `summary.json` says."""
+    say(f"tuning {how}; {sentences.tuning_heading(summary)}:")
+    table(sentences.tuning(summary))
+    say(*sentences.accuracy(summary), *sentences.search(summary), *sentences.trust(summary))
+    say(*map(sentences.verdict, summary["verdicts"]), *sentences.shortest(summary))
+    if summary["status"] == "interrupted":
+        say("interrupted: these are the best gains so far; the same command goes on from here")
+    say(f"results in {folder}")
+
+
+def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """Laws side by side, as `summary.json` says."""
+    alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
+    say(f"comparison {how}: {alike}")
+    table(sentences.comparison(summary))
+    say(*sentences.comparison_lines(summary), f"results in {folder}")
+
+
+def front(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """A front of accuracy against torque, as its `summary.json` says."""
+    say(f"front {how}: {sentences.front_heading(summary)}")
+    table(sentences.front(summary))
+    say(*sentences.front_lines(summary), f"results in {folder}")
+
+
+def say(*lines: str) -> None:
+    """Print lines that the terminal breaks, not we."""
+    from rich.console import Console
+
+    for line in lines:
+        Console(highlight=False).print(line, soft_wrap=True, markup=False)
+
+
+def table(cells: sentences.Table, **style: Any) -> None:
+    """Print a table; style: of rich's `Table`."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+    from rich.text import Text
+
+    made = Table(*map(escape, cells.head), pad_edge=False, **{"box": None, **style})
+    for row in cells.rows:
+        made.add_row(*map(Text, row))
+    Console(highlight=False).print(made)

@@ -1,0 +1,108 @@
+"""Intervals of the free gains; shares of them, from 0 to 1, <-> gains."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.observers.base import Linear
+from ptsmc_jax.scenario import free_gains
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import envelopes
+from tuning.search import gains as gain_names
+
+TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may fall behind its sample
+
+HALF = 0.5  # of the widest sign: an interval is never narrower than up from there
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Intervals of the free gains, in order. A gain that may vary more than tenfold is searched on a log scale.
+
+    The interval of sign_width begins at hop / observer_gain where that is more than its lower bound: K2, and with it
+    the width below which the sampled sign hops from side to side, is inverse to that gain.
+    """
+
+    names: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    hop: float = 0.0  # in the units of s times those of the observer's gain
+
+    @property
+    def logarithmic(self) -> np.ndarray:
+        """(gains,) bool: searched on a log scale."""
+        return np.asarray(self.upper) > 10.0 * np.asarray(self.lower)
+
+    def _scaled(self) -> tuple[np.ndarray, np.ndarray]:
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        log = self.logarithmic
+        return np.where(log, np.log(lower), lower), np.where(log, np.log(upper), upper)
+
+    def gains(self, share: Float[Array, " gains"]) -> Float[Array, " gains"]:
+        """Gains of shares of the intervals: 0 is the lower bound, 1 the upper one."""
+        low, high = self._scaled()
+        inner = low + (high - low) * share
+        found = jnp.where(self.logarithmic, jnp.exp(inner), inner)
+        if not self.hop:
+            return found
+        k, least = self._width, self._least_width(found)
+        return found.at[k].set(least * (self.upper[k] / least) ** share[k])
+
+    def share(self, gains: np.ndarray) -> np.ndarray:
+        """Shares of gains, (gains,); of those beyond a bound the bound's."""
+        low, high = self._scaled()
+        inner = np.where(self.logarithmic, np.log(np.maximum(gains, 1e-300)), gains)
+        if self.hop:
+            low[self._width] = np.log(self._least_width(gains))
+        return np.clip((inner - low) / (high - low), 0.0, 1.0)
+
+    @property
+    def _width(self) -> int:
+        return self.names.index("sign_width")
+
+    def _least_width(self, gains: Array | np.ndarray) -> Array:
+        observers = [k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain"]
+        least = self.hop / gains[np.asarray(observers)].min()
+        return jnp.clip(least, self.lower[self._width], HALF * self.upper[self._width])
+
+    def at_bound(self, gains: np.ndarray, near: float = 0.01) -> dict[str, str]:
+        """Gains that ended within this share of the interval from a bound: name to "lower" or "upper"."""
+        sides = {name: "lower" if share < near else "upper"
+                 for name, share in zip(self.names, self.share(gains), strict=True)
+                 if not near <= share <= 1.0 - near}  # fmt: skip
+        return sides
+
+    def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
+        """Gains by name with so many digits, none of them beyond its bounds; times stay on their samples."""
+        within = zip(self.names, gains, self.lower, self.upper, strict=True)
+        shown = {name: TIME_DIGITS if name in TIMES else digits for name in self.names}
+        return {name: min(max(float(f"{gain:.{shown[name]}g}"), low), high) for name, gain, low, high in within}
+
+
+def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
+    """The bounds of a checked scenario's free gains; its parts."""
+    assert scenario.tune is not None
+    names = gain_names.named(scenario)
+    intervals = {name: scenario.tune.bounds[gain_names.base(name)] for name in names}
+    hop = 0.0
+    if "sign_width" in names and _hops(scenario, parts):
+        hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
+        if isinstance(parts.observer, Linear) and any(gain_names.base(name) == "observer_gain" for name in names):
+            hop *= float(parts.observer.gain.min())
+        else:  # it does not move with a gain
+            low, high = intervals["sign_width"]
+            intervals["sign_width"], hop = (min(max(low, hop), HALF * high), high), 0.0
+    lower, upper = zip(*intervals.values(), strict=True)
+    return Bounds(names, lower, upper, hop)
+
+
+def _hops(scenario: Scenario, parts: Parts) -> bool:
+    """Whether the sign may be so narrow that it hops, by a bound that is nobody's but the usual one."""
+    if scenario.loop.mode != "sampled" or not isinstance(parts.controller, Prescribed):
+        return False
+    assert scenario.tune is not None
+    return scenario.tune.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]

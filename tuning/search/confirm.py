@@ -1,0 +1,95 @@
+"""Whether a limit for a share of the trials will hold: counted on trials that no search has seen, as it is judged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within
+from tuning.search.gains import with_gains
+from tuning.search.objective import Problem
+
+FRESH = 1000  # trials on which gains are judged, at least
+FEWEST, TIMES = 4096, 8  # trials to count on: this many, and so many times what the gains are judged on
+SURE = 0.98  # probability that gains which are confirmed are met by the verdict
+
+
+@dataclass(frozen=True)
+class Count:
+    """How many of the trials counted on break a requirement."""
+
+    metric: str
+    trials: int
+    beyond: int
+    allowed: int | None  # of them; None: even with none the verdict would not be sure
+    probability: float  # that the verdict on fresh trials is met
+    harder: np.ndarray  # trials beyond the limit but for the `allowed` farthest, the farthest of these first
+
+    @property
+    def held(self) -> bool:
+        """Whether the requirement is confirmed."""
+        return self.allowed is not None and self.beyond <= self.allowed
+
+
+def fresh_trials(requirements: Sequence[Requirement]) -> int:
+    """Trials to judge on: enough to show every quantile that is asked for, with some beyond the limit."""
+    needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
+    return max([FRESH, *(2 * count for count in needed)])
+
+
+def training_trials(requirements: Sequence[Requirement], wanted: int) -> int:
+    """Trials to tune on: those wanted, or the fewest that can show every quantile that is asked for."""
+    needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
+    return max([wanted, *needed])
+
+
+def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) -> float:
+    """Probability that a verdict on `fresh` trials is met where `beyond` of `trials` others break the limit.
+
+    Beta-binomial: the share is known by the count, with a uniform prior (Gelman and others, Bayesian Data Analysis,
+    2013, 2.4).
+    """
+    from scipy.stats import betabinom  # takes a while to import, which most runs need not wait for
+
+    least = least_within(fresh, requirement.quantile, requirement.confidence)
+    return 0.0 if least is None else float(betabinom.cdf(fresh - least, fresh, beyond + 1, trials - beyond + 1))
+
+
+def allowed(requirement: Requirement, fresh: int, trials: int) -> int | None:
+    """How many of `trials` may break the limit for the verdict on `fresh` others to be met with `SURE`."""
+    low, high = -1, trials
+    while high - low > 1:
+        middle = (low + high) // 2
+        sure = probability(requirement, fresh, trials, middle) >= SURE
+        low, high = (middle, high) if sure else (low, middle)
+    return low if low >= 0 else None
+
+
+def count(
+    problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, first: int, turn: int
+) -> list[Count]:
+    """Fly gains (gains,) on trials from number `first` on, others each turn, and count those beyond each limit."""
+    fresh = fresh_trials(requirements)
+    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
+    many = max(FEWEST, TIMES * fresh)
+    numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
+    flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), numbers)
+    found = []
+    for requirement in requirements:
+        values = np.where(flown.finished, getattr(flown.metrics, requirement.metric), np.inf)
+        ratio = np.where(np.isnan(values), np.inf, values) / requirement.limit
+        order = np.argsort(-ratio, kind="stable")
+        beyond = int(np.sum(ratio > 1.0))
+        most = allowed(requirement, fresh, numbers.size)
+        found.append(
+            Count(
+                metric=requirement.metric,
+                trials=numbers.size,
+                beyond=beyond,
+                allowed=most,
+                probability=probability(requirement, fresh, numbers.size, beyond),
+                harder=numbers[order[(most or 0) : beyond]],
+            )
+        )
+    return found

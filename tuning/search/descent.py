@@ -1,0 +1,117 @@
+"""From one start to the optimum next to it, along the active limits, by sequential quadratic programming."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from tuning.search.evaluate import Measured, Sloped
+from tuning.search.objective import Problem, ended, failures
+
+SLACK = 1e-4  # of a limit that an admissible point may use
+BROKEN = 1e3  # metric / limit by which a trial that fails is over, beside those that end
+CLOSE = 1e-5  # change of F at which a descent ends
+BOLD, CAREFUL = 1.0, 4.0  # a first step that may lead across the bounds into a better valley, and one that stays
+# change of F between two bounds of a gain: where the loop chatters slopes are many orders larger, and say nothing
+STEEPEST = 30.0
+
+
+def largest(c: np.ndarray, margin: float) -> np.ndarray:
+    """(points, requirements) largest metric / limit of the trials that end, from c with limits tighter by a margin."""
+    return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
+
+
+class Best:
+    """The best point so far: an admissible one by its F, another one by how far it is over.
+
+    A trial that fails counts as `BROKEN` beyond its limit: more of them are worse, and what the others do still counts.
+    """
+
+    def __init__(self, share: np.ndarray, requirements: int, margin: float):
+        self.margin, self.share = margin, share.copy()  # (gains,) where nothing better is known
+        self.f = self.value = self.over = np.inf
+        self.worst = np.full(requirements, np.inf)  # largest metric / limit
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The less, the better."""
+        return self.over, self.f
+
+    def offer(self, share: np.ndarray, seen: Measured) -> None:
+        """Keep the best of these points, (points, gains), if it is better; admissible is what keeps the margin."""
+        worst = largest(seen.c, self.margin)
+        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
+        over = np.where(np.isfinite(seen.f), over + BROKEN * failures(seen.c), np.inf)
+        first = int(np.lexsort((seen.f, over))[0])
+        if np.isfinite(seen.f[first]) and (over[first], seen.f[first]) < self.rank:
+            self.share, self.worst = share[first].copy(), worst[first]
+            self.f, self.value, self.over = float(seen.f[first]), float(np.exp(seen.value[first])), float(over[first])
+
+
+class _EnoughError(Exception):
+    """As many points as a descent may look at."""
+
+
+def descend(
+    slopes: Callable[[Problem, np.ndarray], Sloped],
+    problem: Problem,
+    best: Best,
+    share: np.ndarray,
+    steps: int,
+    keep: Callable[[Sloped], None],
+    *,
+    close: float = CLOSE,
+    scale: float = BOLD,
+    fixed: Sequence[int] = (),
+    seen: dict[bytes, Sloped] | None = None,
+) -> None:
+    """From these shares, (gains,), downhill inside the bounds; what is best is kept in `best`.
+
+    At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
+    slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the
+    descent goes through, without those that it only tries. seen: the points that a shorter descent from here looked at,
+    which are not flown again: a longer one goes on where it stopped. slopes: measures a problem at a point (1, gains).
+    """
+    seen = {} if seen is None else seen
+
+    def at(scaled: np.ndarray) -> Sloped:
+        key, point = scaled.tobytes(), np.clip(scaled / scale, 0.0, 1.0)[None]
+        if key not in seen:
+            if len(seen) == steps:
+                raise _EnoughError
+            seen[key] = slopes(problem, point)
+        if seen[key].finite[0]:
+            best.offer(point, seen[key])
+        return seen[key]
+
+    limits = {
+        "type": "ineq",
+        "fun": lambda scaled: -ended(at(scaled).c).reshape(-1),
+        "jac": lambda scaled: -_usable(at(scaled).c_slope.reshape(-1, scaled.size)) / scale,
+    }
+
+    def passed(scaled: np.ndarray) -> None:
+        if scaled.tobytes() in seen:
+            keep(seen[scaled.tobytes()])
+
+    first = scale * share
+    keep(at(first))
+    with contextlib.suppress(_EnoughError):
+        minimize(
+            lambda scaled: float(at(scaled).f[0]),
+            first.copy(),
+            jac=lambda scaled: _usable(at(scaled).f_slope)[0] / scale,
+            method="SLSQP",
+            bounds=[(at, at) if k in fixed else (0.0, scale) for k, at in enumerate(first)],
+            constraints=[limits] if problem.rows else [],
+            callback=passed,
+            options={"maxiter": steps, "ftol": close},
+        )
+
+
+def _usable(slopes: np.ndarray) -> np.ndarray:
+    """Slopes, (rows, gains), cut down to `STEEPEST`; zeros for a row with a number that is not finite."""
+    size = np.abs(slopes).max(axis=1, keepdims=True)
+    known = np.where(np.isfinite(size), slopes, 0.0)
+    return known * np.minimum(1.0, STEEPEST / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))

@@ -1,0 +1,354 @@
+"""Descents from many starts, from few of them all the way: the best point, and the points gone through.
+
+Sequential quadratic programming on the slopes of what flies, see `descend`; where there are none, evolution.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.simulation.clock import Anchored
+from tuning.search.abreast import Ask, in_step
+from tuning.search.bounds import TIMES
+from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
+from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.objective import FAILED, Problem, failures, fewer_trials
+from tuning.search.refine import GENERATIONS, WIDELY, refine
+from tuning.search.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, spread, starting_points
+from tuning.search.work import ROUND, SLOPED
+
+AGAIN = 3  # starts, from whose best points they go on
+EXPLORED, AVERAGED = 32, 16  # trials on which most starts are left behind, those averaged at least among them
+FOLLOWED = 3  # starts that go on with all trials
+SAME = 1e-4  # change of F that makes no difference
+FINISH = 1e-2  # of `CLOSE`: how near to the optimum the best start is taken in the end
+MANY = 512  # points swept where there are no slopes
+
+SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
+    "setting out", "searching", "following the best", "finishing", "evolving",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Step:
+    """A point that the search went through; kept as the history."""
+
+    start: int
+    gains: np.ndarray  # (gains,)
+    value: float  # the goal over the training trials
+    worst: np.ndarray  # (requirements,) largest metric / limit, `FAILED` where a trial fails
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where a descent begins, or goes on."""
+
+    share: np.ndarray  # (gains,)
+    scale: float
+    seen: dict[bytes, Sloped]  # points that it looked at before
+    before: list[Step]  # of its history, those of earlier descents
+
+
+def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple[dict, dict]:
+    """What each step of a search flies at most, in rollouts, and each of a further round; see `Work`."""
+    trials = float(problem.trials.size)
+    if not sloped:
+        evolving = {EVOLVING: GENERATIONS * WIDELY[0] * trials}
+        return {CHOOSING: MANY * trials, **evolving}, {ROUND: 0.0, **evolving}
+    one, few = SLOPED * steps, _few_trials(problem).trials.size
+    exploring = {SETTING_OUT: one * few, CHOOSING: max(SWEPT, starts) * few, SEARCHING: starts * one * 3 / 8 * few}
+    return (
+        {
+            **(exploring if starts > 1 else {}),
+            FOLLOWING: (min(starts, FOLLOWED) + 1) / 2 * one * trials,
+            FINISHING: one * trials,
+        },
+        {ROUND: AGAIN * one * trials, FINISHING: one * trials},
+    )
+
+
+def _few_trials(problem: Problem) -> Problem:
+    """The problem with few trials."""
+    return fewer_trials(problem, max(AVERAGED, EXPLORED - (problem.trials.size - problem.averaged)))
+
+
+class Descents:
+    """Descents from many starts and what they leave: the best point, the history."""
+
+    def __init__(
+        self,
+        evaluate: Evaluator,
+        margin: float,
+        steps: int,
+        rng: np.random.Generator,
+        report: Report = lambda *told: None,
+    ):
+        self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
+        self._own: np.ndarray | None = None  # (gains,) shares to come back to where a gain makes no difference
+        self._best: Best | None = None
+        self._problem: Problem | None = None
+        self._history: dict[int, list[Step]] = {}  # by the start
+        self._ends: dict[int, Best] = {}  # the best point of each start
+        self._from = 0  # the start that the best point comes from
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a point at all."""
+        return self._best is not None and bool(np.isfinite(self._best.f))
+
+    @property
+    def best_so_far(self) -> tuple[float, float]:
+        """The goal of the best point, and how far it is beyond a limit."""
+        return (np.nan, np.nan) if self._best is None else (self._best.value, self._best.over)
+
+    @property
+    def best(self) -> Best:
+        """The best point."""
+        assert self._best is not None
+        return self._best
+
+    @property
+    def problem(self) -> Problem:
+        """What it is the best point of, with its own limits."""
+        assert self._problem is not None
+        return self._problem.tightened(1.0 / (1.0 - self._margin))
+
+    @property
+    def share(self) -> np.ndarray:
+        """(gains,) shares of the best point."""
+        return self.best.share
+
+    @property
+    def gains(self) -> np.ndarray:
+        """(gains,) of the best point."""
+        return np.asarray(self._evaluate.bounds.gains(jnp.asarray(self.share)))
+
+    @property
+    def history(self) -> list[Step]:
+        """In the order of the starts, and of each start's steps."""
+        return [step for _, steps in sorted(self._history.items()) for step in steps]
+
+    def prepare(self, problem: Problem) -> None:
+        """Begin to compile what a search will need later, beside its first steps."""
+        self._evaluate.prepare(_few_trials(problem), problem)
+
+    def set_out(self, problem: Problem, own: np.ndarray) -> None:
+        """From the scenario's own gains, (gains,), on a few trials."""
+        self._own = self._evaluate.bounds.share(own)
+        self._report(SETTING_OUT, 0, 2, *self.best_so_far)
+        self._descend(_few_trials(problem), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
+
+    def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
+        """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
+
+        The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
+        """
+        problem, few, more = _few_trials(problem), max(2, self._steps // 4), max(2, self._steps // 2)
+        self._report(SETTING_OUT, 1, 2, *self.best_so_far)
+        self._descend(problem, self.share, 0, more, scale=CAREFUL, afresh=True)
+        first = starting_points(self._evaluate, self.tightened(problem), self.share, starts, seed, self._report)
+        racing = dict(enumerate(first))
+        rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
+        ranked = self._race(problem, racing, rungs, SEARCHING, scales=(CAREFUL, BOLD))
+        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {0: first[0]}
+
+    def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
+        """From each of these shares part of the way, and from the most promising one to the optimum next to it."""
+        half, self._ends = max(2, self._steps // 2), {}
+        self._race(problem, starts, ((len(starts), half), (1, self._steps)), FOLLOWING, afresh=True)
+        self._finish(problem)
+
+    def _race(
+        self,
+        problem: Problem,
+        starts: Mapping[int, np.ndarray],
+        rungs: Sequence[tuple[int, int]],
+        what: str,
+        *,
+        scales: Sequence[float] = (CAREFUL,),
+        afresh: bool = False,
+    ) -> list[int]:
+        """The starts by where they end, the best first; on each rung so many of them go so many steps in all.
+
+        scales: of the descents, by turns.
+        """
+        ranked, seen = list(starts), {k: dict[bytes, Sloped]() for k in starts}
+        before = {k: list(self._history.get(k, ())) for k in starts}
+        for count, steps in rungs:
+            some = {k: _Start(starts[k], scales[k % len(scales)], seen[k], before[k]) for k in ranked[:count]}
+            self._descend_abreast(problem, some, steps, what, afresh=afresh)
+            afresh = False
+            known = [k for k in ranked if k in self._ends]
+            ranked = sorted(known, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
+        return ranked
+
+    def _descend_abreast(
+        self,
+        problem: Problem,
+        starts: Mapping[int, _Start],
+        steps: int,
+        what: str,
+        *,
+        afresh: bool,
+    ) -> None:
+        """From each of these starts; as many at a time as there are devices."""
+        tightened, bests, told = self.tightened(problem), dict[int, Best](), 0
+
+        def from_start(k: int, ask: Ask) -> None:
+            one, keep = starts[k], partial(self._keep, k)
+            best = bests[k] = Best(one.share, len(problem.rows), self._margin)
+            self._history[k] = list(one.before)  # it goes through the same points again, and on
+            descend(
+                lambda _, point: ask(point), tightened, best, one.share, steps, keep, scale=one.scale, seen=one.seen
+            )
+
+        def tell() -> None:
+            nonlocal told
+            known = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
+            best = min(known, key=lambda best: best.rank)
+            while told < len(bests):  # once for each that has begun
+                self._report(what, told, len(starts), best.value, best.over)
+                told += 1
+
+        def flown(points: list[np.ndarray]) -> list[Sloped]:
+            tell()
+            found = self._evaluate.slopes(tightened, np.concatenate(points))
+            return [found.at(k) for k in range(len(points))]
+
+        try:
+            in_step([partial(from_start, k) for k in starts], flown, len(jax.local_devices()))
+            tell()
+        finally:  # interrupted too
+            for k in starts:
+                if k in bests:
+                    self._take(bests[k], tightened, k, afresh=afresh)
+                    afresh = False
+
+    def again(self, problem: Problem) -> None:
+        """On from where the best starts ended, with what has joined the problem."""
+        ranked = sorted(self._ends.items(), key=lambda item: item[1].rank)[:AGAIN]
+        self._instead(problem, [(start, end.share) for start, end in ranked])
+        self._finish(problem)
+
+    def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]], fixed: Sequence[int] = ()) -> None:
+        """From each of these (start, shares): the best of what is found takes the place of the best so far."""
+        for k, (start, share) in enumerate(ends):
+            self._descend(problem, share, start, self._steps, scale=CAREFUL, fixed=fixed, afresh=k == 0)
+
+    def sweep(self, problem: Problem, own: np.ndarray) -> None:
+        """The best of the scenario's gains and of points spread widely, where there are no slopes."""
+        tightened = self.tightened(problem)
+        share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
+        share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
+        best = Best(share[0], len(problem.rows), self._margin)
+        best.offer(share, self._evaluate.fly(tightened, share))
+        self._take(best, tightened, 0, afresh=True)
+
+    def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
+        """Better points around these shares, without slopes."""
+        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
+        best.offer(share[None], self._evaluate.fly(tightened, share[None]))
+        try:
+            refine(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
+                   lambda done, steps: self._report(EVOLVING, done, steps, best.value, best.over),
+                   partial(self._keep, 0), size)  # fmt: skip
+        finally:  # interrupted too
+            self._take(best, tightened, 0, afresh=True)
+        on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
+        if on_samples.size:
+            best = Best(on_samples[0], len(problem.rows), self._margin)
+            best.offer(on_samples, self._evaluate.fly(tightened, on_samples))
+            self._take(best, tightened, 0, afresh=best.over <= self.best.over)
+
+    def _finish(self, problem: Problem) -> None:
+        self._report(FINISHING, 0, 1, *self.best_so_far)
+        self._descend(problem, self.share, self._from, self._steps, scale=CAREFUL, close=FINISH * CLOSE)
+        times = [k for k, name in enumerate(problem.names) if name in TIMES]
+        ends = [(self._from, share) for share in self._with_the_hand_over_on_a_sample(problem)]
+        self._instead(problem, ends, fixed=times)
+        others = [k for k in range(len(problem.names)) if k not in times]
+        if self._own is not None and others:
+            self._take_back(problem, self._own, others)
+
+    def _take_back(self, problem: Problem, own: np.ndarray, some: Sequence[int]) -> None:
+        """The scenario's own value for as many of some gains as make no difference together."""
+        tightened, found = self.tightened(problem), self.best
+
+        def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
+            share = np.stack([np.where(np.isin(np.arange(own.size), change), own, found.share) for change in changes])
+            flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
+            made = [Best(one, len(problem.rows), self._margin) for one in share]
+            for k, best in enumerate(made):
+                best.offer(share[k : k + 1], flown.at(k))
+            return made
+
+        alone = dict(zip(some, judged([[k] for k in some]), strict=True))
+        order = sorted((k for k in some if self._as_good(alone[k])), key=lambda k: alone[k].f)
+        if order:
+            together = judged([order[: k + 1] for k in range(len(order))])
+            self._best = next((best for best in reversed(together) if self._as_good(best)), found)
+
+    def _as_good(self, best: Best) -> bool:
+        return best.over <= self.best.over and best.f <= self.best.f + SAME
+
+    def _with_the_hand_over_on_a_sample(self, problem: Problem) -> list[np.ndarray]:
+        """The best gains with the nearest hand-overs that are flown as they are trained; none where all are.
+
+        A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
+        """
+        clock, bounds = problem.parts.clock, self._evaluate.bounds
+        if "delta" not in problem.names or not isinstance(clock, Anchored):
+            return []
+        named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
+        t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)
+        samples = (t_f - named["delta"]) / period
+        found = []
+        for sample in sorted({math.floor(samples + 1e-9), math.ceil(samples - 1e-9)}):
+            if bounds.lower[at] * (1 - 1e-9) <= t_f - sample * period <= bounds.upper[at]:
+                gains = self.gains.copy()
+                gains[at] = t_f - sample * period
+                share = self.share.copy()
+                share[at] = bounds.share(gains)[at]
+                found.append(share)
+        return found
+
+    def _descend(
+        self,
+        problem: Problem,
+        share: np.ndarray,
+        start: int,
+        steps: int,
+        *,
+        scale: float,
+        close: float = CLOSE,
+        fixed: Sequence[int] = (),
+        afresh: bool = False,
+    ) -> None:
+        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
+        keep = partial(self._keep, start)
+        try:
+            slopes = self._evaluate.slopes
+            descend(slopes, tightened, best, share, steps, keep, close=close, scale=scale, fixed=fixed)
+        finally:  # interrupted too
+            self._take(best, tightened, start, afresh=afresh)
+
+    def _take(self, best: Best, tightened: Problem, start: int, *, afresh: bool) -> None:
+        """What was found, if it is better; afresh: than nothing, of another problem than the best so far."""
+        if np.isfinite(best.f):
+            self._ends[start] = best
+        if self._best is None or (np.isfinite(best.f) and (afresh or best.rank < self._best.rank)):
+            self._best, self._problem, self._from = best, tightened, start
+
+    def _keep(self, start: int, seen: Measured) -> None:
+        worst = np.where(failures(seen.c)[0] > 0, FAILED, largest(seen.c, self._margin)[0])
+        step = Step(start, seen.gains[0], float(np.exp(seen.value[0])), worst)
+        self._history.setdefault(start, []).append(step)
+
+    def tightened(self, problem: Problem) -> Problem:
+        """With the margin kept from the limits."""
+        return problem.tightened(1.0 - self._margin)

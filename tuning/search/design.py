@@ -1,0 +1,114 @@
+"""The design rule that a torque limit asks for: the shortest t_f, by theory and confirmed by simulation."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import programs, scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import solutions
+from tuning.search.gains import with_gains
+
+FARTHEST = 100.0  # times the scenario's t_f: no longer one is looked at
+CLOSE = 1e-3  # relative width at which the search by simulation ends
+LONGEST = 12  # batches that it may fly
+
+
+@dataclass(frozen=True)
+class ShortestTime:
+    """Shortest t_f [s] at which the largest input of any trial stays within the limit."""
+
+    limit: float
+    theory: float | None  # along the exact motions; None: the limit cannot be kept at any t_f
+    simulated: float | None  # as flown; None: not found
+    trials: int
+
+    def __str__(self) -> str:
+        return text(self.limit, self.theory, self.simulated)
+
+
+def text(limit: float, by_theory: float | None, simulated: float | None) -> str:
+    """A `ShortestTime` in one line."""
+    if by_theory is None:
+        return f"no t_f up to {FARTHEST:g} times the scenario's keeps these gains below the limit of {limit:g}"
+    said = f"shortest t_f for a limit of {limit:g} with these gains: {by_theory:.4g} s by theory"
+    return said + (f", {simulated:.4g} s as flown" if simulated is not None else "; none found by simulation")
+
+
+def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) -> ShortestTime:
+    """Shortest t_f of a scenario's gains for a limit on the commanded input, over these trials of the seed.
+
+    By theory: the largest input along the exact motions of the trials (rule 3.5 for any start, reference and order).
+    By simulation: the same search on flown trials, begun at what theory says.
+    """
+    ready = scenario.study(flown)
+    starts = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
+
+    def predicted(t_f: float) -> float:
+        return float(_predicted(ready.parts, *starts, t_f))
+
+    own = float(ready.parts.controller.t_f)
+    lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
+    rule = _smallest(predicted, limit, own, lowest, FARTHEST * own, CLOSE, 60)
+    if rule is None:
+        return ShortestTime(limit, None, None, len(trials))
+
+    longest = max(1.5 * rule, own)
+    try:
+        roomy = scenario.study(scenario.replace(
+            flown, controller__t_f=longest, loop__t_end=longest + float(ready.parts.t_end) - own
+        ))  # fmt: skip
+    except ScenarioError:  # a reference that runs into the law's singularity later, say
+        return ShortestTime(limit, rule, None, len(trials))
+
+    def simulated(t_f: float) -> float:
+        parts = with_gains(roomy.parts, {"t_f": t_f})
+        result = montecarlo.run(parts, ready.dispersion, seed, trials)
+        peaks = np.where(result.finished, result.metrics.peak_torque, np.inf)
+        return float(peaks.max())
+
+    found = _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
+    return ShortestTime(limit, rule, found, len(trials))
+
+
+@programs.jit
+def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, t_f: jax.Array) -> jax.Array:
+    controller = replace(parts.controller, t_f=jnp.asarray(t_f, float))
+
+    def peak(trial: jax.Array) -> jax.Array:
+        return solutions.exact_peak(dispersion.apply(replace(parts, controller=controller), seed, trial))
+
+    return jnp.max(jax.vmap(peak)(trials))
+
+
+def _smallest(peak, limit: float, start: float, lowest: float, longest: float, close: float, most: int) -> float | None:
+    """Smallest t_f at which peak(t_f) <= limit, the last crossing when t_f shrinks from where the limit is kept.
+
+    Peaks fall about like 1 / t_f^2, so each guess is the last one times sqrt(peak / limit), kept inside the bracket.
+    """
+    over, kept = lowest, None  # t_f known to break the limit, and to keep it
+    guess = start
+    for _ in range(most):
+        value = peak(guess)
+        if value <= limit:
+            kept = guess
+        else:
+            over = max(over, guess)
+        if kept is not None and kept - over <= close * kept:
+            break
+        if kept is None and over >= longest:
+            return None
+        step = guess * (value / limit) ** 0.5 if np.isfinite(value) and value > 0 else 2 * guess
+        if kept is None:
+            guess = min(max(step, 1.001 * over) * (1 + 0.2 * close), longest)
+        else:
+            inside = over + 0.02 * (kept - over), kept - 0.02 * (kept - over)
+            step *= 1 + 0.2 * close
+            guess = step if inside[0] < step < inside[1] else 0.5 * (over + kept)
+    return kept

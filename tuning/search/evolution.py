@@ -1,0 +1,80 @@
+"""A global search of the same problem without slopes: how far the gradient search ended from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from tuning.search.descent import SLACK, Best
+from tuning.search.descents import Descents
+from tuning.search.evaluate import Evaluator
+from tuning.search.optimise import Search
+from tuning.search.starts import Report
+
+POPULATION = 40  # points for each gain
+GENERATIONS = 80
+STEPS = 100  # of the descent from what it found
+SPREAD = 1e-4  # of F in the population, at which it ends
+FORBIDDEN = 100.0  # beside F, for a point that breaks a limit: beyond every F
+
+
+@dataclass(frozen=True)
+class Check:
+    """What differential evolution found of the same problem."""
+
+    gains: dict[str, float]
+    value: float  # its goal
+    distance: float  # the search's F less this one's: about the share by which the search is worse
+    kept: bool  # whether it keeps every limit
+    rollouts: int  # trials flown for it
+
+
+def check(
+    evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *told: None, *, sloped: bool = True
+) -> Check:
+    """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
+
+    Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
+    """
+    problem = found.problem.tightened(1.0 - found.margin)
+    before, generation = evaluate.rollouts, 0
+
+    def merit(share: np.ndarray) -> np.ndarray:
+        flown = evaluate.fly(problem, share.T)
+        bad = FORBIDDEN * np.where(np.isfinite(flown.f), 1.0, 2.0) + np.log1p(np.maximum(flown.beyond, 0.0))
+        return np.where((flown.beyond <= SLACK) & np.isfinite(flown.f), flown.f, bad)
+
+    def tell(intermediate_result) -> None:
+        nonlocal generation
+        generation += 1
+        best = float(intermediate_result.fun)
+        report("differential evolution", generation, GENERATIONS, float(np.exp(best)), 0.0 if best < FORBIDDEN else 1.0)
+
+    result = differential_evolution(
+        merit,
+        [(0.0, 1.0)] * len(problem.names),
+        popsize=POPULATION,
+        maxiter=GENERATIONS,
+        tol=0.0,
+        atol=SPREAD,  # pyright: ignore[reportArgumentType]
+        rng=np.random.default_rng(seed),
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        init="sobol",
+        callback=tell,
+    )
+    best = Best(result.x, len(problem.rows), found.margin)
+    best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
+    if sloped:  # near a limit evolution goes slowly: from where it ends, along it
+        run = Descents(evaluate, found.margin, STEPS, np.random.default_rng(seed))
+        run.descend(found.problem, {0: result.x})
+        best = run.best
+    own, seen = evaluate.fly(problem, found.share[None]), evaluate.fly(problem, best.share[None])
+    return Check(
+        gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),
+        value=best.value,
+        distance=float(own.f[0]) - best.f,
+        kept=bool(seen.c[0].max(initial=-1.0) <= SLACK),
+        rollouts=evaluate.rollouts - before,
+    )

@@ -1,0 +1,185 @@
+"""The gains that tuning can move: their units, and how they are read from and set in parts and scenarios.
+
+A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import core
+from jaxtyping import Array
+
+from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.devices.sensors import Sensors
+from ptsmc_jax.scenario import law_tables, plant_tables
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.clock import Anchored
+from ptsmc_jax.simulation.rollout import Parts
+
+_STATE_UNITS = {
+    "eta": "-",
+    "delta": "s",
+    "observer_gain": "1/s",
+    "k1": "1/s",
+    "sign_width": "x1",
+    "surface_rate": "1/s",
+    "t_f": "s",
+}
+# gain: unit, by the kind of the plant
+UNITS = {
+    "spacecraft": {
+        "eta": "-",
+        "delta": "s",
+        "observer_gain": "N m s",
+        "k1": "1/s",
+        "sign_width": "-",
+        "surface_rate": "1/s",
+        "t_f": "s",
+        "filter_bandwidth": "rad/s",
+        "k_p": "1/s^2",
+        "k_d": "1/s",
+        "b": "1/s^p",
+        "k": "1/s^2",
+        "a1": "1/s",
+        "b1": "1/s",
+        "a2": "1/s^(2-p)",
+        "b2": "1/s^(2-p)",
+        **dict.fromkeys(("p", "gamma", "m", "n"), "-"),
+    },
+    "chain": {**_STATE_UNITS, "sign_width": "s"},
+    "system": _STATE_UNITS,
+}
+_AXIS = "observer_gain_"
+
+
+def base(name: str) -> str:
+    """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
+    return "observer_gain" if name.startswith(_AXIS) else name
+
+
+def named(scenario: Scenario) -> tuple[str, ...]:
+    """Names of the free gains, axis by axis where the scenario says so."""
+    tune = scenario.tune
+    assert tune is not None
+    assert tune.free is not None  # a checked scenario names them
+    names: list[str] = []
+    for name in tune.free:
+        each = tune.per_axis and name == "observer_gain"
+        names += [f"{_AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))] if each else [name]
+    return tuple(names)
+
+
+def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
+    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
+
+    Raises ValueError where the parts' anchored clock has too few samples for them, as far as they are known: under a
+    transformation such a run ends before t_end.
+    """
+    gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    if "t_f" in gains:
+        parts = parts.with_t_f(gains["t_f"])
+    law = {k: v for k, v in gains.items() if base(k) not in ("t_f", "observer_gain", "filter_bandwidth")}
+    parts = replace(parts, controller=replace(parts.controller, **law))
+    each = _each(gains, list(getattr(parts.observer, "gain", ())))
+    if each is not None:
+        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
+    if "filter_bandwidth" in gains:
+        assert isinstance(parts.sensors, Sensors)
+        sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        parts = replace(parts, sensors=sensors)
+    _check_clock(parts)
+    return parts
+
+
+def _check_clock(parts: Parts) -> None:
+    clock, law = parts.clock, parts.controller
+    if not isinstance(clock, Anchored):
+        return
+    times = [law.t_f, law.delta, parts.t_end, clock.period]
+    if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
+        return
+    t_f, delta, t_end, period = map(float, times)
+    hand_over = t_f - delta
+    for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
+        if needed > samples * period * (1.0 + 1e-9):
+            raise ValueError(
+                f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
+                f"the parts' clock has {samples * period:g}; make the parts for them, with ptsmc_jax.replace or with "
+                "the reach of scenario.study"
+            )
+
+
+def gains_of(parts: Parts) -> dict[str, float]:
+    """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
+    controller = parts.controller
+    law = [name for name in controller.free if name not in ("k1", "sign_width", "surface_rate", "t_f")]
+    gains = {name: float(getattr(controller, name)) for name in law}
+    each = [float(v) for v in getattr(parts.observer, "gain", ())]
+    if each:
+        gains["observer_gain"] = sum(each) / len(each)
+    gains |= {name: float(getattr(controller, name)) for name in controller.free if name not in law}
+    if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
+        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    return {**gains, **{f"{_AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
+
+
+def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
+    """The parts' own values of these gains."""
+    gains, each = gains_of(parts), getattr(parts.observer, "gain", ())
+    return [float(each[int(name.removeprefix(_AXIS)) - 1]) if name != base(name) else gains[name] for name in names]
+
+
+def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
+    """The scenario with other gains, checked; with another t_f the time after it is kept, unless it was free."""
+    changes: dict[str, Any] = {
+        f"controller__{k}": v for k, v in gains.items() if base(k) not in ("observer_gain", "filter_bandwidth")
+    }
+    each = _each(gains, list(getattr(scenario.observer, "gain", ())))
+    if each is not None:
+        changes["observer__gain"] = each
+    if "filter_bandwidth" in gains:
+        changes["filter__bandwidth"] = gains["filter_bandwidth"]
+    if "t_f" in gains:
+        assert scenario.loop.t_end is not None
+        changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)
+    return scenarios.replace(scenario, **changes)
+
+
+def of_paper(scenario: Scenario) -> dict[str, float]:
+    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; a smooth sign 1e-3 wide.
+
+    delta is a period or more, and half of t_f or less where a period is.
+    """
+    shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+    delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
+    gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
+    if isinstance(scenario.plant, plant_tables.ChainPlant):
+        gains["eta"] = scenario.plant.order + 1.0
+    papers = isinstance(scenario.observer, law_tables.NonlinearObserver | law_tables.EachNonlinearObserver)
+    return {**gains, "observer_gain": 10.0} if papers else gains
+
+
+def papers(scenario: Scenario) -> Scenario:
+    """The scenario under the paper's law with the paper's gains for its plant."""
+    table, own = scenario.controller, of_paper(scenario)
+    if isinstance(table, law_tables.Baseline):
+        kept = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
+        law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
+        scenario = scenarios.replace(scenario, tune=None, controller=law)
+    return in_scenario(scenario, own)
+
+
+def differ(one: Scenario, other: Scenario) -> bool:
+    """Whether two scenarios fly another law or other gains."""
+    return any(getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "filter"))
+
+
+def _each(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
+    """The observer's gain on every axis, where these gains name one."""
+    if not any(base(name) == "observer_gain" for name in gains):
+        return None
+    common = [gains.get("observer_gain", value) for value in own]
+    return [gains.get(f"{_AXIS}{k + 1}", value) for k, value in enumerate(common)]

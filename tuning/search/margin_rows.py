@@ -1,0 +1,118 @@
+"""Margins as constraints of a tuning problem: rows beside those of what is flown, by a program of their own.
+
+One for each axis, time and case, so that what is the least of several has slopes where two of them change places.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax import programs
+from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.dispersions.base import Coordinates
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.scenario import Study
+from ptsmc_jax.scenario.layouts import MARGINS
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.requirements import over
+from ptsmc_jax.theory import margins
+from tuning.search import gains as gain_names
+from tuning.search.bounds import Bounds
+from tuning.search.gains import with_gains
+
+CASES = 2  # loops with drawn inertias, those that come nearest to a limit
+WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
+
+
+@pytree
+@dataclass(frozen=True)
+class Asked:
+    """Margins that are asked for, and of which loops."""
+
+    parts: Parts
+    dispersion: Dispersion
+    seed: Leaf  # uint32
+    coordinates: Coordinates  # of what is drawn, arrays over the cases first; empty: the nominal loop alone
+    wanted: Leaf  # (margins,) the limits in their units
+    limits: Leaf  # (margins,) how near a loop may come, see `over`: 1, less what the search keeps from it
+    metrics: tuple[str, ...] = field(metadata={"static": True})
+    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
+
+    def tightened(self, factor: float) -> "Asked":
+        """With limits so many times as large."""
+        return replace(self, limits=self.limits * factor)
+
+
+def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
+    """The margins that a scenario asks for, or None; where inertias are drawn, of the trials hardest by its gains."""
+    if not ready.margins:
+        return None
+    asked = Asked(
+        parts=ready.parts,
+        dispersion=ready.dispersion,
+        seed=jnp.uint32(seed),
+        coordinates={},
+        wanted=jnp.asarray([one.limit for one in ready.margins]),
+        limits=jnp.ones(len(ready.margins)),
+        metrics=tuple(one.metric for one in ready.margins),
+        names=names,
+    )
+    return hardest(asked, np.asarray(gain_names.own(ready.parts, names)))[0]
+
+
+def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
+    """With the `CASES` trials whose loops come nearest to a limit by these gains, and how near the nearest comes.
+
+    As it is where no inertia is drawn: all loops are one, which is among the rows.
+    """
+    if not margin_verdicts.differ(asked.dispersion):
+        return asked, 0.0
+    parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
+    each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS))
+    shares = [
+        over(each[name], wanted, at_least=MARGINS[name][2])
+        for name, wanted in zip(asked.metrics, np.asarray(asked.wanted), strict=True)
+    ]
+    near = np.max(np.nan_to_num(shares, nan=WITHOUT), axis=0)
+    trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
+    coordinates = jax.vmap(lambda trial: asked.dispersion.coordinates(asked.seed, trial))(trials)
+    return replace(asked, coordinates=coordinates), float(near.max())
+
+
+def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:
+    """Constraints c, met where c <= 0: how near to its limit each margin comes, over `limits`, less 1.
+
+    A loop without slopes is as far beyond as one without any margin.
+    """
+    parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
+
+    def near(parts: Parts) -> Array:
+        found = margins.judged(parts)[0].each()
+        each = []
+        for name, wanted in zip(asked.metrics, asked.wanted, strict=True):
+            share = over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
+            each.append(jnp.where(jnp.isnan(share), WITHOUT, share))
+        return jnp.stack(each)
+
+    if asked.coordinates:
+        cases = jax.lax.map(lambda c: near(asked.dispersion.at(parts, c)), asked.coordinates)
+        found = jnp.concatenate(list(cases), axis=1)
+    else:
+        found = near(parts)
+    return found / asked.limits[:, None] - 1.0
+
+
+@programs.jit(static_argnames="bounds")
+def sloped(asked: Asked, bounds: Bounds, share: Array) -> dict[str, Array]:
+    """The rows "c" at shares (gains,) of the bounds' intervals, and "c_slope" by these."""
+
+    def twice(share: Array) -> tuple[Array, Array]:
+        c = rows(asked, bounds.gains(share))
+        return c, c
+
+    slope, c = jax.jacfwd(twice, has_aux=True)(share)
+    return {"c": c, "c_slope": jnp.nan_to_num(slope)}

@@ -1,0 +1,212 @@
+"""What is minimised over the training trials, with requirements as constraints per trial."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ptsmc_jax import programs
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.dispersions.base import Coordinates
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.requirements import Requirement
+from ptsmc_jax.simulation.rollout import Parts
+from tuning.search.gains import with_gains
+from tuning.search.margin_rows import Asked
+
+FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
+T_F = "t_f"
+
+
+@pytree
+@dataclass(frozen=True)
+class Problem:
+    """A tuning problem. The first `averaged` trials count in the objective, all of them in the constraints."""
+
+    parts: Parts
+    dispersion: Dispersion
+    seed: Leaf  # uint32
+    trials: Leaf  # (trials,) uint32, that name the noise
+    coordinates: Coordinates  # of what is drawn, arrays over the trials first
+    limits: Leaf  # (requirements,) in the metrics' units
+    counted: Leaf  # (requirements, trials) bool: whether a trial beyond the averaged ones must keep a limit
+    averaged: int = field(metadata={"static": True})
+    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
+    metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
+    # of the averaged trials, how many must keep each limit; None: every trial must
+    least: tuple[int | None, ...] = field(metadata={"static": True})
+    goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
+    tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
+    torque_weight: float = field(default=0.0, metadata={"static": True})
+    margins: Asked | None = None  # of the loop; their rows stand after those of the requirements, see `Evaluator`
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """What the rows of c are of."""
+        return self.metrics + (() if self.margins is None else self.margins.metrics)
+
+    def tightened(self, factor: float) -> "Problem":
+        """The problem with limits so many times as large."""
+        margins = None if self.margins is None else self.margins.tightened(factor)
+        return replace(self, limits=self.limits * factor, margins=margins)
+
+
+def problem(
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: int,
+    trials: np.ndarray,
+    names: tuple[str, ...],
+    requirements: Sequence[Requirement] = (),
+    **others: object,
+) -> Problem:
+    """A problem over these trials of the seed; others: fields of `Problem`."""
+    made = Problem(
+        parts=parts,
+        dispersion=dispersion,
+        seed=jnp.uint32(seed),
+        trials=jnp.zeros(0, dtype=jnp.uint32),
+        coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
+        limits=jnp.asarray([r.limit for r in requirements], dtype=float),
+        counted=jnp.zeros((len(requirements), 0), dtype=bool),
+        averaged=len(trials),
+        names=names,
+        metrics=tuple(r.metric for r in requirements),
+        least=(None,) * len(requirements),
+    )
+    return replace(with_trials(made, trials), **others)
+
+
+def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
+    """Coordinates of these trials, arrays over the trials first."""
+    numbers = jnp.asarray(trials, dtype=jnp.uint32)
+    return _coordinates(dispersion, jnp.uint32(seed), numbers)
+
+
+@programs.jit
+def _coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
+    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
+
+
+def with_trials(
+    problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None, counted: np.ndarray | None = None
+) -> Problem:
+    """The problem with these trials added, which count in the constraints; coordinates: if not their own.
+
+    counted: (requirements,) bool, which limits they must keep; by default those that every trial must keep.
+    """
+    if coordinates is None:
+        coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
+    rows = np.asarray(whole_rows(problem) if counted is None else counted, dtype=bool)
+    return replace(
+        problem,
+        trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
+        counted=jnp.concatenate([problem.counted, jnp.tile(rows[:, None], (1, len(trials)))], axis=1),
+        coordinates={name: jnp.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
+    )
+
+
+def fewer_trials(problem: Problem, averaged: int) -> Problem:
+    """The problem averaged over the first so many trials only, with those that were added; shares of them as before."""
+    if averaged >= problem.averaged:
+        return problem
+    kept = np.r_[:averaged, problem.averaged : problem.trials.size]
+
+    def share(count: int | None) -> int | None:
+        return None if count is None else max(1, math.ceil(count * averaged / problem.averaged))
+
+    return replace(
+        problem,
+        trials=problem.trials[kept],
+        counted=problem.counted[:, kept],
+        coordinates={name: v[kept] for name, v in problem.coordinates.items()},
+        averaged=averaged,
+        least=tuple(share(count) for count in problem.least),
+        tail=share(problem.tail),
+    )
+
+
+def whole_rows(problem: Problem) -> np.ndarray:
+    """(requirements,) bool: limits that every trial must keep."""
+    return np.asarray([least is None for least in problem.least], dtype=bool)
+
+
+def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
+    """F that is minimised, c = metric / limit - 1, (requirements, trials), met where c <= 0, and ln of the goal.
+
+    The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
+    worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
+    only some trials must keep a limit, c of the others is cut down to that of the last one that must. Where a trial
+    fails, or has no value, c is `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to
+    F.
+    """
+    named = dict(zip(problem.names, gains, strict=True))
+    parts = with_gains(problem.parts, named)
+
+    def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
+        trial, coordinates = case
+        metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
+        over = [
+            judged(getattr(metrics, name) / limit, status) - 1.0
+            for name, limit in zip(problem.metrics, problem.limits, strict=True)
+        ]
+        goal = metrics.window_error if problem.goal == T_F else getattr(metrics, problem.goal)
+        square, torque = (judged(v, status) ** 2 for v in (goal, metrics.peak_torque))
+        return square, torque, jnp.stack(over) if over else jnp.zeros(0)
+
+    squares, torques, over = montecarlo.blocks(fly, (problem.trials, problem.coordinates))
+    value = weighted = (
+        jnp.log(named[T_F]) if problem.goal == T_F else _log_rms(squares[: problem.averaged], problem.tail)
+    )
+    if problem.goal != T_F:
+        weighted = value + jnp.sum(squares[: problem.averaged] >= FAILED**2) * math.log(FAILED)
+    if problem.torque_weight:
+        weighted = weighted + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
+    rows = [
+        _asked(row, least, problem.averaged, counted[problem.averaged :])
+        for row, least, counted in zip(over.T, problem.least, problem.counted, strict=True)
+    ]
+    constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
+    return weighted, constraints, value
+
+
+def judged(value: Array, status: Array) -> Array:
+    """A trial's metric, or its share of a limit, as it counts: `FAILED` where the trial failed or has no value."""
+    ended = (status == rollout.OK) | (status == rollout.MISSED)
+    return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
+
+
+def ended(c: np.ndarray) -> np.ndarray:
+    """Constraints, where a trial that fails or has no value is as if it kept its limit: no gain may change that."""
+    return np.where(c < FAILED - 1.0, c, -1.0)
+
+
+def failures(c: np.ndarray) -> np.ndarray:
+    """(points,) how many trials fail or have no value, of constraints c (points, requirements, trials)."""
+    return np.sum(np.any(c >= FAILED - 1.0, axis=1), axis=1)
+
+
+def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:
+    """Over those that end, or the `tail` worst of them: beside `FAILED`^2 no digit of theirs would be left."""
+    left = squares < FAILED**2
+    count = jnp.sum(left)
+    kept = jnp.where(left, squares, 0.0)
+    if tail is not None:
+        kept, count = jax.lax.top_k(kept, tail)[0], jnp.minimum(count, tail)
+    return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(kept) / jnp.maximum(count, 1), FAILED**2))
+
+
+def _asked(
+    over: Float[Array, " trials"], least: int | None, averaged: int, counted: Bool[Array, " added"]
+) -> Float[Array, " trials"]:
+    """What is asked of c: of the averaged trials all but the worst beyond `least`, of the others those counted."""
+    first = over[:averaged]
+    if least is not None:
+        first = jnp.minimum(first, -jax.lax.top_k(-first, least)[0][-1])
+    return jnp.concatenate([first, jnp.where(counted, over[averaged:], -1.0)])

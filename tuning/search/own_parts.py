@@ -1,0 +1,79 @@
+"""Programs that scenarios name: systems and metrics of one's own, which flying runs and reading does not.
+
+A scenario that a user names is the user's own program. One that a ptsmc command left may come from anybody, with
+everything in its folder, the digests too: what it names is run with `--trust` only, and as it was when that was made.
+"""
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.scenario import systems
+from ptsmc_jax.scenario.tables import Scenario
+
+DIGESTS = {"plant.system": "system_sha256", "--metrics": "metrics_sha256"}  # names in `versions.json`
+
+
+def named(scenario: Scenario, metrics: str | None = None) -> dict[str, str]:
+    """What flying a scenario, and metrics of one's own, runs: where it stands, by the key that names it."""
+    system = getattr(scenario.plant, "system", None)
+    found = {"plant.system": system, "--metrics": metrics}
+    return {key: where for key, where in found.items() if isinstance(where, str)}
+
+
+def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
+    """Let a scenario file be flown: see `allow` where it lies in results; what stands elsewhere than beside it is said.
+
+    Raises RefusedError.
+    """
+    programs, folder = named(scenario), _results(path)
+    if folder is not None:
+        allow(programs, path, store.made(folder), trusted)
+        return
+    beside = os.path.realpath(path.parent) + os.sep
+    _say({key: where for key, where in programs.items() if not systems.location(where).startswith(beside)}, path)
+
+
+def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], trusted: bool) -> None:
+    """Let what results name be run, and say so; made: their `versions.json`.
+
+    Raises RefusedError without --trust, or where it is not what they were made with.
+    """
+    if programs and not trusted:
+        listed = " and ".join(f"{systems.location(where)} ({key})" for key, where in programs.items())
+        raise RefusedError(
+            f"{results} names code of its own, {listed}, which this command would run; "
+            "allowed is --trust, for one who has read it"
+        )
+    check_unchanged(programs, results, made)
+    _say(programs, results)
+
+
+def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> None:
+    """Raise RefusedError where a program is not the one that results were made with."""
+    for key, where in programs.items():
+        was, now = made.get(DIGESTS[key]), systems.digest(where)
+        if was is not None and now is not None and now != was:
+            raise RefusedError(
+                f"{results} was made with another {key} than {systems.location(where)} is now "
+                f"(SHA-256 {str(was)[:12]} then, {now[:12]} now); allowed is the file as it was"
+            )
+
+
+def _say(programs: Mapping[str, str], where_named: Path) -> None:
+    for key, where in programs.items():
+        print(f"ptsmc: runs {systems.location(where)}, which {key} of {where_named} names", file=sys.stderr)
+
+
+def _results(scenario: Path) -> Path | None:
+    """The folder that a command left and a scenario file lies in, itself or in a folder of it; links count as both."""
+    return next((folder for folder in _around(scenario) if (folder / "versions.json").exists()), None)
+
+
+def _around(path: Path) -> Iterator[Path]:
+    for found in (Path(os.path.abspath(path)), Path(os.path.realpath(path))):
+        yield from found.parents[:2]

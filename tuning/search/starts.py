@@ -1,0 +1,103 @@
+"""Where a search starts: points spread over the bounds, and the most promising of them that lie far apart."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.objective import Problem
+
+SWEPT = 64  # points flown, among which starts are chosen
+CALL = 16  # of them between two reports
+CHARGE = 3.0
+APART = (0.5, 0.35, 0.2, 0.0)  # in the unit cube, along the gain in which two points differ most
+STEEP = 10.0  # times the charge, where many points are close to a limit
+CHOOSING = "choosing starts"
+NEARLY = 0.05  # of a limit
+# what is being done, steps done, in all, best goal, how far beyond a limit
+Report = Callable[[str, int, int, float, float], None]
+
+
+def starting_points(
+    evaluate: Evaluator, problem: Problem, first: np.ndarray, starts: int, seed: int, report: Report
+) -> np.ndarray:
+    """(starts, gains) these shares first, (gains,), then the most promising ones of a sweep over the others, far apart.
+
+    A gain that an active limit hangs on, as the peak torque hangs on eta, keeps its value: else most of the sweep would
+    break the limit.
+    """
+    share = spread(len(problem.names), max(SWEPT, starts), np.random.default_rng(seed))
+    held = held_by_limits(evaluate.slopes(problem, first[None]))
+    share[:, held] = first[held]
+    chosen = promising(evaluate, problem, share, starts - 1, partial(report, CHOOSING))
+    return np.concatenate([first[None], chosen])
+
+
+def held_by_limits(at: Sloped) -> list[int]:
+    """For each limit that is nearly reached at a point the gain that it hangs on most, but for the last two gains."""
+    nearest = at.c[0].argmax(axis=1)
+    held: list[int] = []
+    for row in np.argsort(-at.c[0].max(axis=1)):
+        largest, slope = at.c[0, row, nearest[row]], np.abs(at.c_slope[0, row, nearest[row]])
+        free = [k for k in np.argsort(-slope) if k not in held]
+        if largest > -NEARLY and len(free) > 2 and slope[free[0]] > 0.0:
+            held.append(int(free[0]))
+    return held
+
+
+def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, gains) shares spread evenly: Sobol's sequence, scrambled."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # counts other than powers of 2 are a little less even
+        return qmc.Sobol(gains, rng=rng).random(count)
+
+
+def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: int, tell: Callable) -> np.ndarray:
+    """So many of the points, (points, gains), by F with breaches of a limit charged: those far apart first.
+
+    By turns charged little and much: what is far beyond a limit may lead to better gains, and what keeps it is near.
+    """
+    flown = []
+    for k in range(0, len(share), CALL):
+        flown.append(evaluate.fly(problem, share[k : k + CALL]))
+        tell(min(k + CALL, len(share)), len(share), np.nan, np.nan)
+    apart = distances(share)
+    orders = [_by_merit(np.concatenate([merit(one, times) for one in flown])) for times in (1.0, STEEP)]
+    queue = [k for pair in zip(*orders, strict=True) for k in pair]
+    return share[far_apart(queue, apart, count)]
+
+
+def distances(share: np.ndarray) -> np.ndarray:
+    """(points, points) how far apart points are, in the unit cube."""
+    return np.abs(share[:, None] - share[None]).max(axis=2)
+
+
+def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
+    """So many of the points in this order, those first that lie far from all before them.
+
+    With few gains, or many points to choose, they cannot all lie far apart: then nearer ones, step by step.
+    """
+    chosen: list[int] = []
+    for distance in APART:
+        for k in order:
+            if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
+                chosen.append(k)
+    return chosen
+
+
+def _by_merit(merits: np.ndarray) -> list[int]:
+    return [int(k) for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])]
+
+
+def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
+    """(points,) F, with what the trials that end are beyond a limit charged, so many times as hard."""
+    return charged(flown.f, flown.beyond, times)
+
+
+def charged(f: Any, beyond: Any, times: float) -> Any:
+    """F with a breach of a limit charged, so many times as hard."""
+    return f + CHARGE * np.log1p(times * np.maximum(beyond, 0.0))

@@ -1,0 +1,135 @@
+"""What makes a tuning result believable: slopes checked, gains' influence, intervals of what was averaged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ptsmc_jax.campaigns import montecarlo
+from tuning.search.bounds import TIMES, Bounds
+from tuning.search.evaluate import Evaluator
+from tuning.search.gains import with_gains
+from tuning.search.objective import Problem
+
+DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
+STEP = 1e-2  # of the gains, relative, for sensitivities
+SMALLEST = 1e-6  # slopes of ln F below this are none
+ACROSS = 15  # gains looked at between the bounds of each, besides the one found
+FLAT = 0.01  # what changes by less than this share between the bounds does not depend on the gain
+CONFIDENCE = 0.95  # of intervals
+RESAMPLED = 2000  # times, for an interval
+
+
+def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> float:
+    """Largest difference of F's slopes, by automatic differentiation, from central differences, at shares (gains,).
+
+    Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it, beside
+    a hand-over on a sample just behind it: F has a kink there, where the first period of the anchored clock vanishes.
+    """
+    behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
+    count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
+    offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
+    f = evaluate.fly(problem, inside + offsets).f.reshape(4, count)
+    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
+    exact = evaluate.slopes(problem, inside[None]).f_slope[0]
+    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The goal along one gain between its bounds, the others as they were found."""
+
+    gain: np.ndarray  # (points,)
+    value: np.ndarray  # (points,) the goal
+    over: np.ndarray  # (points,) largest metric / limit; zero without a requirement
+    f: np.ndarray  # (points,) F: ln of the goal, with what the torque weighs in it
+
+    @property
+    def flat(self) -> bool:
+        """Whether neither F nor the nearest limit depends on the gain."""
+        steady = self.f.max() - self.f.min() <= np.log1p(FLAT)
+        return bool(steady and self.over.max() <= (1.0 + FLAT) * self.over.min())
+
+
+def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
+    """How the goal goes with each gain, by its name; share: (gains,) of the bounds' intervals, of what was found."""
+    count = share.size
+    points = np.tile(share, (count, ACROSS + 1, 1))
+    for k in range(count):
+        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
+    flown = evaluate.fly(problem, points.reshape(-1, count))
+    found = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
+    gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in found)
+    return {
+        name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0]) for k, name in enumerate(problem.names)
+    }
+
+
+def sensitivities(
+    problem: Problem, bounds: Bounds, gains: np.ndarray, names: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """D ln(metric) / d ln(gain), percent by percent, of each metric's RMS over the averaged trials; by metric and gain.
+
+    Central differences inside the bounds, of the program that judges, which has every metric: one that slopes are
+    compiled for takes longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is
+    left out.
+    """
+    trials = np.asarray(problem.trials)[: problem.averaged]
+
+    def statistics(gains: np.ndarray) -> np.ndarray:
+        parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
+        flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
+        return np.asarray([rms(getattr(flown.metrics, name)[flown.finished]) for name in names])
+
+    less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rows = [
+            np.log(statistics(more[k]) / statistics(less[k])) / np.log(more[k, k] / less[k, k])
+            for k in range(gains.size)
+        ]
+    return {
+        metric: dict(zip(problem.names, row.tolist(), strict=True))
+        for metric, row in zip(names, np.transpose(rows), strict=True)
+        if np.all(np.isfinite(row))
+    }
+
+
+def rms(values: np.ndarray, axis: int = -1) -> Any:
+    """Root mean square."""
+    return np.sqrt(np.mean(values**2, axis=axis))
+
+
+def mean(values: np.ndarray, axis: int = -1) -> Any:
+    """Mean."""
+    return np.mean(values, axis=axis)
+
+
+def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
+    """Bootstrap interval (bias-corrected and accelerated, Efron, JASA 82, 1987) of a statistic, at `CONFIDENCE`.
+
+    None where there are too few trials to resample, or all are equal.
+    """
+    return _bootstrap((values,), statistic, paired=False)
+
+
+def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[float, float] | None:
+    """The same of the ratio of two RMS over the same trials, which are resampled together."""
+    return _bootstrap((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
+
+
+def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
+    if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
+        return None
+    found = stats.bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLED,
+        batch=250,
+        confidence_level=CONFIDENCE,
+        paired=paired,
+        rng=np.random.default_rng(0),
+    )
+    low, high = found.confidence_interval
+    return (float(low), float(high)) if np.isfinite(low) and np.isfinite(high) else None

@@ -1,0 +1,291 @@
+"""Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import margin_verdicts, rows, runs, store
+from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
+from ptsmc_jax.campaigns.rows import Part, Rows
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.scenario import Study, schema, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from tuning.search import own_parts
+
+FLOOR = "floor.json"  # what no controller can beat: found when flying, so that a summary needs no plant
+OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
+
+
+class Made(msgspec.Struct, frozen=True):
+    """What `versions.json` of a campaign says of it, as far as its rows are known by it."""
+
+    command: Literal["montecarlo"]
+    seed: Annotated[int, Meta(ge=0, lt=2**32)]
+    trials: Annotated[int, Meta(ge=1, le=2**32)]
+    precision: Literal[32, 64]
+    metrics: str | None = None
+    metrics_names: tuple[str, ...] | None = None
+    metrics_sha256: str | None = None
+    system_sha256: str | None = None
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A campaign and where it is kept."""
+
+    path: Path
+    scenario: Scenario
+    seed: int
+    trials: int  # that it is to have
+    own: str | None = None  # where the function stands that makes metrics of one's own
+    bits: int = 64  # of every number
+    made: Made | None = None  # as its folder says; None: it is yet to be begun
+    trusted: bool = True  # systems and metrics of one's own may be run
+
+    @cached_property
+    def programs(self) -> dict[str, str]:
+        """What flying it runs, by the key that names it."""
+        return own_parts.named(self.scenario, self.own)
+
+    @cached_property
+    def told(self) -> dict[str, Any]:
+        """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
+        digests = {
+            name: getattr(self.made, name) if self.made else systems.digest(self.programs[key])
+            for key, name in own_parts.DIGESTS.items()
+            if key in self.programs
+        }
+        more = {} if self.own is None else {"metrics": self.own}
+        known = {name: found for name, found in digests.items() if found is not None}
+        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **known}
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """What its `versions.json` says."""
+        names = None if self.own is None else self.own_names
+        told = {**self.told, "trials": self.trials, "metrics_names": names}
+        return store.versions(**{name: value for name, value in told.items() if value is not None})
+
+    @cached_property
+    def own_names(self) -> list[str]:
+        """Names of the metrics of one's own."""
+        if self.made is None or self.own is None:
+            return [] if self.own is None else self.campaign.own_names()
+        if self.made.metrics_names is None:
+            raise RefusedError(
+                f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
+            )
+        return list(self.made.metrics_names)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """Its rows."""
+        return Rows(self.path / rows.FOLDER, self._key)
+
+    @cached_property
+    def plan(self) -> Rows:
+        """What its trials fly with, written without flying them."""
+        return Rows(self.path / "plan", self._key)
+
+    @property
+    def _key(self) -> bytes:
+        return rows.key_of(schema.dump(self.scenario), self.told)
+
+    @cached_property
+    def ready(self) -> Study | None:
+        """What is flown, without metrics of one's own; None where that would run a system that nobody trusts."""
+        if "plant.system" in self.programs:
+            if not self.trusted:
+                return None
+            self._check_unchanged("plant.system")
+        return scenario.study(self.scenario)
+
+    @cached_property
+    def campaign(self) -> Campaign:
+        """What is flown. Raises ScenarioError where the metrics of one's own are none, RefusedError without trust."""
+        if self.ready is None or (self.own is not None and not self.trusted):
+            raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
+        if self.own is None:
+            return Campaign(self.ready, self.seed)
+        self._check_unchanged("--metrics")
+        try:
+            own: Any = systems.item(self.own, OWN)
+            if not isinstance(own, Callable):
+                raise ValueError(f"it is a {type(own).__name__}; allowed is {OWN}")
+            made = Campaign(self.ready, self.seed, own)
+            made.own_names()
+            return made
+        except ValueError as error:
+            raise ScenarioError(f"--metrics is {self.own}: {error}") from None
+
+    def _check_unchanged(self, key: str) -> None:
+        if self.made is not None:
+            own_parts.check_unchanged({key: self.programs[key]}, self.path, self.told)
+
+    def recipe(self) -> tuple[Callable, tuple[str, str]]:
+        """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
+        return made_again, (str(self.path.resolve()), self._key.hex())
+
+    def whole_parts(self) -> list[Part]:
+        """Its parts; raises RefusedError where one is damaged, or there is none."""
+        parts, broken = self.rows.parts()
+        if broken:
+            raise RefusedError(
+                f"{broken[0]} is damaged or of another campaign; "
+                "`ptsmc montecarlo` with the same options flies it again"
+            )
+        if not parts:
+            raise RefusedError(f"{self.path} holds no trials yet; `ptsmc montecarlo` flies them")
+        return parts
+
+
+def begin(wanted: Folder, force: bool) -> None:
+    """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
+    tables, path = schema.dump(wanted.scenario), wanted.path
+    if force and path.is_dir():
+        for kept in (wanted.rows, wanted.plan):
+            for file in kept.folder.glob("*.parquet"):
+                file.unlink()
+        (path / FLOOR).unlink(missing_ok=True)
+    else:
+        store.check(path, force=True)
+        there = path.is_dir() and any(path.iterdir())
+        other = store.difference(path, tables, {**wanted.told, **store.packages()}) if there else None
+        if other is not None:
+            raise RefusedError(
+                f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew"
+            )
+        if there:
+            before = opened(path)
+            if before.trials > wanted.trials:
+                raise RefusedError(
+                    f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
+                )
+            if before.trials == wanted.trials and before.made == _made(wanted):
+                return
+
+    def fill(making: Path) -> None:
+        store.write_toml(making / "scenario.toml", tables)
+        store.write_json(making / "versions.json", wanted.versions)
+
+    store.write(path, fill)
+
+
+def opened(path: Path) -> Folder:
+    """The campaign of a folder, of which nothing is run that it names; raises RefusedError where there is none."""
+    try:
+        said = store.made(path)
+        if said.get("command", "montecarlo") != "montecarlo":
+            raise RefusedError(
+                f"{path} holds results of `ptsmc {said['command']}`, but must be one of `ptsmc montecarlo`"
+            )
+        made = msgspec.convert(said, Made, strict=True)
+        if made.metrics is not None:
+            systems.named(made.metrics, OWN)
+        flown = scenario.read(path / "scenario.toml")
+    except ScenarioError as error:
+        raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
+    except RefusedError:
+        raise
+    except (ValueError, msgspec.ValidationError):
+        raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
+    return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, trusted=False)
+
+
+def _made(folder: Folder) -> Made:
+    """What `versions.json` is to say of it."""
+    return msgspec.convert(folder.versions, Made)
+
+
+def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
+    """Campaign and rows of a folder, on a worker that shares it; raises RefusedError where it holds another one.
+
+    The key knows scenario and digests: what is run here is what was trusted where the campaign was begun.
+    """
+    folder = opened(Path(path))
+    if folder.rows.key.hex() != key:
+        raise RefusedError(f"{path} holds another campaign there than here")
+    folder = replace(folder, trusted=True)
+    return folder.campaign, folder.rows
+
+
+def fly(
+    folder: Folder,
+    shard: tuple[int, int],
+    report: Callable[[Tally], None],
+    elsewhere: Callable[[Folder, list[Wanted]], Iterator[tuple[Part, int]]] | None = None,
+    trials: int | None = None,
+) -> None:
+    """Fly what is missing of the first `trials` trials (all, if None).
+
+    What is damaged is named, set aside and flown again. elsewhere: flies parts on other machines.
+    """
+    trials = folder.trials if trials is None else trials
+    parts, broken = folder.rows.parts()
+    for path in broken:
+        aside = path.with_name(path.name + ".damaged")
+        os.replace(path, aside)
+        print(f"ptsmc: {path} is damaged and is flown again; it is kept as {aside.name}", file=sys.stderr)
+    alone = shard == (1, 1) and elsewhere is None
+    if alone:  # others may be writing otherwise
+        folder.rows.tidy(parts)
+    wanted = flying.missing(parts, trials, shard)
+    made = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
+    flying.follow(made, flying.tally(parts, trials), report)
+    if alone:
+        folder.rows.tidy(folder.rows.parts()[0])
+
+
+def find_floor(folder: Folder) -> None:
+    """Write what theory says into the folder, where it is not there yet.
+
+    The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
+    """
+    if not (folder.path / FLOOR).exists():
+        ready = folder.campaign.ready
+        judged = [{**msgspec.to_builtins(v), "met": v.met} for v in margin_verdicts.over_trials(ready, folder.seed)]
+        found = {"window_error": runs.floor(ready, folder.seed), "margins": judged}
+        store.write_json(folder.path / FLOOR, found)
+
+
+def floor_of(folder: Folder) -> float | None:
+    """The floor that `find_floor` wrote; None: none, as in campaigns of earlier versions."""
+    return _theory(folder).get("window_error")
+
+
+def margins_of(folder: Folder) -> list[dict[str, Any]]:
+    """The verdicts on margins that `find_floor` wrote, as `summary.json` says them."""
+    return _theory(folder).get("margins", [])
+
+
+def _theory(folder: Folder) -> dict[str, Any]:
+    try:
+        return dict(json.loads((folder.path / FLOOR).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
+    """Write what each trial flies with, without flying it."""
+    parts, _ = folder.plan.parts()
+    folder.plan.tidy(parts)
+    made = flying.here(folder.campaign.draw, folder.plan, flying.missing(parts, folder.trials))
+    flying.follow(made, Tally(sum(part.count for part in parts), folder.trials, 0), report)
+
+
+def settle(folder: Folder, trials: int) -> Folder:
+    """The campaign as one of so many trials."""
+    settled = replace(folder, trials=trials)
+    store.write_json(folder.path / "versions.json", settled.versions)
+    return settled

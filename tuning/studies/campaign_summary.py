@@ -1,0 +1,228 @@
+"""What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import rows, runs, store
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.figures import campaign_plots as plots
+from ptsmc_jax.figures import style
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.scenario import schema
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from ptsmc_jax.simulation.rollout import STATUS
+from tuning.studies.campaign_folder import Folder, floor_of, margins_of
+
+SAME = 1e-12  # how far a replayed run may be off its row, relative
+CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
+QUANTILES = (0.5, 0.9, 0.99, 0.9973)
+SEARCHED = 100_000  # trials by which it is judged what drives a metric
+DRAWN = 1000  # trials whose histories are drawn
+POINTS = 5000  # trials in a figure of points
+
+
+def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
+    """Fly ever more trials until every requirement's share is known to within `width`; returns how many.
+
+    Looked at after each doubling. The intervals are those of a campaign whose size was fixed beforehand: looking
+    often, and stopping by what is seen, makes them a little too sure.
+    """
+    count = min(flying.PART, folder.trials)
+    while True:
+        fly_first(count)
+        widths = [high - low for low, high in (v["share_interval"] for v in judged(folder, first=count)[1])]
+        if count == folder.trials or all(w <= width for w in widths):
+            return count
+        count = min(2 * count, folder.trials)
+
+
+def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
+    """Verdicts over the trials (the first so many), and what `summary.json` says of each; not of margins."""
+    wanted = scenario.requirements(folder.scenario)
+    names = dict.fromkeys(r.metric for r in wanted)
+    frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
+    verdicts = flying.verdicts(wanted, frame)
+    return verdicts, [_told(v, r) for v, r in zip(verdicts, wanted, strict=True)]
+
+
+def _told(verdict: Verdict, wanted: Requirement) -> dict[str, Any]:
+    within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
+    told = {
+        **msgspec.to_builtins(verdict),
+        "met": verdict.met,
+        "share": within / verdict.trials,
+        "share_interval": statistics.share_interval(within, verdict.trials, CONFIDENCE),
+        "share_bound": statistics.share_bound(within, verdict.trials, confidence),
+    }
+    if wanted.quantile is not None and wanted.confidence is not None:
+        told["fewest_trials"] = statistics.fewest_for(verdict.failures, wanted.quantile, wanted.confidence)
+    return told
+
+
+def summarise(folder: Folder) -> dict[str, Any]:
+    """What `summary.json` says."""
+    parts = folder.whole_parts()
+    told = [*judged(folder)[1], *margins_of(folder)]
+    head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
+    counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
+    finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
+    reasons = [
+        {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
+        for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
+    ]
+    found, drivers = {}, {}
+    names = list(pl.read_parquet_schema(parts[0].path))
+    drawn = names[names.index("initial_angle") :]
+    own = folder.own_names
+    drawn = [name for name in drawn if name not in own]
+    inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
+    for name in (*scenario.catalogue(folder.scenario), *own):
+        values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
+        found[name] = _of_metric(values, finished)
+        driven = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
+        of = {key: inputs[key].to_numpy()[driven] for key in drawn}
+        drivers[name] = statistics.drivers(of, values[:SEARCHED][driven]) if driven.sum() > 1 else {}
+    done = int(head.height)
+    met = all(v["met"] for v in told) if told else counts["ok"] == done
+    return {
+        "status": "unfinished" if done < folder.trials else "met" if met else "not met",
+        "plant": folder.scenario.plant.kind,
+        "seed": folder.seed,
+        "trials": folder.trials,
+        "flown": done,
+        "counts": counts,
+        "reasons": reasons,
+        "interval_confidence": CONFIDENCE,
+        "floor": floor_of(folder),
+        "verdicts": told,
+        "quantiles": found,
+        "drivers": drivers,
+    }
+
+
+def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
+    """Statistics of a metric: mean, RMS and largest of the trials that have it, quantiles over all trials.
+
+    In the quantiles a trial without a value counts as beyond all others: it is not left out.
+    """
+    has = finished & np.isfinite(values)
+    known, ordered = values[has], np.sort(np.where(has, values, np.inf))
+    told: dict[str, Any] = {"without_value": int(values.size - known.size)}
+    if known.size:
+        told |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
+    for quantile in QUANTILES:
+        low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
+        told[str(quantile)] = {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
+    return told
+
+
+def write_summary(folder: Folder, found: dict[str, Any], figures: bool) -> None:
+    """Write the summary and the figures into the campaign's folder."""
+
+    def fill(making: Path) -> None:
+        store.write_json(making / "summary.json", found)
+        if figures:
+            style.save(figures_of(folder, found), making / "figures")
+
+    store.write(folder.path, fill)
+
+
+def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
+    """The rows of the worst trials by a metric, failed ones first."""
+    parts = folder.whole_parts()
+    names = list(pl.read_parquet_schema(parts[0].path))
+    allowed = [name for name in names if name not in ("trial", "status", "reason", "bad_time")]
+    if by not in allowed:
+        raise RefusedError(f"--by is {by}, but must be a column of the rows; {schema.nearest(by, allowed)}")
+    frame = rows.read(parts, [by, "status"]).head(folder.trials)
+    failed = ~flying.finished(frame)
+    chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)
+    return rows.read(parts).head(folder.trials)[chosen]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A trial flown again."""
+
+    run: runs.Run  # with its history
+    off: float | None  # largest difference of the row flown again from the one kept, relative; None: none is kept
+    rounding: float  # the same of the run with its history, which another program flies, from the row flown again
+
+
+def replay(folder: Folder, trial: int) -> Replay:
+    """A trial's row as the campaign flies it, and its run in full."""
+    run, row = runs.fly(folder.campaign.ready, folder.seed, trial), folder.campaign.fly([trial])
+    there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
+    kept = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial) if there else None
+    again = row.row(0, named=True)
+    rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
+    if run.status != again["status"]:
+        rounding = np.inf
+    if kept is None:
+        return Replay(run, None, rounding)
+    return Replay(run, max(_off(value, again[name]) for name, value in kept.row(0, named=True).items()), rounding)
+
+
+def _off(a: Any, b: Any) -> float:
+    """Relative difference of two values of a row."""
+    if isinstance(a, float) and isinstance(b, float) and np.isfinite([a, b]).all():
+        return 0.0 if a == b else abs(a - b) / max(abs(a), abs(b))
+    missing = [v is None or v != v for v in (a, b)]
+    return 0.0 if a == b or all(missing) else np.inf
+
+
+def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
+    """Figures of a campaign by name."""
+    parts, kind = folder.whole_parts(), folder.scenario.plant.kind
+    limits = {r.metric: r.limit for r in scenario.requirements(folder.scenario)}
+    names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
+    finished = flying.finished(frame)
+    made: dict[str, Any] = {}
+    shown = np.arange(min(DRAWN, frame.height))
+    window = frame["window_error"].to_numpy()
+    if finished.any():
+        if folder.ready is not None:  # its histories are not kept, but flown for it
+            flown = flying.Campaign(folder.ready, folder.seed)
+            t, error = flying.history(flown, shown.astype(np.uint32))
+            hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+            _, course = flying.history(flown, np.asarray([frame["trial"][hardest]], dtype=np.uint32))
+            made["fan"] = plots.fan(
+                t, error[finished[: shown.size]], (hardest, course[0]), folder.scenario.controller.t_f, kind
+            )
+        units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
+        made["distributions"] = plots.distributions(
+            {
+                name: (units[name], np.where(finished, frame[name].to_numpy(), np.nan), limits.get(name))
+                for name in names
+            }
+        )
+    outcome = frame["status"].to_numpy().astype(object)
+    for metric, limit in limits.items():
+        outcome[(outcome == "ok") & ~(frame[metric].to_numpy() <= limit)] = plots.BEYOND
+    totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
+    bad, good = np.flatnonzero(outcome != "ok")[: POINTS // 2], np.flatnonzero(outcome == "ok")
+    some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
+    made["torque_by_angle"] = plots.torque_by_angle(
+        frame["initial_angle"].to_numpy()[some],
+        frame["peak_torque"].to_numpy()[some],
+        outcome[some],
+        totals,
+        limits.get("peak_torque"),
+        kind,
+    )
+    driving = sorted(found["drivers"].get("window_error", {}).items(), key=lambda item: -item[1]["first_order"])
+    varied = [name for name, _ in driving][:4]
+    if len(varied) >= 2:
+        inputs = rows.read(parts, varied)[some]
+        made["inputs"] = plots.pairs({name: inputs[name].to_numpy() for name in varied}, outcome[some], totals)
+    return made

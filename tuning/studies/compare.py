@@ -1,0 +1,240 @@
+"""The paper's law beside others, tuned to the same requirements by the same search, judged on the same trials."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy import stats
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.figures import study_plots, style
+from ptsmc_jax.numerics.statistics import value_at
+from ptsmc_jax.scenario import errors, law_tables, plant_tables, replace, schema, study, tables
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Verdict
+from tuning.search import gains, trust
+from tuning.search.journal import Journal
+from tuning.search.starts import Report
+from tuning.studies import tuner
+
+BASELINES = ("pd", "terminal", "fixed_time")
+OURS = "prescribed_time"
+KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A law with its gains, judged on the fresh trials."""
+
+    flown: Scenario
+    gains: dict[str, float]
+    at_bound: dict[str, str]
+    trials: Trials
+    verdicts: list[Verdict]
+    floor: float | None  # RMS window error that no controller can beat
+
+    @property
+    def met(self) -> bool:
+        """Every requirement met, and no trial failed or missed t_f."""
+        return all(v.met for v in self.verdicts) and bool(np.all(self.trials.ok))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All contenders on the same trials: the paper's gains first where they can fly, then the tuned laws."""
+
+    contenders: dict[str, Contender]
+    fresh_seed: int
+    interrupted: bool
+    paper_refused: str | None = None  # why the paper's gains are not among them
+
+    @property
+    def status(self) -> str:
+        """Whether the tuned law of the paper meets every requirement, in a word."""
+        if self.interrupted:
+            return "interrupted"
+        return "met" if self.contenders[OURS].met else "not met"
+
+
+def check(scenario: Scenario) -> None:
+    """Raise ScenarioError where there is nothing to compare with."""
+    if not isinstance(scenario.plant, plant_tables.SpacecraftPlant):
+        kind = errors.show(scenario.plant.kind)
+        raise ScenarioError(
+            f'plant.kind is {kind}, but must be "spacecraft": the laws to compare with are for attitudes'
+        )
+    if scenario.loop.mode != "sampled":
+        mode = errors.show(scenario.loop.mode)
+        raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws fly there')
+
+
+def contenders(scenario: Scenario) -> dict[str, Scenario]:
+    """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
+    assert scenario.tune is not None
+    table, tune = scenario.controller, scenario.tune
+    common = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
+    same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
+    found = {}
+    for kind in (OURS, *BASELINES):
+        if scenario.controller.kind == kind:
+            found[kind] = scenario
+        elif kind == OURS:
+            found[kind] = _posed(gains.papers(scenario), tune, same)
+        else:
+            width = {"sign_width": table.sign_width} if kind != "pd" and hasattr(table, "sign_width") else {}
+            other = replace(scenario, tune=None, controller={"kind": kind, **common, **width})
+            found[kind] = _posed(other, tune, same)
+    return found
+
+
+def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
+    """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
+    if tune.objective != tuner.T_F:
+        return replace(other, tune=same)
+    default = replace(other, tune={}).tune
+    assert default is not None
+    assert default.free is not None
+    return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
+
+
+def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None) -> Comparison:
+    """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
+    fresh_seed = tuner.seed_of_judge(seed)
+    rivals = contenders(scenario)
+    for law, posed in rivals.items():
+        try:
+            study(posed)
+        except ScenarioError as error:  # before hours of search, not after
+            raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
+    others, refused = tuner.beside(scenario)
+    made = {"paper": _papers(tuner.as_flown(others["paper"]), fresh_seed)} if "paper" in others else {}
+    stopped = False
+    for law, posed in rivals.items():
+
+        def told(what: str, *others: Any, law: str = law) -> None:
+            tell(f"{law}: {what}", *others)
+
+        tuned = tuner.tune(posed, seed, told, journal, trusted=False)
+        fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
+        made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
+        stopped = tuned.search.interrupted
+        if stopped:
+            break
+    return Comparison(made, fresh_seed, stopped, refused)
+
+
+def _papers(flown: Scenario, fresh_seed: int) -> Contender:
+    ready = study(flown)
+    trials = tuner.judge(flown, fresh_seed, ready.requirements)
+    verdicts, floor = tuner.verdicts_of(flown, trials, fresh_seed), tuner.floor_of(flown, fresh_seed)
+    return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
+
+
+def figures_of(one: Contender) -> dict[str, Any]:
+    """What is said of a contender: over the trials that were flown to the end, but for the counts."""
+    trials = one.trials
+    angle, done = trials.drawn["initial_angle"], trials.finished
+    settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[done]
+    settled = done & np.isfinite(settling)
+    known, late = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
+    spread = known.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(known) > 0.0
+    mean = {name: float(np.mean(getattr(trials.metrics, name)[done])) if done.any() else None
+            for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
+    return {
+        "gains": one.gains,
+        "at_bound": one.at_bound,
+        "met": one.met,
+        "counts": trials.counts(),
+        "window_error": float(trust.rms(errors)) if done.any() else None,
+        "floor": one.floor,
+        "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
+        **mean,
+        "largest_peak_torque": float(np.max(trials.metrics.peak_torque[done])) if done.any() else None,
+        "unsettled": int(trials.status.size - known.size),
+        "settling_time": {str(q): _quantile(late, q) for q in (0.01, 0.5, 0.99)},
+        # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
+        "settling_by_angle": _rank_correlation(angle[settled], known) if spread else None,
+        "settling_near_far": _near_far(angle, late) if spread else None,
+        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
+    }
+
+
+def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """Spearman's."""
+    return float(np.corrcoef(stats.rankdata(x), stats.rankdata(y))[0, 1])
+
+
+def _quantile(late: np.ndarray, q: float) -> float | None:
+    """Of settling times [s], infinite where a trial never settles; None: that is never."""
+    found = value_at(np.sort(late), q)
+    return found if np.isfinite(found) else None
+
+
+def _near_far(angle: np.ndarray, late: np.ndarray) -> tuple[float | None, float | None]:
+    """Median settling times of the nearest and the farthest fifth of the starts [s]; see `_quantile`."""
+    order = np.argsort(angle)
+    fifth = max(1, angle.size // 5)
+    return _quantile(late[order[:fifth]], 0.5), _quantile(late[order[-fifth:]], 0.5)
+
+
+def summary(made: Comparison) -> dict[str, Any]:
+    """What `summary.json` says."""
+    first = next(iter(made.contenders.values()))
+    return {
+        "status": made.status,
+        "seed": made.fresh_seed,
+        "trials": int(first.trials.status.size),
+        "paper_refused": made.paper_refused,
+        "judged_on": tuner.judged_on(made.contenders.get(OURS, first).flown),
+        "settling_angle": first.flown.loop.settling_angle,
+        "laws": {law: figures_of(one) for law, one in made.contenders.items()},
+    }
+
+
+def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
+    """Fill a result folder."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_json(folder / "versions.json", store.versions(**known_by))
+    said = summary(made)
+    store.write_json(folder / "summary.json", said)
+    (folder / "scenarios").mkdir()
+    for law, one in made.contenders.items():
+        store.write_toml(folder / "scenarios" / f"{law}.toml", schema.dump(one.flown))
+    columns = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
+               "settling_by_angle")  # fmt: skip
+    rows = [[law, *(found[name] for name in columns), *((found["settling_time"] or {}).get(q) for q in _SHARES),
+             "; ".join(f"{name} = {value:.6g}" for name, value in found["gains"].items())]
+            for law, found in said["laws"].items()]  # fmt: skip
+    settling = [f"settling_time_{100 * float(q):g}" for q in _SHARES]
+    store.write_csv(folder / "compare.csv", ["law", *columns, *settling, "gains"], rows)
+    if figures:
+        style.save(dict(_figures(made)), folder / "figures")
+
+
+_SHARES = ("0.01", "0.5", "0.99")
+
+
+def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
+    unit = catalogues.CATALOGUE["settling_time"][0]
+    sets = {law: one.trials for law, one in made.contenders.items()}
+    t_f = made.contenders[OURS].flown.controller.t_f
+    yield "settling", study_plots.settling_by_angle(
+        {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
+         for law, t in sets.items()}, t_f, unit,
+    )  # fmt: skip
+    limit = next((v.limit for v in made.contenders[OURS].verdicts if v.metric == "peak_torque"), None)
+    yield "tradeoff", study_plots.tradeoff(
+        {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
+         if t.finished.any()}, limit,
+    )  # fmt: skip
+
+
+def told(scenario: Scenario, seed: int) -> dict[str, Any]:
+    """By what a finished or interrupted comparison is known again."""
+    return {"command": "compare", "seed": seed}

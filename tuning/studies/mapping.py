@@ -1,0 +1,226 @@
+"""`ptsmc map`: accuracy and peak torque over two keys of a scenario, with what linear theory says beside it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.campaigns import montecarlo, store
+from ptsmc_jax.figures import study_plots, style
+from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.observers.base import Linear
+from ptsmc_jax.observers.none import NoObserver
+from ptsmc_jax.scenario import Study, schema, study, systems
+from ptsmc_jax.scenario import replace as changed
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.clock import Anchored, Flight
+from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import borders, covariance, margins
+
+PERIOD, DELTA = "loop.period", "controller.delta"
+WHOLE = ("hardware.delay", "hardware.star_tracker_every")
+WIDE = 5.0  # axes that span more than this factor are spaced by factors
+
+
+class AxisError(ValueError):
+    """An axis that cannot be followed. Its text is one sentence."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A key of the scenario and the values that it takes."""
+
+    key: str
+    values: tuple[float, ...]
+
+    @property
+    def text(self) -> str:
+        """As `axis` reads it."""
+        return f"{self.key}={self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}"
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether it is spaced by factors."""
+        return self.values[0] > 0 and self.values[-1] > WIDE * self.values[0]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One pair of values."""
+
+    x: float
+    y: float
+    status: str  # "flown", or why it was not
+    trials: int = 0
+    failures: int = 0  # not finished
+    missed: int = 0
+    window_error: float = np.nan  # RMS over the trials
+    peak_torque: float = np.nan  # mean over the trials [N m]
+    largest_peak_torque: float = np.nan
+    linear_window_error: float = np.nan  # of the noise alone, by linear covariance
+    linear_torque: float = np.nan
+    radius: float = np.nan  # of the frozen loop's poles at the hand-over
+    gain_margin: float = np.nan
+    delay_margin: float = np.nan  # [s]
+    hold_gain_margin: float = np.nan  # after it
+    hold_delay_margin: float = np.nan  # [s]
+
+
+def axis(text: str, option: str) -> Axis:
+    """An axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9; raises AxisError."""
+    key, _, span = text.partition("=")
+    parts = span.split(":")
+    wanted = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
+    if len(parts) != 3 or key.count(".") != 1:
+        raise AxisError(wanted)
+    try:
+        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+    except ValueError:
+        raise AxisError(wanted) from None
+    if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
+        raise AxisError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
+    wide = low > 0 and high > WIDE * low
+    values = np.geomspace(low, high, count) if wide else np.linspace(low, high, count)
+    if key in WHOLE:
+        values = np.unique(np.round(values))
+    return Axis(key, tuple(float(f"{v:.6g}") for v in values))
+
+
+def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> list[Cell]:
+    """Fly the scenario's trials for every pair of values; tell(cells done, in all).
+
+    Raises ScenarioError where no pair at all is allowed.
+    """
+    if PERIOD in (x.key, y.key) and scenario.loop.mode != "sampled":
+        raise ScenarioError(f'{PERIOD} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    base = changed(scenario, tune=None)  # its bounds would not fit every pair
+    pairs = [(a, b) for b in y.values for a in x.values]
+    ready: list[Study | str] = []
+    for a, b in pairs:
+        try:
+            ready.append(study(_with(base, {x.key: a, y.key: b})))
+        except ScenarioError as error:
+            ready.append(str(error))
+    allowed = [one for one in ready if isinstance(one, Study)]
+    if not allowed:
+        raise ScenarioError(str(ready[0]))
+    common = _common([one.parts for one in allowed])
+    cells = []
+    for k, ((a, b), one) in enumerate(zip(pairs, ready, strict=True)):
+        cells.append(Cell(a, b, one) if isinstance(one, str) else _cell(a, b, one, common, seed, trials))
+        tell(k + 1, len(pairs))
+    return cells
+
+
+def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
+    """The scenario with other values of these keys; a key with a number per axis gets the value on each."""
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        table, _, name = key.partition(".")
+        current = getattr(getattr(scenario, table, None), name, None)
+        number: Any = int(value) if key in WHOLE else value
+        changes[f"{table}__{name}"] = [value] * len(current) if isinstance(current, tuple) else number
+    if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
+        loop, t_f = scenario.loop, values.get("controller.t_f", scenario.controller.t_f)
+        assert loop.t_end is not None
+        after = max(loop.t_end - scenario.controller.t_f, values.get("loop.window", loop.window))
+        changes["loop__t_end"] = t_f + after
+    return changed(scenario, **changes)
+
+
+def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
+    """What gives all parts clocks of one size and one number of substeps, so that one program flies them all."""
+    substeps = max(p.substeps for p in parts)
+
+    def fit(one: Parts) -> Parts:
+        timing = one.clock
+        if isinstance(timing, Flight):
+            timing = replace(timing, count=max(p.clock.count for p in parts if isinstance(p.clock, Flight)))
+        elif isinstance(timing, Anchored):
+            sizes = [(p.clock.before, p.clock.after) for p in parts if isinstance(p.clock, Anchored)]
+            timing = replace(timing, before=max(b for b, _ in sizes), after=max(a for _, a in sizes))
+        return replace(one, clock=timing, substeps=substeps)
+
+    return fit
+
+
+def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
+    count = trials if ready.drawn else 1
+    flown = montecarlo.run(common(ready.parts), ready.dispersion, seed, np.arange(count))
+    done, counts = flown.finished, flown.counts()
+    errors, peaks = flown.metrics.window_error[done], flown.metrics.peak_torque[done]
+    known: dict[str, float] = {}
+    if done.any():
+        known = {
+            "window_error": float(np.sqrt(np.mean(errors**2))),
+            "peak_torque": float(np.mean(peaks)),
+            "largest_peak_torque": float(peaks.max()),
+        }
+    parts = common(ready.parts)
+    if ready.scenario.loop.mode == "sampled" and isinstance(parts.controller, Prescribed):
+        ends = margins.at_ends(parts)
+        (at, radius), (hold, _) = ends["hand_over"], ends["hold"]
+        known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
+        known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
+        read = parts.sensors is not None and hasattr(parts.sensors, "reading")
+        if read and isinstance(parts.observer, NoObserver | Linear) and radius < 1.0:
+            expected = covariance.noise(parts)
+            known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
+    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **known)
+
+
+def _factor(found: margins.Margins) -> float:
+    """On the gain of the worst axis, up to which the loop is stable; below 1 where it is not."""
+    return float(10.0 ** (found.gain_up.min() / 20.0))
+
+
+def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
+    second_order = getattr(scenario.plant, "order", 2) == 2
+    papers = hasattr(scenario.controller, "eta")
+    if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order or not papers:
+        return {}
+    eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
+    h = np.asarray(x.values if x.key == PERIOD else y.values)
+    anchored = scenario.loop.clock == "anchored"
+    labels = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
+    if delay > 1:
+        labels[f"with {delay} periods of delay"] = float(delay)
+    found = {}
+    for label, late in labels.items():
+        delta = np.array([borders.smallest_delta(eta, float(period), late, anchored=anchored) for period in h])
+        found[label] = (h, delta) if x.key == PERIOD else (delta, h)
+    return found
+
+
+def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
+    """Fill a result folder."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    trials = max((cell.trials for cell in cells), default=0)
+    source = systems.source(getattr(scenario.plant, "system", None))
+    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials, **source))
+    fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
+    cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)
+    rows = [["" if value != value else value for value in row] for row in cells_of]
+    store.write_csv(folder / "map.csv", [x.key, y.key, *fields], rows)
+    if figures:
+        shape = (len(y.values), len(x.values))
+        grids = {
+            name: np.array([getattr(cell, name) for cell in cells]).reshape(shape)
+            for name in ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
+        }
+        if not any(np.isfinite(grid).any() for grid in grids.values()):
+            return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
+        lost = np.array([cell.failures + cell.missed > 0 for cell in cells]).reshape(shape)
+        made = study_plots.accuracy_map(
+            (x.key, x.values, x.logarithmic),
+            (y.key, y.values, y.logarithmic),
+            grids,
+            lost,
+            lines(scenario, x, y),
+            scenario.plant.kind,
+        )
+        style.save({"map": made}, folder / "figures")

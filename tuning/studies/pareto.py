@@ -1,0 +1,306 @@
+"""Accuracy against peak torque: the front by epsilon-constraint with warm starts, every point judged on fresh trials.
+
+The smallest window error is found for a ladder of limits on the peak torque, from the gains that ask for the least to
+those that no limit holds back; each step starts from what its neighbours found (Haimes, Lasdon and Wismer, IEEE Trans.
+SMC 1(3), 1971).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.figures import study_plots, style
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.scenario import replace as changed
+from ptsmc_jax.scenario import schema, study, systems
+from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.simulation import catalogues
+from tuning.search import gains, trust
+from tuning.search.descent import Best
+from tuning.search.descents import Descents
+from tuning.search.journal import Journal
+from tuning.search.objective import T_F, Problem
+from tuning.search.optimise import MARGIN, Search, search
+from tuning.search.refine import NEARBY
+from tuning.search.starts import Report
+from tuning.studies import tuner
+
+TORQUE = "peak_torque"
+OFF = 1e9  # a limit that holds nothing back
+HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that nothing keeps
+FEWER = 4  # starts of the search for the least torque
+WARM = 3  # of the gains known so far, from which each step of the ladder starts
+STEPS = 40  # points looked at from each of them, at most
+APART = 1e-3  # of the bounds' intervals between two points, at least
+RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
+
+
+@dataclass(frozen=True)
+class Point:
+    """Gains on the front, or off it."""
+
+    limit: float  # on the largest peak torque of the training trials [N m]; NaN: gains that were not searched for
+    gains: dict[str, float]
+    trained: float  # the goal over the training trials
+    rms: float  # window error over the fresh trials
+    interval: tuple[float, float] | None  # of it
+    peak: float  # peak torque that the share of fresh trials asked for stays below, or all of them
+    mean_peak: float
+    failures: int  # fresh trials that failed or missed t_f
+    meets: bool  # every requirement, on the fresh trials
+    dominated: bool = False  # by another point, beyond the interval of the ratio of their errors
+    knee: bool = False
+
+
+@dataclass(frozen=True)
+class Front:
+    """The points in order of their peak torque, and for comparison the paper's and the scenario's own gains."""
+
+    points: list[Point]
+    others: dict[str, Point]
+    paper_refused: str | None  # why the paper's gains are not among them
+    fresh_seed: int
+    trials: int
+    floor: float | None  # RMS window error that no controller can beat
+    rollouts: int
+    gradients: int
+
+    @property
+    def kept(self) -> list[Point]:
+        """The points that no other one dominates."""
+        return [point for point in self.points if not point.dominated]
+
+    @property
+    def status(self) -> str:
+        """Whether some gains on the front meet every requirement on the fresh trials."""
+        return "met" if any(point.meets for point in self.kept) else "not met"
+
+
+def trace(
+    scenario: Scenario,
+    seed: int,
+    points: int,
+    tell: Report = lambda *told: None,
+    journal: Journal | None = None,
+) -> Front:
+    """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""
+    limited, own_limit = _limited(scenario)
+    table = limited.tune
+    assert table is not None
+    posed = tuner.pose(limited, seed, journal)
+    ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
+    others, refused = tuner.beside(limited)
+    at = problem.metrics.index(TORQUE)
+
+    def under(limit: float) -> Problem:
+        return replace(problem, limits=jnp.asarray(problem.limits).at[at].set(limit))
+
+    def told(what: str) -> Report:
+        return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
+
+    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
+    loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in ready.requirements]
+    free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
+    _unless_interrupted(free)
+    problem = replace(free.problem, limits=problem.limits)
+    highest = free.ended[at] * OFF
+    tight = HARDLY * highest
+    least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
+    _unless_interrupted(least)
+    lowest = least.ended[at] * tight
+    ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
+    if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
+        ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
+    climbed = _climb([under(limit) for limit in ladder], [free.share, least.share], posed, tell)
+    climbed = {float(ladder[k]): found for k, found in climbed.items()}
+    fresh_seed = tuner.seed_of_judge(seed)
+    judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
+    fixed = {}
+    for name, other in others.items():
+        trials, values = tuner.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
+        fixed[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
+    count = next(iter(judged.values()))[1].status.size if judged else 0
+    floor = tuner.floor_of(scenario, fresh_seed)
+    return Front(_marked(judged), fixed, refused, fresh_seed, count, floor, evaluate.rollouts, evaluate.gradients)
+
+
+def check(scenario: Scenario) -> None:
+    """Raise ScenarioError where there is no front of accuracy against torque to look for."""
+    assert scenario.tune is not None
+    of = "for a front of the window error"
+    if scenario.tune.objective == T_F:
+        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {of}')
+    if scenario.tune.torque_weight:
+        raise wrong("tune.torque_weight", scenario.tune.torque_weight, f"absent {of} against the torque")
+    if scenario.tune.worst_case:
+        raise wrong("tune.worst_case", True, f"false {of}, whose points keep their limits in the trials drawn")
+
+
+def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:
+    """The scenario with a requirement on the peak torque, and its own limit, if there is one."""
+    known = scenario.requirements.get(TORQUE)
+    if known is None:
+        requirements = {**schema.dump(scenario).get("requirements", {}), TORQUE: OFF}
+        return changed(scenario, requirements=requirements), None
+    return scenario, known.limit if isinstance(known, Limit) else float(known)
+
+
+def _unless_interrupted(found: Search) -> None:
+    if found.interrupted:
+        raise KeyboardInterrupt
+
+
+def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: tuner.Posed, tell: Report) -> dict[int, Best]:
+    """What is found on each rung, down the ladder and up again, each from what is known by then.
+
+    One rung of those that a limit does not hold back, and whose gains are the same.
+    """
+    best: dict[int, Best] = {}
+    rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
+    for done, k in enumerate(rungs):
+        tell("ladder", done, len(rungs), np.nan, 0.0)
+        found = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
+        if found is not None and (k not in best or found.f < best[k].f):
+            best[k] = found
+            known.append(found.share)
+    apart: dict[int, Best] = {}
+    for k in sorted(best):
+        if all(np.abs(best[k].share - other.share).max() >= APART for other in apart.values()):
+            apart[k] = best[k]
+    return apart
+
+
+def _step(posed: tuner.Posed, problem: Problem, known: np.ndarray) -> Best | None:
+    """The best gains that keep these limits, from the most promising known ones."""
+    flown = posed.evaluate.fly(problem, known)
+    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]]
+    run = Descents(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
+    if posed.sloped:
+        run.descend(problem, dict(enumerate(chosen)))
+    else:
+        run.evolve(problem, chosen[0], NEARBY)
+    return run.best if run.started and run.best.over == 0.0 else None
+
+
+def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[float, tuple[Point, Trials]]:
+    judged = {}
+    for k, (limit, best) in enumerate(found.items()):
+        tell("judging on fresh trials", k, len(found), np.nan, 0.0)
+        named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(best.share))), tuner.DIGITS)
+        tuned = gains.in_scenario(scenario, named)
+        trials = tuner.judge(tuned, fresh_seed, requirements)
+        judged[limit] = _point(limit, named, best.value, trials, tuned, fresh_seed), trials
+    return judged
+
+
+def _point(limit, named, trained, trials: Trials, scenario: Scenario, fresh_seed: int) -> Point:
+    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+    peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
+    asked = scenario.requirements[TORQUE]
+    quantile = (asked.quantile if isinstance(asked, Limit) else None) or 1.0
+    verdicts = tuner.verdicts_of(scenario, trials, fresh_seed)
+    return Point(
+        limit=limit,
+        gains=dict(named),
+        trained=trained,
+        rms=float(trust.rms(errors)) if errors.size else np.nan,
+        interval=trust.interval(errors, trust.rms),
+        peak=statistics.value_at(np.sort(peaks), quantile) if peaks.size else np.nan,
+        mean_peak=float(np.mean(peaks)) if peaks.size else np.nan,
+        failures=int(np.sum(~trials.ok)),
+        meets=all(v.met for v in verdicts) and bool(np.all(trials.ok)),
+    )
+
+
+def _marked(judged: dict[float, tuple[Point, Trials]]) -> list[Point]:
+    """The points in order of peak torque, dominated ones and the knee marked."""
+    pairs = sorted(judged.values(), key=lambda pair: pair[0].peak)
+    points = [
+        replace(point, dominated=any(_beats(other, (point, trials)) for other in pairs)) for point, trials in pairs
+    ]
+    front = [k for k, point in enumerate(points) if not point.dominated]
+    if len(front) > 2:
+        knee = front[knee_of(np.asarray([[points[k].peak, points[k].rms] for k in front]))]
+        points[knee] = replace(points[knee], knee=True)
+    return points
+
+
+def _beats(one: tuple[Point, Trials], other: tuple[Point, Trials]) -> bool:
+    """Whether a point asks for no more torque than another and is more accurate, beyond the interval of the ratio.
+
+    A point with more failed trials does not. One trial, where nothing is drawn, has no interval.
+    """
+    (a, flown), (b, _) = one, other
+    if a is b or a.failures > b.failures or not (a.peak <= b.peak and a.rms < b.rms):
+        return False
+    both = one[1].finished & other[1].finished
+    errors = (np.asarray(pair[1].metrics.window_error)[both] for pair in (other, one))
+    interval = trust.ratio_interval(*errors)
+    return flown.status.size == 1 if interval is None else interval[0] > 1.0
+
+
+def knee_of(points: np.ndarray) -> int:
+    """Which of the points (count, 2), in order along a front, lies farthest below the line between its ends, in log."""
+    logs = np.log(points)
+    span = np.ptp(logs, axis=0)
+    unit = (logs - logs.min(axis=0)) / np.where(span > 0.0, span, 1.0)
+    along = unit[-1] - unit[0]
+    off = unit - unit[0]
+    return int(np.argmax(off[:, 0] * along[1] - off[:, 1] * along[0]))
+
+
+def told(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
+    """By what a finished or interrupted front is known again."""
+    source = systems.source(getattr(scenario.plant, "system", None))
+    return {"command": "pareto", "seed": seed, "points": points, **source}
+
+
+def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
+    """What `summary.json` says."""
+
+    def said(point: Point) -> dict[str, Any]:
+        return {name: getattr(point, name) for name in point.__dataclass_fields__}
+
+    return {
+        "status": front.status,
+        "plant": scenario.plant.kind,
+        "requirements": list(scenario.requirements),
+        "trials": front.trials,
+        "seed": front.fresh_seed,
+        "interval_confidence": trust.CONFIDENCE,
+        "floor": front.floor,
+        "rollouts": front.rollouts,
+        "gradients": front.gradients,
+        "points": [said(point) for point in front.points],
+        **{name: said(point) for name, point in front.others.items()},
+        "paper_refused": front.paper_refused,
+    }
+
+
+def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_by: dict[str, Any]) -> None:
+    """Fill a result folder."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_json(folder / "versions.json", store.versions(**known_by))
+    store.write_json(folder / "summary.json", summary(front, scenario))
+    names = gains.named(scenario)
+    header = ["limit", *names, "rms_window_error", "rms_low", "rms_high", "peak_torque", "mean_peak_torque",
+              "failures", "meets", "dominated", "knee", "trained_goal"]  # fmt: skip
+    rows = [
+        [p.limit, *(p.gains[name] for name in names), p.rms, *(p.interval or ("", "")), p.peak, p.mean_peak, p.failures,
+         int(p.meets), int(p.dominated), int(p.knee), p.trained]
+        for p in front.points
+    ]  # fmt: skip
+    store.write_csv(folder / "front.csv", header, rows)
+    if figures:
+        known = scenario.requirements.get(TORQUE)
+        limit = None if known is None else _limited(scenario)[1]
+        units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name][0] for name in ("window_error", TORQUE))
+        drawn = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
+        style.save({"front": drawn}, folder / "figures")

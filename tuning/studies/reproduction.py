@@ -1,0 +1,109 @@
+"""What `ptsmc reproduce` leaves: Figs. 1 to 10 of the paper, and its claims and slips beside what was measured."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.figures import run_plots, style
+from ptsmc_jax.paper import claims, remark_2, slips
+from ptsmc_jax.plants.integrator_chain import Chain
+from ptsmc_jax.scenario import from_tables, schema
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The paper's cases as flown, and what was measured."""
+
+    cases: dict[str, Run]
+    claims: list[claims.Claim]
+    slips: list[slips.Slip]
+    observers: list[remark_2.Measured]
+
+    @property
+    def ok(self) -> bool:
+        """Every case was flown to its end."""
+        return all(run.status == "ok" for run in self.cases.values())
+
+
+def reproduce() -> Reproduction:
+    """Fly every case of the paper and measure what it claims."""
+    cases = claims.fly_cases()
+    return Reproduction(cases, claims.claims(cases), slips.shown(cases), remark_2.measure())
+
+
+def summary(made: Reproduction) -> dict[str, Any]:
+    """What `summary.json` says."""
+    verdicts = [claim.verdict for claim in made.claims]
+    return {
+        "status": "ok" if made.ok else "failed",
+        "verdicts": {word: verdicts.count(word) for word in claims.VERDICTS},
+        "claims": [asdict(claim) for claim in made.claims],
+        "slips": [asdict(slip) for slip in made.slips],
+        "observers": [
+            {key: value for key, value in asdict(one).items() if key not in ("t", "off")} for one in made.observers
+        ],
+        "cases": {
+            name: {"figures": claims.CASES[name][0], "status": run.status, **run.metrics}
+            for name, run in made.cases.items()
+        },
+    }
+
+
+def write(folder: Path, made: Reproduction, figures: bool) -> None:
+    """Fill a result folder."""
+    store.write_json(folder / "versions.json", store.versions("reproduce", 0))
+    store.write_json(folder / "summary.json", summary(made))
+    (folder / "claims.md").write_text(_markdown(made), encoding="utf-8")
+    (folder / "scenarios").mkdir()
+    for name, (_, _, tables) in claims.CASES.items():
+        store.write_toml(folder / "scenarios" / f"{name}.toml", schema.dump(from_tables(tables)))
+    if figures:
+        style.save(_figures(made), folder / "figures")
+
+
+def _figures(made: Reproduction) -> dict[str, Figure]:
+    found = {}
+    for name, run in made.cases.items():
+        numbers, title, _ = claims.CASES[name]
+        first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
+        chain = isinstance(run.parts.plant, Chain)
+        parts = ("a", "b") if chain else ("", "")
+        motion, label = (run_plots.states, "states") if chain else (run_plots.attitude, "attitude")
+        heading = f"Fig. {first}{f' ({parts[0]})' if chain else ''}: {title}"
+        found[f"fig_{int(first):02}{parts[0]}_{label}"] = motion(run.parts, run.log, heading)
+        heading = f"Fig. {last}{f' ({parts[1]})' if chain else ''}: {title}"
+        label = "control" if chain else "torque"
+        found[f"fig_{int(last):02}{parts[1]}_{label}"] = run_plots.torque(run.parts, run.log, title=heading)
+        found[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
+    found["remark_2_observers"] = run_plots.observers(made.observers)
+    return found
+
+
+def _markdown(made: Reproduction) -> str:
+    claims = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in made.claims]
+    shown = [(s.where, s.paper, s.correct, s.shown) for s in made.slips]
+    return "\n".join(
+        [
+            "# The paper's claims beside what was measured",
+            "",
+            *_rows(("where", "the paper", "measured", "verdict", "why"), claims),
+            "",
+            "# Its slips, and what shows them",
+            "",
+            *_rows(("where", "the paper", "what it must be", "shown by"), shown),
+            "",
+            "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
+            "",
+            *_rows(*remark_2.rows(made.observers)),
+            "",
+        ]
+    )
+
+
+def _rows(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    cells = [header, tuple("---" for _ in header), *rows]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]

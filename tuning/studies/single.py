@@ -1,0 +1,36 @@
+"""What `ptsmc simulate` leaves: the history of one run as CSV, its metrics and verdicts, figures."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario.tables import Scenario
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """What `summary.json` says."""
+    verdicts = {
+        v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least}
+        for v in run.verdicts
+    }
+    heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
+    floor = None if run.floor is None else run.floor.window_error
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts}
+
+
+def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
+    """Fill a result folder."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    source = systems.source(getattr(scenario.plant, "system", None))
+    store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
+    store.write_json(folder / "summary.json", summary(run))
+    columns = run.columns()
+    store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
+    if figures:
+        from ptsmc_jax.figures import run_plots, style  # takes 0.3 s, which a run without figures need not wait for
+
+        style.save(run_plots.run_figures(run.parts, run.log, run.torque_limit, run.floor), folder / "figures")

@@ -1,0 +1,122 @@
+"""`ptsmc margins`: what gain, phase, delay and sensitivity the loop of a scenario leaves, and where."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.plants.rigid_body import Spacecraft
+from ptsmc_jax.scenario import Study, errors, schema, study, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.theory import margins
+from ptsmc_jax.theory.margins import FIELDS, Course
+
+_NO_SIGN = "the exact sign has no slope: it counts as if it were not there"
+
+
+def find(scenario: Scenario) -> tuple[Study, Course]:
+    """Margins of a scenario, along its nominal run. Raises ScenarioError without the sampled loop, or slopes of it."""
+    if scenario.loop.mode != "sampled":
+        raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    ready = study(scenario)
+    course = margins.along(ready.parts)
+    if np.isnan(course.hold[1].modulus).any():
+        raise ScenarioError(
+            f"margins need slopes of the loop by all that it carries, but with controller.kind = "
+            f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
+        )
+    return ready, course
+
+
+def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
+    """Margins of the worst axis "before" the hand-over, where they are judged, and in "hold".
+
+    None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable".
+    """
+    if ready.scenario.loop.mode != "sampled":
+        return None
+    found, hold = jax.tree.map(np.asarray, margins.judged_jit(ready.parts))
+    if np.isnan(found.modulus[-1]).any():
+        return None
+    places = {"before": ~hold, "hold": hold}
+    return {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in places.items()
+            if rows.any()}  # fmt: skip
+
+
+def _worst(found: margins.Margins) -> dict[str, Any]:
+    return {"stable": bool(found.stable.all()), **{name: _number(v) for name, v in found.worst().items()}}
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def names(ready: Study) -> tuple[list[str], list[str]]:
+    """Of the inputs, and of what the sensors see."""
+    plant = ready.parts.plant
+    if isinstance(plant, Spacecraft):
+        return list("xyz"), [f"{what} {axis}" for what in ("attitude", "rate") for axis in "xyz"]
+    size = np.asarray(ready.parts.initial).size
+    return [f"u{k + 1}" for k in range(plant.inputs)], [f"x{k + 1}" for k in range(size)]
+
+
+def summary(ready: Study, course: Course) -> dict[str, Any]:
+    """What `summary.json` says: [dB], [deg], [s]; null: no limit, or no value."""
+    inputs, seen = names(ready)
+    (_, hold), before = course.hold, course.before
+
+    def table(found: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
+        return {label: {name: _number(getattr(found, name)[k]) for name in fields} for k, label in enumerate(labels)}
+
+    t_f = float(ready.parts.controller.t_f)
+    exact = getattr(ready.scenario.controller, "sign_width", None) == 0.0
+    return {
+        "stable": bool(hold.stable.all()),
+        "worst": {name: _number(v) for name, v in course.worst().items()},
+        "hold": table(hold, inputs, (*FIELDS, "crossover")),
+        "together": {name: _number(course.together[name]) for name in FIELDS},
+        "sensors": table(course.at_sensors, seen, tuple(name for name in FIELDS if name != "delay")),
+        "before": [
+            {
+                "time_to_go": t_f - float(t),
+                "judged": bool(counts),
+                "stable": bool(before.stable[k].all()),
+                **{name: _number((max if name == "modulus" else min)(getattr(before, name)[k])) for name in FIELDS},
+            }
+            for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
+        ],
+        "said": _NO_SIGN if exact else None,
+    }
+
+
+def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
+    """Fill a result folder."""
+    scenario = ready.scenario
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    source = systems.source(getattr(scenario.plant, "system", None))
+    store.write_json(folder / "versions.json", store.versions("margins", None, **source))
+    store.write_json(folder / "summary.json", summary(ready, course))
+    inputs, _ = names(ready)
+    t_f = float(ready.parts.controller.t_f)
+    rows = [
+        [t, t_f - t, name, *(float(getattr(course.at_input, field)[j, k]) for field in (*FIELDS, "crossover")),
+         int(course.at_input.stable[j, k])]
+        for j, t in enumerate(course.t.tolist())
+        for k, name in enumerate(inputs)
+    ]  # fmt: skip
+    units = ("gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "modulus_dB", "crossover_rad_s", "stable")
+    store.write_csv(folder / "margins.csv", ["t", "time_to_go", "axis", *units], rows)
+    if figures:
+        from ptsmc_jax.figures import margin_plots, style
+
+        loop, hold = course.hold
+        w, seen = margins.responses(loop)
+        made = {
+            "nichols": margin_plots.nichols(seen, inputs),
+            "sensitivity": margin_plots.sensitivity(w, seen, inputs),
+            "margins": margin_plots.over_time(t_f - course.t[:-1], course.before, hold),
+        }
+        style.save(made, folder / "figures")

@@ -1,0 +1,207 @@
+"""The files of a tuning run: summary, history, tuned scenario, figures."""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.figures import study_plots, style
+from ptsmc_jax.scenario import free_gains, schema, systems
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
+from tuning.search import gains as gain_names
+from tuning.search import trust
+from tuning.search.descents import Step
+from tuning.studies.tuner import GOALS, Trust, Tuning, judged_on
+
+JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
+
+
+def statistics(trials: Trials, kind: str) -> dict[str, Any]:
+    """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
+    summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
+    for name in catalogues.CATALOGUES[kind]:
+        values = getattr(trials.metrics, name)[trials.finished]
+        known = values[np.isfinite(values)]
+        if known.size == 0:
+            summary[name] = None
+            continue
+        summary[name] = {
+            "mean": known.mean(),
+            "rms": trust.rms(known),
+            "median": np.median(known),
+            "q99": np.quantile(known, 0.99),
+            "max": known.max(),
+        }
+        if known.size < values.size:
+            summary[name]["without_value"] = int(values.size - known.size)
+        if name in JUDGED:
+            statistic = JUDGED[name]
+            summary[name][f"{statistic}_interval"] = trust.interval(known, getattr(trust, statistic))
+    return summary
+
+
+def summary(tuning: Tuning) -> dict[str, Any]:
+    """What `summary.json` says."""
+    kind, found = tuning.tuned.plant.kind, tuning.search
+    assert tuning.tuned.tune is not None
+    groups = {
+        name: {"gains": tuning.judged_gains[name], "floor": tuning.floors[name], **statistics(trials, kind)}
+        for name, trials in tuning.fresh.items()
+    }
+    checked = None if tuning.check is None else asdict(tuning.check)
+    return {
+        "status": tuning.status,
+        "plant": kind,
+        "gains": tuning.gains,
+        "at_bound": tuning.at_bound,
+        **_accuracy_gain(tuning.fresh),
+        "interval_confidence": trust.CONFIDENCE,
+        "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
+        "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
+        **{name: {"seed": tuning.fresh_seed, **group} for name, group in groups.items() if name != "tuned"},
+        "paper_refused": tuning.paper_refused,
+        "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
+        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
+        "judged_on": judged_on(tuning.tuned),
+        "search": {
+            "objective": tuning.tuned.tune.objective,
+            "goal": found.value,
+            "starts": len({step.start for step in found.history}),
+            "steps": len(found.history),
+            "rounds_with_harder_trials": found.rounds,
+            "largest_over_limit": dict(zip(found.problem.rows, found.worst.tolist(), strict=True)),
+            "confirmed": [
+                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
+            ],
+            "worst_case": tuning.tuned.tune.worst_case,
+            "hardest": None
+            if found.hardest is None
+            else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
+            "trials": np.asarray(found.problem.trials).tolist(),
+            "rollouts": tuning.rollouts,
+            "gradients": tuning.gradients,
+            "seconds": tuning.seconds,
+            "seconds_by_step": found.seconds,
+        },
+        "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
+        "differential_evolution": checked,
+    }
+
+
+def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
+    """How many times the paper's accuracy, over the trials that both fly to the end."""
+    both = fresh["tuned"].finished & fresh["paper"].finished if "paper" in fresh else np.zeros(0, bool)
+    if not both.any():
+        return {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
+    paper, tuned = (np.asarray(fresh[name].metrics.window_error)[both] for name in ("paper", "tuned"))
+    return {
+        "accuracy_gain_over_paper": trust.rms(paper) / trust.rms(tuned),
+        "accuracy_gain_interval": trust.ratio_interval(paper, tuned),
+    }
+
+
+def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
+    loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
+    assert tuning.tuned.tune is not None
+    influence = {}
+    for name, profile in believed.profiles.items():
+        if profile.flat:
+            influence[name] = "none"
+        elif name not in tuning.at_bound:
+            influence[name] = "optimum inside its bounds"
+        elif loop.mode == "continuous" and not sensed and gain_names.base(name) in ("delta", "observer_gain"):
+            influence[name] = "no trade-off: without sampling and noise more of it only helps"
+        else:
+            gain, side = gain_names.base(name), tuning.at_bound[name]
+            bound = tuning.tuned.tune.bounds[gain][side == "upper"]
+            influence[name] = free_gains.border(tuning.tuned, gain, side, bound) or "better beyond its bound"
+    slopes = believed.slope_error
+    return {
+        "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
+        "influence": influence,
+        "sensitivities": believed.sensitivities,
+        "margins": believed.margins,
+        "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
+    }
+
+
+def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
+    """Fill a result folder; known_by: see `sentences`."""
+    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
+    store.write_json(folder / "versions.json", store.versions(**known_by))
+    store.write_json(folder / "summary.json", summary(tuning))
+    assert scenario.tune is not None
+    objective = scenario.tune.objective
+    goal = objective if objective == "t_f" else f"{objective}_window_error"
+    over = [f"{m}_over_limit" for m in tuning.search.problem.rows]
+    rows = [
+        [step, row.start, row.value, *row.gains, *row.worst]
+        for path in _paths(tuning.search.history)
+        for step, row in enumerate(path)
+    ]
+    store.write_csv(folder / "history.csv", ["step", "start", goal, *gain_names.named(scenario), *over], rows)
+    if figures:
+        style.save(figures_of(scenario, tuning), folder / "figures")
+
+
+def _paths(history: Sequence[Step]) -> list[list[Step]]:
+    """The points that each start went through, start by start."""
+    return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
+
+
+def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
+    """By what a finished or interrupted run is known again."""
+    source = systems.source(getattr(scenario.plant, "system", None))
+    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
+
+
+def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+    """Figures of a tuning run by name."""
+    assert scenario.tune is not None
+    kind, names = scenario.plant.kind, gain_names.named(scenario)
+    units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]
+    paths = _paths(tuning.search.history)
+    longest = max(map(len, paths))
+
+    def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # (steps, starts, ...)
+        beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
+        return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
+
+    limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
+    unit = "s" if scenario.tune.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
+    goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
+    moved = over_steps(lambda step: step.gains)
+    found = {
+        "history": study_plots.tuning_history(
+            {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
+            over_steps(lambda step: step.value),
+            over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
+            goal,
+        ),
+        "tradeoff": study_plots.tradeoff(
+            {
+                name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
+                for name, trials in tuning.fresh.items()
+            },
+            limit,
+            kind,
+        ),
+    }
+    if tuning.trust is not None:
+        found["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
+        found["profiles"] = study_plots.profiles(
+            {
+                name: (units[k], p.gain, p.value, p.over, float(tuning.search.gains[k]))
+                for k, (name, p) in enumerate(tuning.trust.profiles.items())
+            },
+            goal,
+        )
+    return found
