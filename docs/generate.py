@@ -4,12 +4,12 @@
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from unittest import mock
 
 from ptsmc_jax.scenario import errors, keys, layouts
-from ptsmc_jax.scenario.signal_tables import Attitude
+from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
@@ -53,7 +53,7 @@ def scenarios() -> str:
     for plant, title in PLANTS.items():
         parts += [f"## {title}"]
         for name, table in layouts.TABLES[plant].items():
-            kinds = table if isinstance(table, dict) else {"": table}
+            kinds = table if isinstance(table, Mapping) else {"": table}
             parts += [f"### [{name}]"]
             if all(struct in seen for struct in kinds.values()):
                 parts += [f"As for {seen[next(iter(kinds.values()))]}."]

@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import attitude_keys
-from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from tuning.cli import convert
 
 

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import tomllib
 import types
+from collections.abc import Mapping
 
 import pytest
 from jaxtyping import Array
@@ -59,7 +60,7 @@ def test_the_references_name_everything():
         part = scenarios[scenarios.index(f"## {TITLES[plant]}") :]
         for name, table in tables.items():
             assert f"### [{name}]" in part
-            structs = table.values() if isinstance(table, dict) else [table]
+            structs = table.values() if isinstance(table, Mapping) else [table]
             for struct in structs:
                 assert all(f"`{key}`" in scenarios for key in struct.__struct_fields__ if key != "kind"), struct
     for catalogue in catalogues.CATALOGUES.values():
@@ -74,7 +75,7 @@ def test_what_others_rely_on_is_documented():
     page = (DOCS / "scenarios.md").read_text()
     for tables in COMPLETE:
         for name, table in tables.items():
-            keys = table if isinstance(table, dict) and name != "requirements" else {}
+            keys = table if isinstance(table, Mapping) and name != "requirements" else {}
             assert f"### [{name}]" in page
             assert all(f"`{key}`" in page or key == "kind" for key in keys), name
 

@@ -30,14 +30,15 @@ HOUSE = {
         "theory": "borders error_floor linear rules solutions | covariance envelopes margins | hold",
         "scenario": """
             errors systems values
-            device_tables dispersion_tables keys law_tables plant_tables signal_tables
+            attitude_keys device_tables dispersion_tables keys plant_tables
+            disturbance_tables reference_tables scales
+            gain
+            law_tables observer_tables
             tables
-            layouts scales
-            schema
-            attitude_keys free_gains
-            checks
+            layouts
+            checks schema
+            free_gains pace
             build reading
-            pace
             flyable
         """,
         "campaigns": "margin_verdicts montecarlo rows store | campaign runs | cluster",

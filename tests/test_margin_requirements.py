@@ -9,7 +9,7 @@ import pytest
 
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.scenario import layouts
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, over, verdict_text
 from ptsmc_jax.theory import margins
 from tests.helpers import SHORT
@@ -48,7 +48,7 @@ def test_margins_that_cannot_be_judged_are_refused(changes, said):
 
 def test_every_margin_has_its_requirement():
     some = margins.Margins(*(jnp.ones(2) for _ in range(5)), stable=jnp.ones(2, bool), crossover=jnp.ones(2))
-    assert tuple(some.worst()) == tuple(layouts.MARGINS)
+    assert tuple(some.worst()) == tuple(catalogues.MARGINS)
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import re
 import tomllib
+from collections.abc import Mapping
 
 import pytest
 
 from ptsmc_jax.scenario import from_tables, keys, layouts, schema
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import ROOT
 from tuning.cli import new
@@ -74,7 +75,7 @@ def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
     assert list(found) == [*[name for name in layouts.TABLES[plant] if name != "tune"], "requirements", "tune"]
     for name, table in layouts.TABLES[plant].items():
         said = kinds(found[name])
-        structs = list(table.values()) if isinstance(table, dict) else [table]
+        structs = list(table.values()) if isinstance(table, Mapping) else [table]
         assert len(said) == len(structs)
         explained = set() if name == "initial" else ATTITUDE  # there
         for lines, struct in zip(said, structs, strict=True):
@@ -109,7 +110,7 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
     dispersion = layout["dispersion"]
     assert isinstance(dispersion, type)
     drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(dispersion))
-    others = sum(len(table) if isinstance(table, dict) else 1 for table in layout.values()) - 1
+    others = sum(len(table) if isinstance(table, Mapping) else 1 for table in layout.values()) - 1
     assert tried == others + drawn + 1  # [requirements] is no table of the layout
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.devices import sensors
 from ptsmc_jax.dispersions import attitudes
-from ptsmc_jax.scenario import from_tables, pace, read, replace, schema, signal_tables, study
+from ptsmc_jax.scenario import from_tables, pace, read, reference_tables, replace, schema, study
 from ptsmc_jax.scenario.attitude_keys import quaternion
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.pace import Reach
@@ -352,7 +352,7 @@ def test_replace_by_none_returns_a_key_to_its_default():
     scenario = replace(from_tables({}), controller__t_f=20.0, loop__t_end=None)
     assert scenario.loop.t_end == 30.0
     turned = replace(scenario, initial__quat_xyzw=None, initial__rotvec_deg=[0.0, 0.0, 90.0])
-    assert turned.initial == signal_tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
+    assert turned.initial == reference_tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
 
 
 def test_replace_adds_a_table():

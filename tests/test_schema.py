@@ -5,11 +5,13 @@ import re
 import pytest
 
 from ptsmc_jax.scenario import errors, from_tables, schema
+from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
+from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_tables import Baseline, Prescribed
+from ptsmc_jax.scenario.law_tables import Baseline
 from ptsmc_jax.scenario.plant_tables import ChainPlant
-from ptsmc_jax.scenario.signal_tables import Attitude, GravityGradient, SumDisturbance
+from ptsmc_jax.scenario.reference_tables import Reference
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
@@ -294,7 +296,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
     named.pop(Attitude)  # bases of others
     named.pop(Actuators)
     named.pop(WheelLimits)
-    named.pop(Prescribed)
+    named.pop(Reference)
     named.pop(Baseline)
     named.pop(SumDisturbance)  # of tables that are looked at like any other
     named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked

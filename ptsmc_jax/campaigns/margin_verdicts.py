@@ -45,7 +45,7 @@ def differ(dispersion: Dispersion) -> bool:
 
 
 def worst(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
-    """Each of `layouts.MARGINS` of each trial's loop, (trials,), the worst over axes and times; NaN without slopes."""
+    """`catalogues.MARGINS` of each trial's loop, (trials,), the worst over axes and times; NaN without slopes."""
     found = _worst(parts, dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32))
     return {name: np.asarray(v) for name, v in found.items()}
 

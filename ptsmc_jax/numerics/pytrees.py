@@ -5,6 +5,8 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 # Type of a part's numbers: an array, alone or with batch axes; at run time anything, since JAX rebuilds pytrees
@@ -41,3 +43,8 @@ def pytree(cls: _Class) -> _Class:
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
     return cls
+
+
+def vector(values: Any) -> Array:
+    """Numbers, of any shape, as a leaf of the parts."""
+    return jnp.asarray(np.asarray(values, dtype=float))

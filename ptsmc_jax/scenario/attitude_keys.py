@@ -1,11 +1,38 @@
 """Attitudes as a scenario file gives them: every key turned into a unit quaternion, or refused."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
-from ptsmc_jax.scenario import errors, signal_tables
+from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.values import Four, Matrix, Table, Three
+
+
+class Attitude(Table, frozen=True):
+    """Exactly one of the attitude keys, of the body relative to the inertial frame; `sequence` goes with `euler_deg`.
+
+    Attributes:
+        quat_xyzw: unit quaternion, scalar last
+        quat_wxyz: unit quaternion, scalar first
+        rotvec_deg: rotation vector [deg]
+        mrp: modified Rodrigues parameters
+        dcm_body_to_inertial: rotation matrix, by rows, that takes body components to inertial ones
+        euler_deg: three angles of the axes in `sequence` [deg]
+        sequence: three axes; capitals: intrinsic, about the body's; small letters: extrinsic
+    """
+
+    quat_xyzw: Four | None = None
+    quat_wxyz: Four | None = None
+    rotvec_deg: Three | None = None
+    mrp: Three | None = None
+    dcm_body_to_inertial: Matrix | None = None
+    euler_deg: Three | None = None
+    sequence: Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None = None
+
+
+ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
 
 
 def unit(key: str, value: Any) -> np.ndarray:
@@ -17,17 +44,7 @@ def unit(key: str, value: Any) -> np.ndarray:
     return array / length
 
 
-def turn(table: signal_tables.SlewReference) -> np.ndarray:
-    """Rotation vector of a slew from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    start, end = quaternion(table, "reference"), unit("reference.to_quat_xyzw", table.to_quat_xyzw)
-    short = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
-    angle = np.linalg.norm(short)
-    return short * (1.0 - 2.0 * np.pi / angle) if table.way == "long" and angle > 0.0 else short
-
-
-def quaternion(table: signal_tables.Attitude, name: str) -> np.ndarray:
+def quaternion(table: Attitude, name: str) -> np.ndarray:
     """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
     key, value = attitude_key(table)
     full = f"{name}.{key}"
@@ -43,7 +60,7 @@ def quaternion(table: signal_tables.Attitude, name: str) -> np.ndarray:
     return found
 
 
-def _turned(table: signal_tables.Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
+def _turned(table: Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
     """The attitude of a key that holds no quaternion, as one."""
     from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
 
@@ -67,12 +84,20 @@ def _turned(table: signal_tables.Attitude, name: str, full: str, array: np.ndarr
         ) from None
 
 
-def has_attitude(table: signal_tables.Attitude) -> bool:
+def has_attitude(table: Attitude) -> bool:
     """Whether a table gives an attitude at all."""
-    return any(getattr(table, key) is not None for key in signal_tables.ATTITUDE_KEYS)
+    return any(getattr(table, key) is not None for key in ATTITUDE_KEYS)
 
 
-def attitude_key(table: signal_tables.Attitude) -> tuple[str, Any]:
+def attitude_key(table: Attitude) -> tuple[str, Any]:
     """The attitude key that a table uses, and its value."""
-    key = next(key for key in signal_tables.ATTITUDE_KEYS if getattr(table, key) is not None)
+    key = next(key for key in ATTITUDE_KEYS if getattr(table, key) is not None)
     return key, getattr(table, key)
+
+
+def at_most_one(name: str, table: Any) -> None:
+    """Raise ScenarioError where a table gives its attitude twice."""
+    said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
+    if len(said) > 1:
+        two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
+        raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")

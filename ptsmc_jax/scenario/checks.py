@@ -12,18 +12,16 @@ from ptsmc_jax.scenario import (
     device_tables,
     dispersion_tables,
     errors,
-    free_gains,
-    law_tables,
-    layouts,
     plant_tables,
-    schema,
-    signal_tables,
     systems,
     tables,
 )
+from ptsmc_jax.scenario.disturbance_tables import SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.free_gains import FINITE_TIME, MOST_STEPS
+from ptsmc_jax.scenario.gain import hand_over
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.values import MOST_STEPS, Kind
+from ptsmc_jax.simulation import catalogues
 
 if TYPE_CHECKING:
     from ptsmc_jax.plants.second_order import System
@@ -34,18 +32,19 @@ SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell ap
 def resolve(scenario: Scenario) -> Scenario:
     """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs."""
     loop, t_f = scenario.loop, scenario.controller.t_f
-    observer, disturbance = filled("observer", scenario.observer, scenario), scenario.disturbance
-    if isinstance(disturbance, signal_tables.SumDisturbance):
-        each = tuple(filled("disturbance", term, scenario) for term in disturbance.terms)
+    m = inputs(scenario)
+    observer, disturbance = scenario.observer.filled(scenario, m), scenario.disturbance
+    if isinstance(disturbance, SumDisturbance):
+        each = tuple(term.filled(scenario, m) for term in disturbance.terms)
         disturbance = msgspec.structs.replace(disturbance, terms=each)
     else:
-        disturbance = filled("disturbance", disturbance, scenario)
+        disturbance = disturbance.filled(scenario, m)
     scenario = msgspec.structs.replace(scenario, observer=observer, disturbance=disturbance)
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
     dispersion = scenario.dispersion
     if isinstance(dispersion, dispersion_tables.StateDispersion) and dispersion.x0 is not None:
-        key = _spread(dispersion.x0)
+        key = dispersion.x0.width
         width = getattr(dispersion.x0, key) or (1.0,) * len(initial_state(scenario))
         dispersion = msgspec.structs.replace(dispersion, x0=msgspec.structs.replace(dispersion.x0, **{key: width}))
     return msgspec.structs.replace(scenario, loop=loop, dispersion=dispersion)
@@ -65,36 +64,22 @@ def initial_state(scenario: Scenario) -> tuple[float, ...]:
     return scenario.plant.x0
 
 
-def filled(name: str, table: Any, scenario: Scenario) -> Any:
-    """A table with its lists of one number for each input, where they are absent, filled in."""
-    known = layouts.EACH.get((name, table.kind), {})
-    if isinstance(table, FINITE_TIME):
-        known = {key: value * (scenario.controller.disturbance_rate_bound or 1e-3) for key, value in known.items()}
-    absent = {key: (value,) * inputs(scenario) for key, value in known.items() if getattr(table, key) is None}
-    return msgspec.structs.replace(table, **absent)
-
-
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
     _check_plant(scenario)
     _check_requirements(scenario)
-    _check_observer(scenario)
+    scenario.observer.check(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
-
-
-def _spread(x0: dispersion_tables.UniformState | dispersion_tables.NormalState) -> str:
-    """The key that says how wide the initial states are drawn."""
-    return "half_width" if isinstance(x0, dispersion_tables.UniformState) else "std"
 
 
 def _check_requirements(scenario: Scenario) -> None:
     for key, value in scenario.requirements.items():
         if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
             raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
-        if key in layouts.MARGINS and scenario.loop.mode != "sampled":
+        if key in catalogues.MARGINS and scenario.loop.mode != "sampled":
             raise ScenarioError(f'requirements.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
-        if key in layouts.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
+        if key in catalogues.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
             raise ScenarioError(
                 f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
                 "allowed is a width greater than 0"
@@ -118,9 +103,7 @@ def _check_plant(scenario: Scenario) -> None:
                 value = errors.brief(scenario.spacecraft.true_inertia)
                 raise ScenarioError(f"spacecraft.true_inertia is {value}: {error}") from None
         attitude_keys.quaternion(scenario.initial, "initial")
-        attitude_keys.quaternion(scenario.reference, "reference")
-        if isinstance(scenario.reference, signal_tables.SlewReference):
-            attitude_keys.unit("reference.to_quat_xyzw", scenario.reference.to_quat_xyzw)
+        scenario.reference.check()
         _check_devices(scenario)
         return
     if isinstance(plant, plant_tables.SystemPlant):
@@ -130,16 +113,16 @@ def _check_plant(scenario: Scenario) -> None:
     m, n = inputs(scenario), len(plant.x0)
     for k, term in enumerate(terms(scenario)):
         name = f"disturbance.terms[{k}]" if len(terms(scenario)) > 1 else "disturbance"
-        _check_each(name, "disturbance", term, m)
-    _check_each("observer", "observer", scenario.observer, m)
+        _check_each(name, term, m)
+    _check_each("observer", scenario.observer, m)
     noise = getattr(scenario.hardware, "state_noise", None)
     if noise is not None and len(noise) != n:
         raise wrong("hardware.state_noise", noise, f"a list of {n} numbers, one for each state")
 
 
-def _check_each(name: str, table: str, found: Any, m: int) -> None:
-    for key in layouts.EACH.get((table, found.kind), {}):
-        value = getattr(found, key)
+def _check_each(name: str, table: Kind, m: int) -> None:
+    for key in table.each:
+        value = getattr(table, key)
         if len(value) != m:
             raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
 
@@ -186,33 +169,10 @@ def _check_chain(plant: plant_tables.ChainPlant, controller: Any) -> None:
         )
 
 
-def prescribed_times(scenario: Scenario, observer: law_tables.Prescribed) -> tuple[float, float]:
-    """T_o and delta_o of a prescribed-time observer [s]; a third of t_f, and 0.05 s or a period, if not given."""
-    loop = scenario.loop
-    t_o = scenario.controller.t_f / 3 if observer.t_o is None else observer.t_o
-    shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
-    return t_o, min(shortest, t_o / 4) if observer.delta_o is None else observer.delta_o
-
-
-def _check_observer(scenario: Scenario) -> None:
-    observer, controller = scenario.observer, scenario.controller
-    if isinstance(observer, law_tables.Prescribed):
-        t_o, delta_o = prescribed_times(scenario, observer)
-        if t_o > controller.t_f:
-            raise wrong("observer.t_o", t_o, f"at most controller.t_f, {controller.t_f}")
-        if delta_o >= t_o:
-            raise wrong("observer.delta_o", delta_o, f"less than observer.t_o, {t_o}")
-    if isinstance(observer, FINITE_TIME):
-        assert observer.gain is not None  # `resolve` filled it in
-        least = controller.disturbance_rate_bound
-        if min(observer.gain) < least or min(observer.gain) <= 0.0:
-            raise wrong("observer.gain", observer.gain, f"at least controller.disturbance_rate_bound, {least}, each")
-
-
 def terms(scenario: Scenario) -> tuple[Any, ...]:
     """The disturbances that act together."""
     table = scenario.disturbance
-    return table.terms if isinstance(table, signal_tables.SumDisturbance) else (table,)
+    return table.terms if isinstance(table, SumDisturbance) else (table,)
 
 
 def _check_devices(scenario: Scenario) -> None:
@@ -220,14 +180,8 @@ def _check_devices(scenario: Scenario) -> None:
     table, device, estimator = scenario.hardware, scenario.wheels, scenario.filter
     assert table is None or isinstance(table, device_tables.Hardware)
     for k, term in enumerate(terms(scenario)):
-        if isinstance(term, signal_tables.GravityGradient):
-            several = isinstance(scenario.disturbance, signal_tables.SumDisturbance)
-            name = f"disturbance.terms[{k}]" if several else "disturbance"
-            schema.one_attitude(name, term)
-            if attitude_keys.has_attitude(term):
-                attitude_keys.quaternion(term, name)
-            elif term.sequence is not None:
-                raise ScenarioError(f"{name}.sequence is {errors.brief(term.sequence)}, but goes with euler_deg only")
+        several = isinstance(scenario.disturbance, SumDisturbance)
+        term.check(f"disturbance.terms[{k}]" if several else "disturbance")
     if table is not None:
         if table.rate_noise is not None and table.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", table.rate_noise_density, "absent where rate_noise is given")
@@ -263,12 +217,11 @@ def _check_devices(scenario: Scenario) -> None:
 
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
-    t_f, delta, sampled = controller.t_f, free_gains.hand_over(scenario), loop.mode == "sampled"
-    if isinstance(controller, law_tables.Baseline) and not sampled:
+    t_f, delta, sampled = controller.t_f, hand_over(scenario), loop.mode == "sampled"
+    if not controller.prescribed and not sampled:
         kind = errors.show(scenario.controller.kind)
         raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
-    if isinstance(controller, law_tables.FixedTimeController) and not controller.gamma - 1.0 / controller.p > 1.0:
-        raise wrong("controller.gamma", controller.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / controller.p:.6g}")
+    controller.check()
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     assert loop.t_end is not None  # `resolve` filled it in
@@ -294,10 +247,9 @@ def _check_loop(scenario: Scenario) -> None:
             value = getattr(scenario, name)
             if value is not None and not isinstance(value, device_tables.NoFilter):
                 raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
-        if any(isinstance(term, signal_tables.RandomWalk | signal_tables.EachRandomWalk) for term in terms(scenario)):
-            raise ScenarioError(
-                f'disturbance.kind = "random_walk" needs the sampled loop, but loop.mode is "{loop.mode}"'
-            )
+        if any(term.sampled_only for term in terms(scenario)):
+            kind = next(errors.show(term.kind) for term in terms(scenario) if term.sampled_only)
+            raise ScenarioError(f'disturbance.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
 
 
 def _check_periods(scenario: Scenario) -> None:
@@ -333,7 +285,7 @@ def _check_dispersion(scenario: Scenario) -> None:
         if isinstance(angles, dispersion_tables.AxisAngle) and angles.min_deg > angles.max_deg:
             raise wrong(f"dispersion.{key}.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
     if isinstance(dispersion, dispersion_tables.StateDispersion) and dispersion.x0 is not None:
-        key, states = _spread(dispersion.x0), len(initial_state(scenario))
+        key, states = dispersion.x0.width, len(initial_state(scenario))
         value = getattr(dispersion.x0, key)
         if len(value) != states:
             raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")

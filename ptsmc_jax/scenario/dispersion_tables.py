@@ -1,16 +1,66 @@
 """The tables of a scenario file that say what is drawn for each trial."""
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Table
+
+
+class Numbers(Table, frozen=True):
+    """How numbers are drawn, about what the scenario says."""
+
+    width: ClassVar[str] = "std"  # the key that says how far
+    widest: ClassVar[float] = 0.0  # how far a vector of three goes, in times that: all but one in 10 000
+
+    def of(self, count: int = 1) -> Sequence[float]:
+        """The width of so many numbers, of which a single one of the table stands for all."""
+        return np.ones(count) * getattr(self, self.width)
+
+    def build(self, count: int = 1) -> Any:
+        """A part of `dispersions.numbers`, of so many numbers."""
+        raise NotImplementedError
+
+
+class Normal(Numbers, frozen=True):
+    """Normal, not truncated."""
+
+    widest: ClassVar[float] = 4.6
+
+    def build(self, count: int = 1) -> Any:
+        """`numbers.Normal`."""
+        from ptsmc_jax.dispersions.numbers import Normal as Physics
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return Physics(vector(self.of(count)))
+
+
+class Uniform(Numbers, frozen=True):
+    """Uniform, as far on either side."""
+
+    width: ClassVar[str] = "half_width"
+    widest: ClassVar[float] = float(np.sqrt(3.0))
+
+    def build(self, count: int = 1) -> Any:
+        """`numbers.Uniform`."""
+        from ptsmc_jax.dispersions.numbers import Uniform as Physics
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return Physics(vector(self.of(count)))
 
 
 class UniformAttitude(Table, frozen=True):
     """Any attitude at all, uniform on SO(3)."""
 
     kind: Literal["uniform"] = "uniform"
+
+    def build(self) -> Any:
+        """`attitudes.UniformAttitude`."""
+        from ptsmc_jax.dispersions.attitudes import UniformAttitude as Physics
+
+        return Physics()
 
 
 class AxisAngle(Table, frozen=True):
@@ -25,6 +75,13 @@ class AxisAngle(Table, frozen=True):
     min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
     max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
 
+    def build(self) -> Any:
+        """`attitudes.AxisAngle`."""
+        from ptsmc_jax.dispersions.attitudes import AxisAngle as Physics
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return Physics(*(vector(np.deg2rad(angle)) for angle in (self.min_deg, self.max_deg)))
+
 
 class NormalAttitude(Table, frozen=True):
     """Turned by a normal rotation vector from what the scenario says.
@@ -36,8 +93,15 @@ class NormalAttitude(Table, frozen=True):
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 1.0
 
+    def build(self) -> Any:
+        """`attitudes.NormalAttitude`."""
+        from ptsmc_jax.dispersions.attitudes import NormalAttitude as Physics
+        from ptsmc_jax.numerics.pytrees import vector
 
-class NormalRate(Table, frozen=True):
+        return Physics(vector(np.deg2rad(self.std_deg)))
+
+
+class NormalRate(Normal, frozen=True):
     """Each axis normal about initial.rate.
 
     Attributes:
@@ -48,7 +112,7 @@ class NormalRate(Table, frozen=True):
     std: NotNegative = 0.01
 
 
-class UniformRate(Table, frozen=True):
+class UniformRate(Uniform, frozen=True):
     """Each axis uniform about initial.rate.
 
     Attributes:
@@ -71,6 +135,14 @@ class RelativeInertia(Table, frozen=True):
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
     axes_deg: NotNegative = 0.0
 
+    def build(self, inertia: Any) -> Any:
+        """`inertias.RelativeInertia`, about the inertia (3, 3) of the true body [kg m^2]."""
+        from ptsmc_jax.dispersions.inertias import RelativeInertia as Physics
+        from ptsmc_jax.numerics.pytrees import vector
+
+        moments, axes = np.linalg.eigh(np.asarray(inertia))
+        return Physics(*(vector(value) for value in (moments, axes, self.std, np.deg2rad(self.axes_deg))))
+
 
 class UniformPhase(Table, frozen=True):
     """Uniform over the circle."""
@@ -78,7 +150,7 @@ class UniformPhase(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
 
 
-class RelativeNormal(Table, frozen=True):
+class RelativeNormal(Numbers, frozen=True):
     """Times 1 + a normal number, truncated at three sigma.
 
     Attributes:
@@ -88,8 +160,15 @@ class RelativeNormal(Table, frozen=True):
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
 
+    def build(self, count: int = 1) -> Any:
+        """`numbers.TruncatedNormal`."""
+        from ptsmc_jax.dispersions.numbers import TruncatedNormal
+        from ptsmc_jax.numerics.pytrees import vector
 
-class RelativeUniform(Table, frozen=True):
+        return TruncatedNormal(vector(self.of(count)))
+
+
+class RelativeUniform(Uniform, frozen=True):
     """Times 1 + a uniform number.
 
     Attributes:
@@ -100,7 +179,7 @@ class RelativeUniform(Table, frozen=True):
     half_width: Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")] = 0.2
 
 
-class NormalBias(Table, frozen=True):
+class NormalBias(Normal, frozen=True):
     """Normal about what [disturbance] says.
 
     Attributes:
@@ -111,7 +190,7 @@ class NormalBias(Table, frozen=True):
     std: NotNegative = 1e-3
 
 
-class UniformBias(Table, frozen=True):
+class UniformBias(Uniform, frozen=True):
     """Uniform about what [disturbance] says.
 
     Attributes:
@@ -122,7 +201,7 @@ class UniformBias(Table, frozen=True):
     half_width: NotNegative = 1e-3
 
 
-class UniformState(Table, frozen=True):
+class UniformState(Uniform, frozen=True):
     """Every state uniform about x0.
 
     Attributes:
@@ -133,7 +212,7 @@ class UniformState(Table, frozen=True):
     half_width: NotNegatives = ()
 
 
-class NormalState(Table, frozen=True):
+class NormalState(Normal, frozen=True):
     """Every state normal about x0.
 
     Attributes:

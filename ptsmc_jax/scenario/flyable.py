@@ -13,9 +13,10 @@ from ptsmc_jax import programs
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario import attitude_keys, build, errors, layouts, pace
+from ptsmc_jax.scenario import attitude_keys, build, errors, pace
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -68,9 +69,11 @@ def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
 
 def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """What a scenario asks of its loop."""
-    asked = {name: value for name, value in scenario.requirements.items() if name in layouts.MARGINS}
+    asked = {name: value for name, value in scenario.requirements.items() if name in catalogues.MARGINS}
     return tuple(
-        Requirement(name, float(typing.cast(float, value)), layouts.MARGINS[name][0], at_least=layouts.MARGINS[name][2])
+        Requirement(
+            name, float(typing.cast(float, value)), catalogues.MARGINS[name][0], at_least=catalogues.MARGINS[name][2]
+        )
         for name, value in asked.items()
     )
 
@@ -170,13 +173,13 @@ def _parts(scenario: Scenario, saves: object, reach: pace.Reach | None) -> Parts
         disturbance=disturbance,
         reference=reference,
         controller=controller,
-        observer=build.observer(scenario, model),
+        observer=scenario.observer.build(scenario, model),
         sensors=build.sensors(scenario),
         clock=clock.flight(1.0, 1.0),  # until it is known how fast things happen
         initial=initial,
-        t_end=build.vector(loop.t_end),
-        window=build.vector(loop.window),
-        settling_angle=build.vector(loop.settling_angle),
+        t_end=vector(loop.t_end),
+        window=vector(loop.window),
+        settling_angle=vector(loop.settling_angle),
         actuators=build.actuators(scenario),
         walk_rate=walk,
     )

@@ -1,17 +1,78 @@
-"""The tables of a scenario file that say how it is steered: the law, its gains, and the disturbance observer."""
+"""The laws of a scenario file: each a table with its keys, its gains, what it is refused for, and what it is made into.
 
-from typing import Annotated, Literal
+A law is its physics in a file of `laws`, a table here, and a row in `LAWS`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from ptsmc_jax.scenario.values import EachPositive, NotNegative, Positive, Table, ThreePositive
+from ptsmc_jax.scenario import gain
+from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.gain import Choice, Gain, between
+from ptsmc_jax.scenario.values import NotNegative, Positive, Table
 
 Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
 AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
 
 
-class Controller(Table, frozen=True):
+class Law(Table, frozen=True):
+    """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
+
+    # gains that tuning may move; those that are free where a scenario does not say, before the observer's gain and,
+    # in the sampled loop only, after it: without samples a larger K1 and a narrower sign cost nothing but steps
+    gains: ClassVar[Mapping[str, Gain]] = {}
+    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
+    prescribed: ClassVar[bool] = True  # hands over at t_f - delta, and flies in either loop; others when sampled only
+
+    def physics(self) -> Any:
+        """What flies: a class of `laws`, its fields named as the keys."""
+        raise NotImplementedError
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """How fast it turns the body [rad/s], at most, and the key that says so."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raise ScenarioError where its keys contradict each other."""
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """The law of a plant's model."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        made = self.physics()
+        names = [field.name for field in dataclasses.fields(made) if field.name != "model"]
+        own = {name: gain.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
+        return made(model, **{name: vector(value) for name, value in own.items()})
+
+
+def _two(_: Any) -> float:
+    return 2.0  # Theorems 1 and 2
+
+
+class Prescribed(Law, frozen=True):
+    """The paper's gains, whatever the plant."""
+
+    gains: ClassVar[Mapping[str, Gain]] = {
+        "eta": gain.eta(_two),
+        "delta": gain.DELTA,
+        "k1": gain.K1,
+        "sign_width": gain.SIGN_WIDTH,
+        "surface_rate": gain.SURFACE_RATE,
+        "t_f": gain.T_F,
+    }
+    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("eta", "delta"), ("k1", "sign_width"))
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at the start."""
+        return "controller.eta", 2.0 * self.eta / t_f  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class Controller(Prescribed, frozen=True):
     """The paper's law for a spacecraft: (56) and (57) before the hand-over, (59) and (60) after it.
 
     Attributes:
@@ -39,8 +100,14 @@ class Controller(Table, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
+    def physics(self) -> Any:
+        """By its error."""
+        from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeMultiplicative
 
-class Baseline(Table, frozen=True):
+        return PrescribedTimeMultiplicative if self.error == "multiplicative" else PrescribedTime
+
+
+class Baseline(Law, frozen=True):
     """What the laws to compare with have besides their gains.
 
     Attributes:
@@ -54,6 +121,12 @@ class Baseline(Table, frozen=True):
     disturbance_rate_bound: NotNegative = 1e-3
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
+    prescribed: ClassVar[bool] = False
+
+
+def _over_t_f(low: float, high: float, power: int = 1) -> Gain:
+    """What has the unit 1/s, or a power of it."""
+    return Gain(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
 
 
 class PDController(Baseline, frozen=True):
@@ -67,6 +140,22 @@ class PDController(Baseline, frozen=True):
     kind: Literal["pd"] = "pd"
     k_p: Positive = 0.2
     k_d: Positive = 0.6
+    gains: ClassVar[Mapping[str, Gain]] = {
+        "k_p": _over_t_f(2.0, 2000.0, 2),
+        "k_d": _over_t_f(0.3, 100.0),
+        "t_f": gain.T_F,
+    }
+    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("k_p", "k_d"), ())
+
+    def physics(self) -> Any:
+        """`laws.pd`."""
+        from ptsmc_jax.laws.pd import QuaternionPD
+
+        return QuaternionPD
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """All of the potential energy of its spring."""
+        return "controller.k_p", 2.0 * math.sqrt(self.k_p)
 
 
 class TerminalController(Baseline, frozen=True):
@@ -84,6 +173,44 @@ class TerminalController(Baseline, frozen=True):
     b: Positive = 0.1
     k: Positive = 0.1
     sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, Gain]] = {
+        "p": Gain(lambda _: (1.05, 1.95), between(1.0, 2.0)),
+        "b": _over_t_f(0.01, 100.0),
+        "k": _over_t_f(2.0, 2000.0, 2),
+        "sign_width": gain.SIGN_WIDTH,
+        "t_f": gain.T_F,
+    }
+    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("p", "b", "k"), ("sign_width",))
+
+    def physics(self) -> Any:
+        """`laws.terminal`."""
+        from ptsmc_jax.laws.terminal import Terminal
+
+        return Terminal
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.b", 2.0 * self.b ** (1.0 / self.p)
+
+
+def _usual_p(choice: Choice) -> tuple[float, float]:
+    least = _allowed_p(choice)[0]
+    return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
+
+
+def _allowed_p(choice: Choice) -> tuple[float, float, bool]:
+    """For gamma - 1/p > 1; where gamma is free too, it follows p."""
+    return 1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0, False
+
+
+def _usual_gamma(choice: Choice) -> tuple[float, float]:
+    least = _allowed_gamma(choice)[0]
+    return least + 0.05, least + 2.0
+
+
+def _allowed_gamma(choice: Choice) -> tuple[float, float, bool]:
+    """Gamma - 1/p > 1, for every p."""
+    return 1.0 + 1.0 / choice.least("p"), math.inf, False
 
 
 class FixedTimeController(Baseline, frozen=True):
@@ -111,9 +238,38 @@ class FixedTimeController(Baseline, frozen=True):
     m: AboveOne = 1.5
     n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
     sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, Gain]] = {
+        "p": Gain(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
+        **dict.fromkeys(("a1", "b1"), _over_t_f(0.01, 100.0)),
+        **dict.fromkeys(("a2", "b2"), Gain(lambda _: (1e-4, 10.0))),
+        "gamma": Gain(_usual_gamma, _allowed_gamma),
+        "m": Gain(lambda _: (1.05, 3.0), between(1.0, math.inf)),
+        "n": Gain(lambda _: (0.05, 0.95), between(0.0, 1.0)),
+        "sign_width": gain.SIGN_WIDTH,
+        "t_f": gain.T_F,
+    }
+    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (
+        ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n"),
+        ("sign_width",),
+    )
+
+    def physics(self) -> Any:
+        """`laws.fixed_time`."""
+        from ptsmc_jax.laws.fixed_time import FixedTime
+
+        return FixedTime
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.a1", 2.0 * (self.a1 + self.b1)
+
+    def check(self) -> None:
+        """Its surface is nonsingular for gamma - 1/p > 1 only."""
+        if not self.gamma - 1.0 / self.p > 1.0:
+            raise wrong("controller.gamma", self.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
 
-class SystemController(Table, frozen=True):
+class SystemController(Prescribed, frozen=True):
     """The paper's law (29) for a second-order system, with (57)'s gains.
 
     Attributes:
@@ -121,7 +277,7 @@ class SystemController(Table, frozen=True):
         eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
         delta: hand-over to constant gains so long before t_f (Remark 1) [s]
         k1: K1, rate of s from the hand-over on [1/s]
-        sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
+        sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [unit of d/s]
         disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [unit of d]
@@ -139,6 +295,12 @@ class SystemController(Table, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
+    def physics(self) -> Any:
+        """`laws.prescribed_time`."""
+        from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
+
+        return PrescribedTimeSystem
+
 
 class ChainController(SystemController, frozen=True):
     """The paper's law (52) for an integrator chain; without an observer (36) to (40).
@@ -153,93 +315,26 @@ class ChainController(SystemController, frozen=True):
     a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
         1.0,
     )
+    gains: ClassVar[Mapping[str, Gain]] = {
+        **Prescribed.gains,
+        "eta": gain.eta(lambda scenario: float(scenario.plant.order)),  # Theorem 3
+    }
+
+    def physics(self) -> Any:
+        """`laws.prescribed_time`."""
+        from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain
+
+        return PrescribedTimeChain
 
 
-class NoObserver(Table, frozen=True):
-    """None: d_hat = 0, and K switches against the whole disturbance."""
-
-    kind: Literal["none"] = "none"
-
-
-class NonlinearObserver(Table, frozen=True):
-    """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
-
-    Attributes:
-        gain: diagonal of l(w) [N m s]
-    """
-
-    kind: Literal["nonlinear"] = "nonlinear"
-    gain: ThreePositive = (10.0, 10.0, 10.0)
-
-
-class EachNonlinearObserver(Table, frozen=True):
-    """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
-
-    Attributes:
-        gain: one number for each input; default: 10 each [1/s]
-    """
-
-    kind: Literal["nonlinear"] = "nonlinear"
-    gain: EachPositive | None = None
-
-
-class Prescribed(Table, frozen=True):
-    """What a prescribed-time observer has besides its gain.
-
-    Attributes:
-        mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
-        t_o: time by which it has converged; default: a third of t_f [s]
-        delta_o: mu/(t_o - t) is off from so long before t_o; default: 0.05, or a period, at most t_o/4 [s]
-    """
-
-    mu: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
-    t_o: Positive | None = None
-    delta_o: Positive | None = None
-
-
-class PrescribedTimeObserver(Prescribed, frozen=True):
-    """An observer that has converged by t_o, the nonlinear one from then on.
-
-    Attributes:
-        gain: diagonal of the constant part of l [N m s]
-    """
-
-    kind: Literal["prescribed_time"] = "prescribed_time"
-    gain: ThreePositive = (10.0, 10.0, 10.0)
-
-
-class EachPrescribedTimeObserver(Prescribed, frozen=True):
-    """An observer that has converged by t_o, the nonlinear one from then on.
-
-    Attributes:
-        gain: constant part, one number for each input; default: 10 each [1/s]
-    """
-
-    kind: Literal["prescribed_time"] = "prescribed_time"
-    gain: EachPositive | None = None
-
-
-class FiniteTimeObserver(Table, frozen=True):
-    """A super-twisting observer, exact after a finite time (Levant 1998).
-
-    Attributes:
-        gain: per axis, at least controller.disturbance_rate_bound; default: 20 times that [N m/s]
-        sign_width: of its smooth sign, in the continuous loop [N m s]
-    """
-
-    kind: Literal["finite_time"] = "finite_time"
-    gain: ThreePositive | None = None
-    sign_width: NotNegative = 1e-5
-
-
-class EachFiniteTimeObserver(Table, frozen=True):
-    """A super-twisting observer, exact after a finite time (Levant 1998).
-
-    Attributes:
-        gain: one for each input, at least controller.disturbance_rate_bound; default: 20 times that [unit of d/s]
-        sign_width: of its smooth sign, in the continuous loop
-    """
-
-    kind: Literal["finite_time"] = "finite_time"
-    gain: EachPositive | None = None
-    sign_width: NotNegative = 1e-5
+# by the kind of the plant and the kind of the law, the default first
+LAWS: dict[str, Mapping[str, type[Law]]] = {
+    "spacecraft": {
+        "prescribed_time": Controller,
+        "pd": PDController,
+        "terminal": TerminalController,
+        "fixed_time": FixedTimeController,
+    },
+    "chain": {"prescribed_time": ChainController},
+    "system": {"prescribed_time": SystemController},
+}

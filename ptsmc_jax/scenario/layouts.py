@@ -4,60 +4,31 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ptsmc_jax.scenario import device_tables, law_tables, plant_tables, signal_tables, values
+from ptsmc_jax.scenario import device_tables, plant_tables, reference_tables
 from ptsmc_jax.scenario import dispersion_tables as dt
 from ptsmc_jax.scenario import tables as t
+from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
+from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.reference_tables import REFERENCES
+from ptsmc_jax.scenario.values import Kinds, Table
 
 # A table is a struct, or one for each kind, the default first.
-Kinds = dict[str, type[values.Table]]
-_STATE_OBSERVERS: Kinds = {
-    "nonlinear": law_tables.EachNonlinearObserver,
-    "finite_time": law_tables.EachFiniteTimeObserver,
-    "prescribed_time": law_tables.EachPrescribedTimeObserver,
-}
-_STATE_DISTURBANCES: Kinds = {
-    "sinusoid": signal_tables.EachSinusoid,
-    "constant": signal_tables.EachConstant,
-    "random_walk": signal_tables.EachRandomWalk,
-    "sum": signal_tables.SumDisturbance,
-}
-_STATE_LOOP: dict[str, type[values.Table] | Kinds] = {
+_STATE_LOOP: dict[str, type[Table] | Kinds] = {
     "loop": t.Loop,
     "hardware": device_tables.StateHardware,
     "dispersion": dt.StateDispersion,
     "tune": t.Tune,
 }
-TABLES: dict[str, dict[str, type[values.Table] | Kinds]] = {  # by the kind of the plant
+TABLES: dict[str, dict[str, type[Table] | Kinds]] = {  # by the kind of the plant
     "spacecraft": {
         "plant": plant_tables.SpacecraftPlant,
         "spacecraft": plant_tables.Spacecraft,
-        "initial": signal_tables.Initial,
-        "reference": {
-            "fixed": signal_tables.FixedReference,
-            "spin": signal_tables.SpinReference,
-            "sinusoid": signal_tables.SinusoidReference,
-            "slew": signal_tables.SlewReference,
-        },
-        "disturbance": {
-            "sinusoid": signal_tables.SinusoidDisturbance,
-            "none": signal_tables.NoDisturbance,
-            "constant": signal_tables.ConstantDisturbance,
-            "gravity_gradient": signal_tables.GravityGradient,
-            "random_walk": signal_tables.RandomWalk,
-            "sum": signal_tables.SumDisturbance,
-        },
-        "controller": {
-            "prescribed_time": law_tables.Controller,
-            "pd": law_tables.PDController,
-            "terminal": law_tables.TerminalController,
-            "fixed_time": law_tables.FixedTimeController,
-        },
-        "observer": {
-            "nonlinear": law_tables.NonlinearObserver,
-            "none": law_tables.NoObserver,
-            "finite_time": law_tables.FiniteTimeObserver,
-            "prescribed_time": law_tables.PrescribedTimeObserver,
-        },
+        "initial": reference_tables.Initial,
+        "reference": REFERENCES,
+        "disturbance": DISTURBANCES["spacecraft"],
+        "controller": LAWS["spacecraft"],
+        "observer": OBSERVERS["spacecraft"],
         "loop": t.Loop,
         "hardware": device_tables.Hardware,
         "wheels": {"pyramid": device_tables.PyramidWheels, "axes": device_tables.AxesWheels},
@@ -67,29 +38,18 @@ TABLES: dict[str, dict[str, type[values.Table] | Kinds]] = {  # by the kind of t
     },
     "chain": {
         "plant": plant_tables.ChainPlant,
-        "disturbance": {
-            "sinusoid": signal_tables.EachSinusoid,
-            "none": signal_tables.NoDisturbance,
-            **_STATE_DISTURBANCES,
-        },
-        "controller": {"prescribed_time": law_tables.ChainController},
-        "observer": {"none": law_tables.NoObserver, **_STATE_OBSERVERS},
+        "disturbance": DISTURBANCES["chain"],
+        "controller": LAWS["chain"],
+        "observer": OBSERVERS["chain"],
         **_STATE_LOOP,
     },
     "system": {
         "plant": plant_tables.SystemPlant,
-        "disturbance": {"none": signal_tables.NoDisturbance, **_STATE_DISTURBANCES},
-        "controller": {"prescribed_time": law_tables.SystemController},
-        "observer": {"none": law_tables.NoObserver, **_STATE_OBSERVERS},
+        "disturbance": DISTURBANCES["system"],
+        "controller": LAWS["system"],
+        "observer": OBSERVERS["system"],
         **_STATE_LOOP,
     },
-}
-# margins of the loop, see `margins`: name: (unit, what it is, whether a requirement is the least that is allowed)
-MARGINS = {
-    "gain_margin": ("dB", "factor on the gain, up or down, to the border of stability", True),
-    "phase_margin": ("deg", "phase, either way, to the border of stability", True),
-    "delay_margin": ("s", "further delay to the border of stability", True),
-    "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1", False),
 }
 OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
 _RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
@@ -108,17 +68,6 @@ DISPERSIONS: dict[str, Kinds] = {
 _CASE_I: dict[str, Mapping[str, Any]] = {
     "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
     "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
-}
-
-
-# What lists of one number for each input hold where they are absent: table and kind -> key -> number.
-EACH: dict[tuple[str, str], dict[str, float]] = {
-    ("disturbance", "random_walk"): {"density": 1e-4},
-    ("disturbance", "constant"): {"amplitude": 0.01},
-    ("disturbance", "sinusoid"): {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0},
-    ("observer", "nonlinear"): {"gain": 10.0},
-    ("observer", "prescribed_time"): {"gain": 10.0},
-    ("observer", "finite_time"): {"gain": 20.0},  # times controller.disturbance_rate_bound
 }
 
 

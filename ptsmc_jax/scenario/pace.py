@@ -12,12 +12,14 @@ import numpy as np
 
 from ptsmc_jax import programs
 from ptsmc_jax.laws.base import SecondOrder
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario import attitude_keys, build, checks, dispersion_tables, law_tables, plant_tables, signal_tables
+from ptsmc_jax.scenario import checks, plant_tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.free_gains import MOST_STEPS, hand_over
+from ptsmc_jax.scenario.gain import hand_over
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import solutions
@@ -58,7 +60,7 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, parts, reach), None
     if isinstance(parts.plant, System):
-        hurried = parts.with_t_f(build.vector(reach.smallest_t_f))
+        hurried = parts.with_t_f(vector(reach.smallest_t_f))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if loop.mode == "continuous":
@@ -70,7 +72,7 @@ def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tup
     last = loop.t_end + reach.t_f - scenario.controller.t_f
     _check_steps(scenario, last, substeps)
     if loop.clock == "flight":
-        return dataclasses.replace(clock.flight(loop.period, last), t_end=build.vector(loop.t_end)), substeps
+        return dataclasses.replace(clock.flight(loop.period, last), t_end=vector(loop.t_end)), substeps
     late = loop.t_end - scenario.controller.t_f + reach.delta
     return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
 
@@ -97,13 +99,13 @@ def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
 
 def _frequencies(scenario: Scenario, parts: Parts, reach: Reach) -> dict[str, float]:
     """How fast things happen [rad/s], by the key that says so."""
-    waves = [np.max(np.abs(getattr(term, "frequency", 0.0))) for term in checks.terms(scenario)]
-    found = {"disturbance.frequency": float(max(waves))}
+    found = {"disturbance.frequency": max(term.quickest() for term in checks.terms(scenario))}
     if scenario.initial is not None:
         found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
-        found |= _reference_frequencies(scenario.reference)
-        key, rate = _slew(scenario.controller, reach.smallest_t_f)
-        if isinstance(scenario.controller, law_tables.Baseline):
+        assert scenario.reference is not None
+        found |= scenario.reference.frequencies()
+        key, rate = scenario.controller.turning(reach.smallest_t_f)
+        if not scenario.controller.prescribed:
             rate = min(rate, 0.5 * BASELINES * 0.025 / scenario.loop.period)
         found[key] = rate
         for key, rate in _nutation(scenario, parts).items():
@@ -127,51 +129,17 @@ def _nutation(scenario: Scenario, parts: Parts) -> dict[str, float]:
     shares = {
         "wheels.momentum": stored,
         "initial.rate": largest * turning,
-        "disturbance.amplitude": _impulse(scenario),
+        "disturbance.amplitude": sum(
+            term.impulse(float(scenario.loop.t_end or 0.0)) for term in checks.terms(scenario)
+        ),
     }
     return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
-
-
-def _impulse(scenario: Scenario) -> float:
-    """What constant and sinusoidal disturbances add up to at most until t_end [N m s]."""
-    end, found = float(scenario.loop.t_end or 0.0), 0.0
-    for term in checks.terms(scenario):
-        swing, frequency, bias = (np.abs(getattr(term, key, (0.0,))) for key in ("amplitude", "frequency", "bias"))
-        lasting = np.minimum(end, 2.0 / np.maximum(frequency, 1e-12))
-        found += float(np.linalg.norm(swing * lasting) + np.linalg.norm(bias) * end)
-    return found
-
-
-def _slew(law: Any, t_f: float) -> tuple[str, float]:
-    """How fast a law turns the body [rad/s], at most, by the key that says so; on their surfaces the baselines."""
-    if isinstance(law, law_tables.PDController):  # all of the potential energy of its spring
-        return "controller.k_p", 2.0 * math.sqrt(law.k_p)
-    if isinstance(law, law_tables.TerminalController):
-        return "controller.b", 2.0 * law.b ** (1.0 / law.p)
-    if isinstance(law, law_tables.FixedTimeController):
-        return "controller.a1", 2.0 * (law.a1 + law.b1)
-    return "controller.eta", 2.0 * law.eta / t_f
 
 
 def _spread(scenario: Scenario) -> float:
     """How much faster than initial.rate a drawn body may turn [rad/s]; a normal rate: all but one in 10 000."""
     table = getattr(scenario.dispersion, "rate", None)
-    if table is None:
-        return 0.0
-    return 4.6 * table.std if isinstance(table, dispersion_tables.NormalRate) else np.sqrt(3.0) * table.half_width
-
-
-def _reference_frequencies(table: Any) -> dict[str, float]:
-    """How fast the reference turns and changes [rad/s], by the key that says so."""
-    if isinstance(table, signal_tables.SpinReference):
-        return {"reference.rate": float(np.linalg.norm(table.rate))}
-    if isinstance(table, signal_tables.SinusoidReference):
-        turning = float(np.linalg.norm(np.multiply(table.amplitude, table.frequency)))
-        return {"reference.frequency": turning + float(np.max(np.abs(table.frequency)))}
-    if isinstance(table, signal_tables.SlewReference):  # largest rate of the quintic, and the motion's own time
-        turning = 1.875 * float(np.linalg.norm(attitude_keys.turn(table)))
-        return {"reference.duration": (turning + 2.0 * np.pi) / table.duration}
-    return {}
+    return 0.0 if table is None else table.widest * table.of()[0]
 
 
 def _fastest(frequencies: Mapping[str, float]) -> float:
@@ -260,11 +228,11 @@ def _grid(
         resolved = _with_gain(observer, reach.largest_gain).fastest()
         observer = _with_gain(observer, reach.gain)
     names = ("t_f", "k1", "sign_width", "surface_rate")
-    widest = dataclasses.replace(controller, **{name: build.vector(getattr(reach, name)) for name in names})
+    widest = dataclasses.replace(controller, **{name: vector(getattr(reach, name)) for name in names})
     layer = (0.0, 0.0)
     if reach.sign_width > 0.0:
         for t_f in (reach.smallest_t_f, reach.t_f):
-            law = dataclasses.replace(widest, t_f=build.vector(t_f))
+            law = dataclasses.replace(widest, t_f=vector(t_f))
             before, after = (float(v) for v in _boundary_layer(law, observer, visited))
             layer = (max(layer[0], before), max(layer[1], after))
     layer = (max(layer[0], resolved), max(layer[1], resolved))
@@ -289,4 +257,4 @@ def _grid(
             raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
         raise _lower(scenario, worst, asks)
     grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
-    return dataclasses.replace(grid, t_end=build.vector(loop.t_end))
+    return dataclasses.replace(grid, t_end=vector(loop.t_end))

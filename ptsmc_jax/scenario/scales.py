@@ -6,12 +6,12 @@ coordinates; their ends are here.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
 from ptsmc_jax import formulas
-from ptsmc_jax.scenario import device_tables, law_tables
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario import device_tables
 from ptsmc_jax.theory import borders
 
 LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
@@ -25,7 +25,7 @@ def gyro_noise(table: device_tables.Hardware, period: float) -> float:
     return table.rate_noise or formulas.per_sample(table.rate_noise_density or 0.0, period)
 
 
-def dead_beat_gain(scenario: Scenario, left: float = LEFT) -> float:
+def dead_beat_gain(scenario: Any, left: float = LEFT) -> float:
     """Gain l [N m s], the same on all axes, from which on at most this share of the observer's error is left.
 
     After one period, and of the error about the axis of the largest principal moment J: l h / J = ln(1 / left), which
@@ -38,7 +38,7 @@ def dead_beat_gain(scenario: Scenario, left: float = LEFT) -> float:
     return math.log(1.0 / left) * moment / scenario.loop.period
 
 
-def largest_k1(scenario: Scenario) -> float:
+def largest_k1(scenario: Any) -> float:
     """K1 [1/s] at which the sampled loop after the hand-over ends to be stable, with this delay and `surface_rate`.
 
     `borders.largest_reaching` = K1 h / 2 for a spacecraft (60), K1 h for what has the K1 of (10), (29); without delay
@@ -50,7 +50,7 @@ def largest_k1(scenario: Scenario) -> float:
     return 2.0 * reaching if scenario.spacecraft is not None else reaching
 
 
-def noise_of_s(scenario: Scenario) -> float:
+def noise_of_s(scenario: Any) -> float:
     """Noise sigma_s of s after the hand-over [1/s], 1 sigma an axis and raw sample; otherwise in the states' units.
 
     The error is half an angle: s = eps' + c eps has sigma_s = (sigma_w^2 + c^2 sigma_q^2)^(1/2) / 2; of the additive
@@ -59,7 +59,7 @@ def noise_of_s(scenario: Scenario) -> float:
     """
     table, law = scenario.hardware, scenario.controller
     if isinstance(table, device_tables.StateHardware):
-        a = law.a if isinstance(law, law_tables.ChainController) else (1.0,)
+        a = getattr(law, "a", (1.0,))  # of a chain's surface
         weights = [one * law.surface_rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
         noises = table.state_noise or [0.0] * len(weights)
         if len(noises) == len(weights):
@@ -81,7 +81,7 @@ def narrowest_that_matters(noise: float, share: float = SHARE) -> float:
     return math.sqrt(24.0 * share) / math.pi * noise
 
 
-def widths(scenario: Scenario) -> tuple[float, float]:
+def widths(scenario: Any) -> tuple[float, float]:
     """Between which the width of the smooth sign matters, in the units of s: by the noise of s, if there is any."""
     noise = noise_of_s(scenario)
     return (narrowest_that_matters(noise), WIDEST * noise) if noise > 0.0 else QUIET

@@ -15,12 +15,13 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import keys, layouts, signal_tables
+from ptsmc_jax.scenario import attitude_keys, disturbance_tables, keys, layouts
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
-from ptsmc_jax.scenario.layouts import TABLES, Kinds
-from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS
+from ptsmc_jax.scenario.layouts import TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
-from ptsmc_jax.scenario.values import Positive, Table, Truth
+from ptsmc_jax.scenario.values import Kinds, Positive, Table, Truth
+from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
 LONGEST_KEY = 100  # characters
@@ -111,7 +112,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         found["plant"] = msgspec.structs.replace(found["plant"], order=order)
     for name in ("initial", "reference"):
         if name in found:
-            one_attitude(name, found[name])
+            attitude_keys.at_most_one(name, found[name])
     found["requirements"] = {
         key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
     }
@@ -153,7 +154,7 @@ def _place(key: str, layout: Mapping[str, Any]) -> str:
 
 
 def _structs(table: type[Table] | Kinds) -> list[type[Table]]:
-    return [struct for struct in table.values() if struct is not None] if isinstance(table, dict) else [table]
+    return [struct for struct in table.values() if struct is not None] if isinstance(table, Mapping) else [table]
 
 
 def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -161,14 +162,6 @@ def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Map
     if any(key in given for key in ATTITUDE_KEYS):
         fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
     return {**fallback, **given}
-
-
-def one_attitude(name: str, table: Any) -> None:
-    """Raise ScenarioError where a table gives its attitude twice."""
-    said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
-    if len(said) > 1:
-        two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
-        raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
@@ -204,26 +197,26 @@ def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
 
 
 def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Table:
-    if not isinstance(kinds, dict):
+    if not isinstance(kinds, Mapping):
         return _fields(name, raw, kinds)
     kind = raw.get("kind", next(iter(kinds)))
     if not isinstance(kind, str) or kind not in kinds:
         raise wrong(f"{name}.kind", kind, " or ".join(map(show, kinds)))
     struct = kinds[kind]
-    if struct is signal_tables.SumDisturbance:
+    if struct is disturbance_tables.SumDisturbance:
         return _sum(name, raw, kinds)
     return _fields(name, raw, struct)
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds) -> Table:
     """A table whose `terms` are tables of the other kinds."""
-    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, signal_tables.SumDisturbance)
+    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, disturbance_tables.SumDisturbance)
     terms = raw.get("terms", ())
     if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
-        raise wrong(f"{name}.terms", terms, signal_tables.TERMS)
-    single = {kind: struct for kind, struct in kinds.items() if struct is not signal_tables.SumDisturbance}
+        raise wrong(f"{name}.terms", terms, disturbance_tables.TERMS)
+    single = {kind: struct for kind, struct in kinds.items() if struct is not disturbance_tables.SumDisturbance}
     found = tuple(_table(f"{name}.terms[{k}]", term, single) for k, term in enumerate(terms))
-    return signal_tables.SumDisturbance(terms=found)
+    return disturbance_tables.SumDisturbance(terms=found)
 
 
 def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
@@ -241,10 +234,10 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
 
 def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
     key = f"requirements.{metric}"
-    if metric not in metrics and metric not in layouts.MARGINS:
-        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *layouts.MARGINS))}")
+    if metric not in metrics and metric not in catalogues.MARGINS:
+        raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *catalogues.MARGINS))}")
     if isinstance(value, Mapping):
-        if metric in layouts.MARGINS:
+        if metric in catalogues.MARGINS:
             raise wrong(key, value, "a number greater than 0, which every loop must keep")
         if "limit" not in value:
             raise wrong(key, value, "a number greater than 0 or a table with `limit`")

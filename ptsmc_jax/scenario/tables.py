@@ -4,7 +4,6 @@ A table is a struct whose docstring says what each key means, with its unit; its
 default. Errors, `ptsmc new` and the scenario reference are made from them.
 """
 
-import typing
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
@@ -18,32 +17,9 @@ from ptsmc_jax.scenario.device_tables import (
     SteadyStateFilter,
 )
 from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion
-from ptsmc_jax.scenario.law_tables import (
-    EachFiniteTimeObserver,
-    EachNonlinearObserver,
-    EachPrescribedTimeObserver,
-    FiniteTimeObserver,
-    NonlinearObserver,
-    NoObserver,
-    PrescribedTimeObserver,
-)
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.plant_tables import ChainPlant, Spacecraft, SpacecraftPlant, SystemPlant
-from ptsmc_jax.scenario.signal_tables import (
-    ConstantDisturbance,
-    EachConstant,
-    EachRandomWalk,
-    EachSinusoid,
-    FixedReference,
-    GravityGradient,
-    Initial,
-    NoDisturbance,
-    RandomWalk,
-    SinusoidDisturbance,
-    SinusoidReference,
-    SlewReference,
-    SpinReference,
-    SumDisturbance,
-)
+from ptsmc_jax.scenario.reference_tables import Initial
 from ptsmc_jax.scenario.values import Interval, NotNegative, Positive, Quantile, Table, Truth
 
 
@@ -81,12 +57,10 @@ class Limit(Table, frozen=True):
     confidence: Quantile | None = None
 
 
-Free = Literal[
-    "eta", "delta", "observer_gain", "k1", "sign_width", "surface_rate", "t_f", "filter_bandwidth",
-    "k_p", "k_d", "p", "b", "k", "a1", "b1", "a2", "b2", "gamma", "m", "n",
-]  # fmt: skip
-FREE: tuple[str, ...] = typing.get_args(Free)
-FreeGains = Annotated[tuple[Free, ...], Meta(min_length=1, description=f"a list of some of {', '.join(FREE)}")]
+FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains),
+        "observer_gain", "filter_bandwidth")  # fmt: skip
+FREE_TOLD = f"a list of some of {', '.join(FREE)}"
+FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_TOLD)]
 
 
 class Tune(Table, frozen=True):
@@ -124,28 +98,11 @@ class Scenario(Table, frozen=True, kw_only=True):
     plant: SpacecraftPlant | ChainPlant | SystemPlant
     spacecraft: Spacecraft | None = None
     initial: Initial | None = None
-    reference: FixedReference | SpinReference | SinusoidReference | SlewReference | None = None
-    disturbance: (
-        NoDisturbance
-        | ConstantDisturbance
-        | SinusoidDisturbance
-        | GravityGradient
-        | RandomWalk
-        | SumDisturbance
-        | EachConstant
-        | EachSinusoid
-        | EachRandomWalk
-    )
-    controller: Any  # the table of its kind, see `layouts.TABLES`
-    observer: (
-        NoObserver
-        | NonlinearObserver
-        | EachNonlinearObserver
-        | PrescribedTimeObserver
-        | EachPrescribedTimeObserver
-        | FiniteTimeObserver
-        | EachFiniteTimeObserver
-    )
+    # the tables of their kinds, see `layouts.TABLES`
+    reference: Any = None  # `reference_tables.Reference`
+    disturbance: Any  # `disturbance_tables.Disturbance`, or several
+    controller: Any  # `law_tables.Law`
+    observer: Any  # `observer_tables.Observer`
     loop: Loop
     hardware: Hardware | StateHardware | None = None
     wheels: PyramidWheels | AxesWheels | None = None

@@ -1,6 +1,7 @@
 """What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
 
-from typing import Annotated, Any
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 from msgspec import Meta
@@ -31,5 +32,27 @@ Inertia = Annotated[Any, Meta(description="three principal moments or a symmetri
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 
 
+MOST_STEPS = 200_000  # of a run
+
+
 class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     """A table of a scenario file."""
+
+
+class Kind(Table, frozen=True):
+    """A kind of a table, which may have lists of one number for each input of the plant."""
+
+    each: ClassVar[Mapping[str, float]] = {}  # such lists, and what they hold where they are absent, times `scale`
+
+    def scale(self, scenario: Any) -> float:
+        """What the numbers of `each` are multiplied by."""
+        return 1.0
+
+    def filled(self, scenario: Any, inputs: int) -> Any:
+        """With its lists where they are absent."""
+        scale = self.scale(scenario)
+        absent = {key: (scale * value,) * inputs for key, value in self.each.items() if getattr(self, key) is None}
+        return msgspec.structs.replace(self, **absent)
+
+
+Kinds = Mapping[str, type[Table]]  # of a table by name, the default first

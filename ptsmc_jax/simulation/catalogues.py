@@ -30,3 +30,11 @@ STATE_CATALOGUE = {
     "peak_rate": ("x2", "largest |x_2|"),
 }
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
+
+# margins of the loop, see `margins`: name: (unit, what it is, whether a requirement is the least that is allowed)
+MARGINS = {
+    "gain_margin": ("dB", "factor on the gain, up or down, to the border of stability", True),
+    "phase_margin": ("deg", "phase, either way, to the border of stability", True),
+    "delay_margin": ("s", "further delay to the border of stability", True),
+    "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1", False),
+}

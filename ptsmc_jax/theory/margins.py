@@ -43,11 +43,11 @@ class Margins(NamedTuple):
     crossover: Array  # [rad/s] where the phase margin is
 
     def worst(self) -> dict[str, Array]:
-        """Each of `layouts.MARGINS`, the worst over all axes and loops."""
+        """Each of `catalogues.MARGINS`, the worst over all axes and loops."""
         return {name: (jnp.max if name == "modulus_margin" else jnp.min)(v) for name, v in self.each().items()}
 
     def each(self) -> dict[str, Array]:
-        """Each of `layouts.MARGINS` by axis: the nearer of both gains, of an unstable loop's sensitivity `MOST`."""
+        """Each of `catalogues.MARGINS` by axis: the nearer of both gains, of an unstable loop's sensitivity `MOST`."""
         return {
             "gain_margin": jnp.minimum(self.gain_up, self.gain_down),
             "phase_margin": self.phase,
@@ -248,7 +248,7 @@ class Course(NamedTuple):
         return jax.tree.map(lambda v: v[:-1], self.at_input)
 
     def worst(self) -> dict[str, float]:
-        """Each of `layouts.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
+        """`catalogues.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
         kept = jax.tree.map(lambda v: v[self.judged], self.at_input)
         return {name: float(v) for name, v in kept.worst().items()}
 

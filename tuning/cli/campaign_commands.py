@@ -88,9 +88,9 @@ def montecarlo(
     if (bits, device) != (64, "cpu") and cluster is not None:
         raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
-    from ptsmc_jax.scenario import layouts
+    from ptsmc_jax.simulation import catalogues
 
-    if width is not None and set(loaded.requirements) <= set(layouts.MARGINS):
+    if width is not None and set(loaded.requirements) <= set(catalogues.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning.studies import campaign_folder
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from ptsmc_jax.scenario import attitude_keys, schema
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.signal_tables import ATTITUDE_KEYS, Initial
+from ptsmc_jax.scenario.reference_tables import Initial
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.errors import UsageError
 

@@ -8,10 +8,10 @@ import msgspec
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, schema
-from ptsmc_jax.scenario.law_tables import Prescribed
-from ptsmc_jax.scenario.signal_tables import Attitude
+from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.observer_tables import PrescribedTimeObserver
 from ptsmc_jax.scenario.tables import Scenario, Tune
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Kind, Table
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
@@ -75,7 +75,7 @@ class _File:
     def table(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
         """A table as it is, and below it what its other kinds have."""
         live, values = self.live.get(name), self.values.get(name, {})
-        kinds = table if isinstance(table, dict) else {}
+        kinds = table if isinstance(table, Mapping) else {}
         kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
         struct = table if isinstance(table, type) else kinds[kind]
         if kind is None:
@@ -122,8 +122,8 @@ class _File:
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
             f"The metrics are {', '.join(catalogue)}. "
-            f"Of the sampled loop also {', '.join(layouts.MARGINS)}: the least allowed, but for the last, which is the "
-            "largest sensitivity."
+            f"Of the sampled loop also {', '.join(catalogues.MARGINS)}: the least allowed, but for the last, which is "
+            "the largest sensitivity."
         )
         yield f"{'#' if live is None else ''}[requirements]"
         for name, limit in (live or REQUIREMENTS).items():
@@ -133,10 +133,10 @@ class _File:
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """What the keys of a table of this kind are where they are absent, as far as they are anything."""
         table: Any = struct()
-        if name in ("observer", "disturbance"):
-            table = checks.filled(name, table, self.resolved)
-        if isinstance(table, Prescribed):
-            t_o, delta_o = checks.prescribed_times(self.resolved, table)
+        if isinstance(table, Kind):
+            table = table.filled(self.resolved, checks.inputs(self.resolved))
+        if isinstance(table, PrescribedTimeObserver):
+            t_o, delta_o = table.times(self.resolved)
             table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
         return {key: value for key, value in schema.plain(table).items() if value not in ([], {})}
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ptsmc_jax.scenario.layouts import MARGINS
+from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.cells import Summary, Table
 
 ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks

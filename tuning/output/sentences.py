@@ -54,8 +54,7 @@ def run_lines(summary: Summary) -> list[str]:
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
-    from ptsmc_jax.scenario.layouts import MARGINS
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
+    from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 
     units = {**CATALOGUES[kind], **MARGINS}
     return [
@@ -68,16 +67,17 @@ def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
 def tuning(summary: Summary) -> Table:
     """Gains and what they do, beside the paper's and those before."""
     from ptsmc_jax.simulation.catalogues import CATALOGUES
-    from tuning.search.gains import UNITS, base
+    from tuning.search.gains import base, units
 
     groups = {"paper": summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     rows: list[tuple[str, ...]] = []
     kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
+    known = units(kind)
     for gain in dict.fromkeys(name for group in groups.values() for name in group["gains"]):
         cells = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
         if len(set(cells)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):
-            rows.append((gain, *("-" if v is None else f"{v:.6g}" for v in cells), UNITS[kind][base(gain)]))
+            rows.append((gain, *("-" if v is None else f"{v:.6g}" for v in cells), known[base(gain)]))
     trials = summary["fresh"]["trials"]
     for label, metric, statistic in (
         ("RMS window error", "window_error", "rms"),

@@ -14,45 +14,31 @@ from jaxtyping import Array
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
-from ptsmc_jax.scenario import law_tables, plant_tables
+from ptsmc_jax.scenario import keys, plant_tables
+from ptsmc_jax.scenario.device_tables import SteadyStateFilter
+from ptsmc_jax.scenario.law_tables import LAWS, Baseline
+from ptsmc_jax.scenario.observer_tables import OBSERVERS, NonlinearObserver
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.clock import Anchored
 from ptsmc_jax.simulation.rollout import Parts
 
-_STATE_UNITS = {
-    "eta": "-",
-    "delta": "s",
-    "observer_gain": "1/s",
-    "k1": "1/s",
-    "sign_width": "x1",
-    "surface_rate": "1/s",
-    "t_f": "s",
-}
-# gain: unit, by the kind of the plant
-UNITS = {
-    "spacecraft": {
-        "eta": "-",
-        "delta": "s",
-        "observer_gain": "N m s",
-        "k1": "1/s",
-        "sign_width": "-",
-        "surface_rate": "1/s",
-        "t_f": "s",
-        "filter_bandwidth": "rad/s",
-        "k_p": "1/s^2",
-        "k_d": "1/s",
-        "b": "1/s^p",
-        "k": "1/s^2",
-        "a1": "1/s",
-        "b1": "1/s",
-        "a2": "1/s^(2-p)",
-        "b2": "1/s^(2-p)",
-        **dict.fromkeys(("p", "gamma", "m", "n"), "-"),
-    },
-    "chain": {**_STATE_UNITS, "sign_width": "s"},
-    "system": _STATE_UNITS,
-}
 _AXIS = "observer_gain_"
+
+
+def units(plant: str) -> dict[str, str]:
+    """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
+    named: list[tuple[type[Table], dict[str, str]]] = [
+        *((law, {name: name for name in law.gains}) for law in LAWS[plant].values()),
+        *((observer, {"gain": "observer_gain"}) for observer in OBSERVERS[plant].values()),
+        (SteadyStateFilter, {"bandwidth": "filter_bandwidth"}),
+    ]
+    found: dict[str, str] = {}
+    for table, gains in named:
+        for key in keys.of(table):
+            if key.name in gains:
+                found.setdefault(gains[key.name], key.unit or "-")
+    return found
 
 
 def base(name: str) -> str:
@@ -158,15 +144,14 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
     if isinstance(scenario.plant, plant_tables.ChainPlant):
         gains["eta"] = scenario.plant.order + 1.0
-    papers = isinstance(scenario.observer, law_tables.NonlinearObserver | law_tables.EachNonlinearObserver)
-    return {**gains, "observer_gain": 10.0} if papers else gains
+    return {**gains, "observer_gain": 10.0} if isinstance(scenario.observer, NonlinearObserver) else gains
 
 
 def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
-    if isinstance(table, law_tables.Baseline):
-        kept = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
+    if not table.prescribed:
+        kept = {key: getattr(table, key) for key in Baseline.__struct_fields__}
         law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)

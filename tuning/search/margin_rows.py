@@ -16,8 +16,8 @@ from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario import Study
-from ptsmc_jax.scenario.layouts import MARGINS
 from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import over
 from ptsmc_jax.theory import margins
 from tuning.search import gains as gain_names

@@ -13,8 +13,9 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import errors, law_tables, plant_tables, replace, schema, study, tables
+from ptsmc_jax.scenario import errors, plant_tables, replace, schema, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import LAWS, Baseline
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -23,7 +24,6 @@ from tuning.search.journal import Journal
 from tuning.search.starts import Report
 from tuning.studies import tuner
 
-BASELINES = ("pd", "terminal", "fixed_time")
 OURS = "prescribed_time"
 KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
 
@@ -74,20 +74,26 @@ def check(scenario: Scenario) -> None:
         raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws fly there')
 
 
+def laws() -> list[str]:
+    """The kinds of laws that are compared, the paper's first."""
+    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if not law.prescribed)]
+
+
 def contenders(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
     assert scenario.tune is not None
     table, tune = scenario.controller, scenario.tune
-    common = {key: getattr(table, key) for key in law_tables.Baseline.__struct_fields__}
+    common = {key: getattr(table, key) for key in Baseline.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     found = {}
-    for kind in (OURS, *BASELINES):
+    for kind in laws():
         if scenario.controller.kind == kind:
             found[kind] = scenario
         elif kind == OURS:
             found[kind] = _posed(gains.papers(scenario), tune, same)
         else:
-            width = {"sign_width": table.sign_width} if kind != "pd" and hasattr(table, "sign_width") else {}
+            kept = ("sign_width",) if "sign_width" in LAWS["spacecraft"][kind].__struct_fields__ else ()
+            width = {key: getattr(table, key) for key in kept if hasattr(table, key)}
             other = replace(scenario, tune=None, controller={"kind": kind, **common, **width})
             found[kind] = _posed(other, tune, same)
     return found

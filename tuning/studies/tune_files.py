@@ -167,7 +167,8 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Figures of a tuning run by name."""
     assert scenario.tune is not None
     kind, names = scenario.plant.kind, gain_names.named(scenario)
-    units = [gain_names.UNITS[kind][gain_names.base(name)] for name in names]
+    known = gain_names.units(kind)
+    units = [known[gain_names.base(name)] for name in names]
     paths = _paths(tuning.search.history)
     longest = max(map(len, paths))
 

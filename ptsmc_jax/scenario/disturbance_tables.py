@@ -1,0 +1,232 @@
+"""The disturbances of a scenario file: each a table with its keys, its pace, and what it is made into.
+
+A disturbance is its physics in `signals.disturbances`, a table here, and a row in `DISTURBANCES`.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from ptsmc_jax.scenario import attitude_keys
+from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.errors import ScenarioError, brief
+from ptsmc_jax.scenario.values import (
+    Each,
+    EachNotNegative,
+    Kind,
+    Kinds,
+    Number,
+    Positive,
+    Three,
+    ThreeNotNegative,
+)
+
+
+class Disturbance(Kind, frozen=True):
+    """A disturbance, alone or one of several."""
+
+    sampled_only: ClassVar[bool] = False
+
+    def quickest(self) -> float:
+        """How fast it changes [rad/s]."""
+        return 0.0
+
+    def impulse(self, end: float) -> float:
+        """What it adds up to at most until `end` [s], in N m s; nothing of what stays small however long it acts."""
+        return 0.0
+
+    def check(self, name: str) -> None:
+        """Raise ScenarioError where its keys contradict each other; name: of its table."""
+
+    def build(self, inertia: Any) -> Any:
+        """What acts, a part of `signals.disturbances`; None: nothing. inertia: the true body's; None without one."""
+
+    def walk(self, period: float) -> Any:
+        """1 sigma a second of its random walk, a number for each input; None: none."""
+
+
+class NoDisturbance(Disturbance, frozen=True):
+    """Nothing disturbs."""
+
+    kind: Literal["none"] = "none"
+
+
+class ConstantDisturbance(Disturbance, frozen=True):
+    """A constant torque.
+
+    Attributes:
+        amplitude: the torque, per body axis [N m]
+    """
+
+    kind: Literal["constant"] = "constant"
+    amplitude: Three = (0.01, 0.01, 0.01)
+
+    def impulse(self, end: float) -> float:
+        """All of it."""
+        return float(np.linalg.norm(np.abs(self.amplitude) * end))
+
+    def build(self, inertia: Any) -> Any:
+        """`disturbances.Constant`."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.signals.disturbances import Constant
+
+        return Constant(vector(self.amplitude))
+
+
+class SinusoidDisturbance(Disturbance, frozen=True):
+    """The torque bias + amplitude sin(frequency t + phase), axis by axis.
+
+    Attributes:
+        amplitude: per body axis [N m]
+        frequency: per axis [rad/s]
+        phase: per axis [rad]
+        bias: constant part, per axis [N m]
+    """
+
+    kind: Literal["sinusoid"] = "sinusoid"
+    amplitude: Three = (0.01, 0.01, 0.01)
+    frequency: Three = (0.1, 0.1, 0.1)
+    phase: Three = (0.0, 0.0, 0.0)
+    bias: Three = (0.0, 0.0, 0.0)
+
+    def quickest(self) -> float:
+        """Its fastest axis."""
+        return float(np.max(np.abs(self.frequency)))
+
+    def impulse(self, end: float) -> float:
+        """Half a period at most, and the constant part."""
+        lasting = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
+        return float(np.linalg.norm(np.abs(self.amplitude) * lasting) + np.linalg.norm(self.bias) * end)
+
+    def build(self, inertia: Any) -> Any:
+        """`disturbances.Sinusoid`."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.signals.disturbances import Sinusoid
+
+        return Sinusoid(*(vector(value) for value in (self.amplitude, self.frequency, self.phase, self.bias)))
+
+
+class GravityGradient(Attitude, Disturbance, frozen=True):
+    """The gravity gradient of a circular orbit, on the body that flies; the attitude key is that of the orbit's frame.
+
+    The frame's z is along the orbit's normal, its x points to where the phase counts from.
+
+    Attributes:
+        orbit_rate: mean motion [rad/s]
+        phase: where on the orbit the run starts [rad]
+    """
+
+    kind: Literal["gravity_gradient"] = "gravity_gradient"
+    orbit_rate: Positive = 1.1e-3
+    phase: Number = 0.0
+
+    def check(self, name: str) -> None:
+        """One attitude at most."""
+        attitude_keys.at_most_one(name, self)
+        if attitude_keys.has_attitude(self):
+            attitude_keys.quaternion(self, name)
+        elif self.sequence is not None:
+            raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
+
+    def build(self, inertia: Any) -> Any:
+        """`disturbances.GravityGradient`; the orbit's frame is the inertial one where no attitude is given."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.signals import disturbances
+
+        turned = attitude_keys.has_attitude(self)
+        orbit = attitude_keys.quaternion(self, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
+        return disturbances.GravityGradient(inertia, *(vector(value) for value in (orbit, self.orbit_rate, self.phase)))
+
+
+class RandomWalk(Disturbance, frozen=True):
+    """A torque that wanders from zero, a new step each period; sampled loop only.
+
+    Attributes:
+        density: of the walk's white noise, per axis [N m/sqrt(s)]
+    """
+
+    kind: Literal["random_walk"] = "random_walk"
+    density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
+    sampled_only: ClassVar[bool] = True
+
+    def walk(self, period: float) -> Any:
+        """Steps of white noise, held over a period."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return vector(self.density) / np.sqrt(period)
+
+
+TERMS = 'a list of tables such as [{ kind = "constant" }]'
+
+
+class SumDisturbance(Kind, frozen=True):
+    """Several disturbances at once.
+
+    Attributes:
+        terms: the disturbances, each an inline table with a kind of its own; needed
+    """
+
+    kind: Literal["sum"] = "sum"
+    terms: Annotated[tuple[Any, ...], Meta(description=TERMS)] = ()
+
+
+class EachRandomWalk(RandomWalk, frozen=True):
+    """A disturbance that wanders from zero, a new step each period; sampled loop only.
+
+    Attributes:
+        density: of the walk's white noise, one number for each input; default: 1e-4 each [unit of d/sqrt(s)]
+    """
+
+    density: EachNotNegative | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    each: ClassVar[Mapping[str, float]] = {"density": 1e-4}
+
+
+class EachConstant(ConstantDisturbance, frozen=True):
+    """A constant disturbance.
+
+    Attributes:
+        amplitude: one number for each input; default: 0.01 each [unit of d]
+    """
+
+    amplitude: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    each: ClassVar[Mapping[str, float]] = {"amplitude": 0.01}
+
+
+class EachSinusoid(SinusoidDisturbance, frozen=True):
+    """The disturbance bias + amplitude sin(frequency t + phase), input by input.
+
+    Attributes:
+        amplitude: one number for each input; default: 0.01 each [unit of d]
+        frequency: one for each; default: 1 each [rad/s]
+        phase: one for each; default: 0 each [rad]
+        bias: constant part, one for each; default: 0 each [unit of d]
+    """
+
+    amplitude: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    frequency: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    phase: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    bias: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    each: ClassVar[Mapping[str, float]] = {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0}
+
+
+_EACH: Kinds = {
+    "sinusoid": EachSinusoid,
+    "constant": EachConstant,
+    "random_walk": EachRandomWalk,
+    "sum": SumDisturbance,
+}
+# by the kind of the plant and the kind of the disturbance, the default first
+DISTURBANCES: dict[str, Mapping[str, type[Kind]]] = {
+    "spacecraft": {
+        "sinusoid": SinusoidDisturbance,
+        "none": NoDisturbance,
+        "constant": ConstantDisturbance,
+        "gravity_gradient": GravityGradient,
+        "random_walk": RandomWalk,
+        "sum": SumDisturbance,
+    },
+    "chain": {"sinusoid": EachSinusoid, "none": NoDisturbance, **_EACH},
+    "system": {"none": NoDisturbance, **_EACH},
+}

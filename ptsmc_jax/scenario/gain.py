@@ -1,0 +1,156 @@
+"""A gain that tuning may move: its usual bounds, how far they may be set, and what lies beyond them.
+
+Each law and observer names its gains beside its keys; here are the record, and those that several laws have.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ptsmc_jax.scenario import scales
+from ptsmc_jax.scenario.values import MOST_STEPS
+
+Interval = tuple[float, float]
+
+
+class Choice(NamedTuple):
+    """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
+
+    scenario: Any
+    free: tuple[str, ...]
+    bounds: Mapping[str, Interval]
+
+    @property
+    def law(self) -> Any:
+        """Its table."""
+        return self.scenario.controller
+
+    @property
+    def t_f(self) -> float:
+        """The scenario's own [s]."""
+        return self.law.t_f
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the loop is."""
+        return self.scenario.loop.mode == "sampled"
+
+    @property
+    def shortest(self) -> float:
+        """The shortest delta [s]: a period, if there is one."""
+        return self.scenario.loop.period if self.sampled else 0.0
+
+    def least(self, name: str) -> float:
+        """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
+        return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
+
+
+def _positive(_: Choice) -> tuple[float, float, bool]:
+    return 0.0, math.inf, False
+
+
+class Gain(NamedTuple):
+    """Its bounds by a choice: the usual ones; lowest and highest that may be set, and whether the lowest itself may."""
+
+    usual: Callable[[Choice], Interval]
+    allowed: Callable[[Choice], tuple[float, float, bool]] = _positive
+    below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
+    above: str | None = None
+
+
+def between(least: float, most: float) -> Callable[[Choice], tuple[float, float, bool]]:
+    """Bounds that lie between two numbers."""
+    return lambda _: (least, most, False)
+
+
+def rounded(bound: float) -> float:
+    """To four digits."""
+    return float(f"{bound:.4g}")
+
+
+def hand_over(scenario: Any) -> float:
+    """How long before t_f the law hands over [s]; a period for a law that does not."""
+    return getattr(scenario.controller, "delta", scenario.loop.period)
+
+
+def size(scenario: Any) -> float:
+    """A body's mean moment of inertia, as a share of the paper's 12 kg m^2; 1 without a body."""
+    if scenario.spacecraft is None:
+        return 1.0
+    moments = np.asarray(scenario.spacecraft.inertia)
+    return float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
+
+
+def _converged(scenario: Any) -> float:
+    """Prescribed time of the observer [s], which t_f must not fall below."""
+    return getattr(scenario.observer, "t_o", None) or 0.0
+
+
+def _usual_t_f(choice: Choice) -> Interval:
+    shortest = 4.0 * choice.shortest if "delta" in choice.free else hand_over(choice.scenario)
+    return max(0.5 * choice.t_f, 1.05 * shortest, 1.05 * _converged(choice.scenario)), 2.0 * choice.t_f
+
+
+def _allowed_t_f(choice: Choice) -> tuple[float, float, bool]:
+    loop, shortest = choice.scenario.loop, choice.shortest
+    least = max(shortest if "delta" in choice.free else hand_over(choice.scenario), _converged(choice.scenario))
+    hold = loop.t_end - choice.t_f
+    return least, MOST_STEPS * loop.period - hold if choice.sampled else math.inf, False
+
+
+def _usual_delta(choice: Choice) -> Interval:
+    t_f = choice.least("t_f")  # below every one
+    lower = choice.shortest or min(0.05, t_f / 4)
+    return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
+
+
+def _usual_width(choice: Choice) -> Interval:
+    low, high = scales.widths(choice.scenario) if choice.sampled else scales.QUIET
+    return rounded(low), rounded(high)
+
+
+def _usual_k1(choice: Choice) -> Interval:
+    least = 3.5 / choice.t_f
+    border = scales.largest_k1(choice.scenario) if choice.sampled else 0.0
+    return least, rounded(border) if border > least else 350.0 / choice.t_f
+
+
+def _usual_rate(choice: Choice) -> Interval:
+    """Two decades; sampled, the frozen loop is stable for (c + K1/2) h < 2: to half of that."""
+    high = 700.0 / choice.t_f
+    high = min(high, 1.0 / choice.scenario.loop.period) if choice.sampled else high
+    return 0.01 * high, high
+
+
+T_F = Gain(_usual_t_f, _allowed_t_f)
+DELTA = Gain(
+    _usual_delta,
+    lambda choice: (choice.shortest, choice.least("t_f"), choice.shortest > 0.0),
+    below="one period, the shortest hand-over that there is",
+)
+SIGN_WIDTH = Gain(
+    _usual_width,
+    below="a narrower one is lost in the noise, or hops from side to side",
+    above="so wide that hardly a switching term is left",
+)
+K1 = Gain(_usual_k1, above="the stability border of the sampled loop")
+SURFACE_RATE = Gain(_usual_rate)
+
+
+def eta(order: Callable[[Any], float]) -> Gain:
+    """The power of the approach, which must exceed a number that the scenario tells: 2, or the order of a chain."""
+
+    def usual(choice: Choice) -> Interval:
+        least = order(choice.scenario)
+        return least + 0.05, least + 6.0
+
+    return Gain(usual, lambda choice: (order(choice.scenario), math.inf, False))
+
+
+def dead_beat(choice: Choice) -> Interval:
+    """An observer's gain, up to that of a dead-beat one."""
+    share = size(choice.scenario)
+    high = rounded(scales.dead_beat_gain(choice.scenario)) if choice.sampled else 300.0 * share
+    return 0.5 * share, high

@@ -1,0 +1,207 @@
+"""The observers of a scenario file: each a table with its keys, its gain, what it is refused for, what it is made into.
+
+An observer is its physics in a file of `observers`, a table here, and a row in `OBSERVERS`.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import Meta
+
+from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.gain import Choice, Gain, dead_beat
+from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
+
+
+class Observer(Kind, frozen=True):
+    """An observer, whatever it is for."""
+
+    gains: ClassVar[Mapping[str, Gain]] = {}  # "observer_gain", where it has one
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """The observer of a plant's model."""
+        raise NotImplementedError
+
+    def _common(self, scenario: Any, model: Any) -> tuple[Any, Any, Any, Any]:
+        """The model, the gain, and the bounds of Assumption 1."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        law, own = scenario.controller, self.gain  # pyright: ignore[reportAttributeAccessIssue]
+        return model, vector(own), vector(law.disturbance_rate_bound), vector(law.initial_estimate_error)
+
+
+class NoObserver(Observer, frozen=True):
+    """None: d_hat = 0, and K switches against the whole disturbance."""
+
+    kind: Literal["none"] = "none"
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """`observers.none`."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.observers.none import NoObserver as Physics
+
+        return Physics(model, vector(scenario.controller.disturbance_bound))
+
+
+_DEAD_BEAT = {
+    "observer_gain": Gain(dead_beat, above="a dead-beat observer: nothing of its error is left after a period")
+}
+
+
+class NonlinearObserver(Observer, frozen=True):
+    """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
+
+    Attributes:
+        gain: diagonal of l(w) [N m s]
+    """
+
+    kind: Literal["nonlinear"] = "nonlinear"
+    gain: ThreePositive = (10.0, 10.0, 10.0)
+    gains: ClassVar[Mapping[str, Gain]] = _DEAD_BEAT
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """`observers.nonlinear`."""
+        from ptsmc_jax.observers.nonlinear import NonlinearObserver as Physics
+
+        return Physics(*self._common(scenario, model))
+
+
+class EachNonlinearObserver(NonlinearObserver, frozen=True):
+    """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
+
+    Attributes:
+        gain: one number for each input; default: 10 each [1/s]
+    """
+
+    gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    each: ClassVar[Mapping[str, float]] = {"gain": 10.0}
+
+
+class PrescribedTimeObserver(Observer, frozen=True):
+    """An observer that has converged by t_o, the nonlinear one from then on.
+
+    Attributes:
+        mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
+        t_o: time by which it has converged; default: a third of t_f [s]
+        delta_o: mu/(t_o - t) is off from so long before t_o; default: 0.05, or a period, at most t_o/4 [s]
+        gain: diagonal of the constant part of l [N m s]
+    """
+
+    kind: Literal["prescribed_time"] = "prescribed_time"
+    mu: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
+    t_o: Positive | None = None
+    delta_o: Positive | None = None
+    gain: ThreePositive = (10.0, 10.0, 10.0)
+    gains: ClassVar[Mapping[str, Gain]] = _DEAD_BEAT
+
+    def times(self, scenario: Any) -> tuple[float, float]:
+        """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
+        loop = scenario.loop
+        t_o = scenario.controller.t_f / 3 if self.t_o is None else self.t_o
+        shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
+        return t_o, min(shortest, t_o / 4) if self.delta_o is None else self.delta_o
+
+    def check(self, scenario: Any) -> None:
+        """It has converged before t_f."""
+        t_o, delta_o = self.times(scenario)
+        if t_o > scenario.controller.t_f:
+            raise wrong("observer.t_o", t_o, f"at most controller.t_f, {scenario.controller.t_f}")
+        if delta_o >= t_o:
+            raise wrong("observer.delta_o", delta_o, f"less than observer.t_o, {t_o}")
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """`observers.prescribed_time`."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver as Physics
+
+        times = (vector(value) for value in (self.mu, *self.times(scenario)))
+        return Physics(*self._common(scenario, model), *times)
+
+
+class EachPrescribedTimeObserver(PrescribedTimeObserver, frozen=True):
+    """An observer that has converged by t_o, the nonlinear one from then on.
+
+    Attributes:
+        gain: constant part, one number for each input; default: 10 each [1/s]
+    """
+
+    gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    each: ClassVar[Mapping[str, float]] = {"gain": 10.0}
+
+
+def _usual_bound(choice: Choice) -> tuple[float, float]:
+    """A bound on the disturbance's rate."""
+    own = choice.scenario.observer.gain
+    return max(choice.law.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
+
+
+def _allowed_bound(choice: Choice) -> tuple[float, float, bool]:
+    least = choice.law.disturbance_rate_bound
+    return least, math.inf, least > 0.0
+
+
+class FiniteTimeObserver(Observer, frozen=True):
+    """A super-twisting observer, exact after a finite time (Levant 1998).
+
+    Attributes:
+        gain: per axis, at least controller.disturbance_rate_bound; default: 20 times that [N m/s]
+        sign_width: of its smooth sign, in the continuous loop [N m s]
+    """
+
+    kind: Literal["finite_time"] = "finite_time"
+    gain: ThreePositive | None = None
+    sign_width: NotNegative = 1e-5
+    gains: ClassVar[Mapping[str, Gain]] = {"observer_gain": Gain(_usual_bound, _allowed_bound)}
+
+    each: ClassVar[Mapping[str, float]] = {"gain": 20.0}
+
+    def scale(self, scenario: Any) -> float:
+        """The bound on the disturbance's rate."""
+        return scenario.controller.disturbance_rate_bound or 1e-3
+
+    def check(self, scenario: Any) -> None:
+        """Its gain is a bound on the disturbance's rate."""
+        assert self.gain is not None  # `filled`
+        least = scenario.controller.disturbance_rate_bound
+        if min(self.gain) < least or min(self.gain) <= 0.0:
+            raise wrong("observer.gain", self.gain, f"at least controller.disturbance_rate_bound, {least}, each")
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """`observers.finite_time`."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.observers.finite_time import FiniteTimeObserver as Physics
+
+        return Physics(*self._common(scenario, model), vector(self.sign_width))
+
+
+class EachFiniteTimeObserver(FiniteTimeObserver, frozen=True):
+    """A super-twisting observer, exact after a finite time (Levant 1998).
+
+    Attributes:
+        gain: one for each input, at least controller.disturbance_rate_bound; default: 20 times that [unit of d/s]
+        sign_width: of its smooth sign, in the continuous loop
+    """
+
+    gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+_EACH: Kinds = {
+    "nonlinear": EachNonlinearObserver,
+    "finite_time": EachFiniteTimeObserver,
+    "prescribed_time": EachPrescribedTimeObserver,
+}
+# by the kind of the plant and the kind of the observer, the default first
+OBSERVERS: dict[str, Mapping[str, type[Observer]]] = {
+    "spacecraft": {
+        "nonlinear": NonlinearObserver,
+        "none": NoObserver,
+        "finite_time": FiniteTimeObserver,
+        "prescribed_time": PrescribedTimeObserver,
+    },
+    "chain": {"none": NoObserver, **_EACH},
+    "system": {"none": NoObserver, **_EACH},
+}
