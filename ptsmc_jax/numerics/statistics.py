@@ -1,5 +1,6 @@
 """Statistics of a campaign: shares and quantiles with intervals, and which inputs drive a metric."""
 
+import bisect
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,14 +16,12 @@ def share_interval(successes: int, trials: int, confidence: float) -> tuple[floa
     >>> f"{low:.4f} {high:.4f}"
     '0.9913 0.9994'
     """
-    outside = (1.0 - confidence) / 2.0
-    low = stats.beta.ppf(outside, successes, trials - successes + 1) if successes > 0 else 0.0
-    high = stats.beta.ppf(1.0 - outside, successes + 1, trials - successes) if successes < trials else 1.0
-    return float(low), float(high)
+    each = (1.0 + confidence) / 2.0
+    return share_bound(successes, trials, each), 1.0 - share_bound(trials - successes, trials, each)
 
 
 def share_bound(successes: int, trials: int, confidence: float) -> float:
-    """One-sided lower bound of a share: Clopper and Pearson."""
+    """One-sided lower bound of a share, beta(1 - confidence; k, trials - k + 1): Clopper and Pearson."""
     return float(stats.beta.ppf(1.0 - confidence, successes, trials - successes + 1)) if successes > 0 else 0.0
 
 
@@ -82,16 +81,14 @@ def fewest_for(failures: int, quantile: float, confidence: float) -> int:
     >>> [fewest_for(failures, quantile=0.9973, confidence=0.9) for failures in (0, 1, 2)]
     [852, 1440, 1970]
     """
-    low, high = failures + 1, failures + 1
-    while share_bound(high - failures, high, confidence) < quantile:
-        high *= 2
-    while low < high:
-        middle = (low + high) // 2
-        if share_bound(middle - failures, middle, confidence) >= quantile:
-            high = middle
-        else:
-            low = middle + 1
-    return high
+
+    def shown(trials: int) -> bool:
+        return share_bound(trials - failures, trials, confidence) >= quantile
+
+    enough = failures + 1
+    while not shown(enough):
+        enough *= 2
+    return failures + 1 + bisect.bisect_left(range(failures + 1, enough), True, key=shown)
 
 
 def most_extreme(values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 On metrics of what is flown, and on margins of its loop, most of which are to be at least so large.
 """
 
+import bisect
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +16,8 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 def least_within(trials: int, quantile: float | None, confidence: float | None) -> int | None:
     """How many of so many trials must keep a limit; None: so few trials cannot show it.
 
-    All of them where no quantile is asked for; with a confidence, the least k for which the one-sided lower bound of
-    Clopper and Pearson (Biometrika 26, 1934) on the share of all trials, beta(1 - confidence; k, trials - k + 1),
-    reaches the quantile.
+    All of them where no quantile is asked for; with a confidence, the least number with which the one-sided lower bound
+    on the share of all trials, `statistics.share_bound`, reaches the quantile.
     """
     if quantile is None:
         return trials
@@ -25,12 +25,13 @@ def least_within(trials: int, quantile: float | None, confidence: float | None) 
         return max(1, math.ceil(quantile * trials - 1e-9))
     if trials < fewest_trials(quantile, confidence):
         return None
-    from scipy.stats import beta  # takes a while to import, which most runs need not wait for
+    from ptsmc_jax.numerics.statistics import share_bound  # SciPy's take a while to import, which few runs wait for
 
-    within = np.arange(1, trials + 1)
-    reached = beta.ppf(1.0 - confidence, within, trials - within + 1) >= quantile
-    reached[-1] = True  # whatever rounding says: there are as many as it takes
-    return int(within[np.argmax(reached)])
+    def shown(within: int) -> bool:
+        return share_bound(within, trials, confidence) >= quantile
+
+    # the bound rises with the count; all of them show it, whatever rounding says: there are as many as it takes
+    return 1 + bisect.bisect_left(range(1, trials), True, key=shown)
 
 
 def fewest_trials(quantile: float, confidence: float) -> int:

@@ -165,15 +165,10 @@ def figures_of(one: Contender) -> dict[str, Any]:
         "unsettled": int(trials.status.size - known.size),
         "settling_time": {str(q): _quantile(late, q) for q in (0.01, 0.5, 0.99)},
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
-        "settling_by_angle": _rank_correlation(angle[settled], known) if spread else None,
+        "settling_by_angle": float(stats.spearmanr(angle[settled], known).statistic) if spread else None,
         "settling_near_far": _near_far(angle, late) if spread else None,
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
     }
-
-
-def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
-    """Spearman's."""
-    return float(np.corrcoef(stats.rankdata(x), stats.rankdata(y))[0, 1])
 
 
 def _quantile(late: np.ndarray, q: float) -> float | None:
