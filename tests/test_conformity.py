@@ -1,6 +1,7 @@
 """Every part in short runs: lanes = vmap = loop, compiled or not, shapes kept, slopes finite at the awkward points.
 
-Each row is a scenario; together they hold every part that a scenario or Python can name. A new part joins a row here.
+Each row is a scenario; together they hold every part that a scenario or Python can name. A new law has a row by itself,
+another new part joins one here.
 """
 
 from dataclasses import replace
@@ -16,6 +17,10 @@ from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.plants import integrator_chain, rigid_body
+from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
+from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.reference_tables import REFERENCES
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from tests.helpers import FULL_INERTIA, ROOT, short
@@ -29,6 +34,11 @@ SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 60.0}}
 NOISE = {"attitude_noise": 2e-4, "rate_noise": 1e-5}
 
+QUICK = {  # gains that reach the goal in so short a run; others fly with their defaults
+    "pd": {"k_p": 2.0, "k_d": 2.5},
+    "terminal": {"p": 1.3, "b": 1.0, "k": 1.0},
+    "fixed_time": {"a1": 0.5, "b1": 0.8},
+}
 ROWS: dict[str, dict] = {
     "continuous": {"controller": SLEW, "loop": SHORT, "dispersion": SPREAD},
     "continuous, spin, no observer": {
@@ -92,17 +102,14 @@ ROWS: dict[str, dict] = {
     **{
         f"baseline {kind}": {
             "spacecraft": {"inertia": FULL_INERTIA},
-            "controller": {"kind": kind, "t_f": 6.0, **gains},
+            "controller": {"kind": kind, "t_f": 6.0, **QUICK.get(kind, {})},
             "reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]},
             "loop": SAMPLED,
             "hardware": NOISE,
             "dispersion": SPREAD,
         }
-        for kind, gains in {
-            "pd": {"k_p": 2.0, "k_d": 2.5},
-            "terminal": {"p": 1.3, "b": 1.0, "k": 1.0},
-            "fixed_time": {"a1": 0.5, "b1": 0.8},
-        }.items()
+        for kind, law in LAWS["spacecraft"].items()
+        if not law.prescribed
     },
     "system": {
         "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
@@ -160,6 +167,21 @@ IN_FULL = KINDS[-1:]  # with slopes, and in a loop
 CASES = [pytest.param(name, name in IN_FULL, id=name) for name in KINDS] + [
     pytest.param(name, True, id=f"{name}, in full", marks=pytest.mark.long) for name in ROWS if name not in IN_FULL
 ]
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("controller", LAWS["spacecraft"]),
+        ("observer", OBSERVERS["spacecraft"]),
+        ("reference", REFERENCES),
+        ("disturbance", DISTURBANCES["spacecraft"]),
+    ],
+)
+def test_every_kind_has_a_row(name, known):
+    asked = [row.get(name, {}) for row in ROWS.values()]
+    asked += [term for table in asked for term in table.get("terms", ())]
+    assert {table.get("kind", next(iter(known))) for table in asked} >= set(known) - {"none"}
 
 
 @partial(jax.jit, static_argnames=("vmap", "sloped"))
