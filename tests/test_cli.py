@@ -13,7 +13,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs, store
-from ptsmc_jax.scenario import pace
+from ptsmc_jax.scenario import timing
 from ptsmc_jax.simulation import catalogues
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
@@ -592,7 +592,7 @@ done
 def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, monkeypatch):
     run = ("simulate", "s.toml", "--no-figures", "--force")
     parts = scenario.study(scenario.read("s.toml")).parts
-    steps = pace.steps(parts)
+    steps = timing.steps(parts)
     assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
     assert "integration steps" not in command(*run)[1]
     monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)

@@ -10,7 +10,7 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement, least_within
 from tests import helpers
 from tests.test_tuning import SPREAD, problem
-from tuning.search import bounds, confirm, gains, objective, optimise
+from tuning.search import confirm, gains, objective, optimise, shares
 from tuning.search.evaluate import Evaluator
 
 SHOWN = Requirement("window_error", 1e-4, None, 0.99, 0.95)
@@ -50,7 +50,7 @@ def test_too_few_trials_are_never_sure():
 def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch):
     """Eight easy training trials: gains that keep a limit in all of them break it in more than a tenth of others."""
     helpers.small_search(monkeypatch, fresh=200)
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
     limit, seed = 0.7, 2  # whose first eight angles lie within 100 degrees; others go up to 140
     wanted = [Requirement("peak_torque", limit, None, 0.9)]
     parts = problem(peak_torque=limit).parts

@@ -187,7 +187,7 @@ def test_every_kind_has_a_row(name, known):
 @partial(jax.jit, static_argnames=("vmap", "sloped"))
 def batch(parts, still, dispersion, vmap, sloped):
     """Metrics, status and bad times of some trials, `still` the last, and the metrics' slopes along the law's gains."""
-    names = [name for name in parts.controller.free if name not in ("sign_width", "t_f", "k1")]
+    names = [name for name in parts.controller.tunable if name not in ("sign_width", "t_f", "k1")]
     gains = {name: getattr(parts.controller, name) for name in names}
 
     def fly(gains):

@@ -11,12 +11,13 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.devices import attitude_filter
-from ptsmc_jax.scenario import free_gains, from_tables, pace, study
+from ptsmc_jax.scenario import free_gains, from_tables, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, vector
-from tuning.search import bounds, gains
+from tuning.search import gains, shares
 from tuning.studies import tuner
 
 BASE = {
@@ -85,7 +86,7 @@ def test_names_and_bounds_axis_by_axis():
     names = gains.named(scenario)
     assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
     assert gains.own(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
-    some = bounds.of_scenario(scenario, ready.parts)
+    some = shares.of_scenario(scenario, ready.parts)
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
@@ -216,7 +217,7 @@ def test_delta_is_looked_for_from_one_period_on_and_that_is_said_where_it_ends_t
 
 
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
-    from tuning.search import bounds, gains
+    from tuning.search import gains, shares
 
     for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
         base = scenario.replace(
@@ -224,7 +225,7 @@ def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
         )
         free = {"free": ["p", "b1"]} if more else {}
         base = scenario.replace(base, tune=free)
-        box = bounds.of_scenario(base, scenario.study(base).parts)
+        box = shares.of_scenario(base, scenario.study(base).parts)
         for corner in (box.lower, box.upper):
             scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
     with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):
@@ -239,7 +240,7 @@ def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, neede
     ready = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None))
     with pytest.raises(ValueError, match=rf"needs {needed} of samples {where} the hand-over, but the parts' clock has"):
         gains.with_gains(ready.parts, other)
-    roomy = scenario.study(ready.scenario, reach=replace(pace.reach_of(ready.scenario), t_f=40.0, delta=1.0))
+    roomy = scenario.study(ready.scenario, reach=replace(timing.reach_of(ready.scenario), t_f=40.0, delta=1.0))
     moved = gains.with_gains(roomy.parts, other)
     law = moved.controller
     assert float(moved.clock.ticks(law.t_f, law.delta).t_next[-1]) == pytest.approx(float(moved.t_end))
@@ -262,3 +263,11 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     assert refused is None
     assert found["paper"].controller.delta == 0.02
     assert list(tuner.beside(found["paper"])[0]) == ["paper"]
+
+
+@pytest.mark.parametrize(("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws])
+def test_a_laws_table_has_bounds_for_what_its_physics_lets_tuning_move(plant, kind):
+    table = LAWS[plant][kind]
+    assert set(table.gains) == set(table().physics().tunable)
+    assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
+    assert set(table.gains) <= set(gains.units(plant))

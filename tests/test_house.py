@@ -22,7 +22,7 @@ HOUSE = {
         "batching": "components | lanes | kernel",
         "plants": "base | integrator_chain rigid_body second_order",
         "signals": "disturbances references",
-        "laws": "base error_quaternion | comparison prescribed_time | fixed_time pd terminal",
+        "laws": "base error_quaternion | baseline prescribed_time | fixed_time pd terminal",
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
         "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
@@ -32,12 +32,12 @@ HOUSE = {
             errors systems values
             attitude_keys device_tables dispersion_tables keys plant_tables
             disturbance_tables reference_tables scales
-            gain
+            gain_bounds
             law_tables observer_tables
             tables
             layouts
-            checks schema
-            free_gains pace
+            checks parsing
+            free_gains timing
             build reading
             flyable
         """,
@@ -50,7 +50,7 @@ HOUSE = {
         ".": "errors",
         "search": """
             abreast gains journal own_parts
-            bounds design
+            design shares
             margin_rows
             objective
             confirm evaluate worst
@@ -169,8 +169,8 @@ def test_the_reader_of_imports_sees_every_form(line):
     assert not allowed("ptsmc_jax", "batching.components", "ptsmc_jax", "batching.lanes")
     assert not allowed("ptsmc_jax", "observers.nonlinear", "ptsmc_jax", "observers.none")
     assert not allowed("ptsmc_jax", "observers.nonlinear", "ptsmc_jax", "simulation.clock")
-    assert not allowed("ptsmc_jax", "scenario.pace", "ptsmc_jax", "scenario")
-    assert allowed("ptsmc_jax", "scenario", "ptsmc_jax", "scenario.pace")
+    assert not allowed("ptsmc_jax", "scenario.timing", "ptsmc_jax", "scenario")
+    assert allowed("ptsmc_jax", "scenario", "ptsmc_jax", "scenario.timing")
     assert allowed("ptsmc_jax", "theory.solutions", "ptsmc_jax", "batching.lanes")
     assert not allowed("ptsmc_jax", "figures.run_plots", "tuning", "search.bounds")
 

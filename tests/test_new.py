@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from ptsmc_jax.scenario import from_tables, keys, layouts, schema
+from ptsmc_jax.scenario import from_tables, keys, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
@@ -56,15 +56,15 @@ def values(lines):
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
 def test_what_is_written_is_the_default_scenario(plant):
     written = tomllib.loads(new.text(plant, {}))
-    assert schema.dump(from_tables(written)) == schema.dump(from_tables({"plant": {"kind": plant}}))
+    assert parsing.dump(from_tables(written)) == parsing.dump(from_tables({"plant": {"kind": plant}}))
     assert len(written) > 4  # and says so key by key
 
 
 @pytest.mark.parametrize("name", ["first_flight", "hard_flight", "two_link_arm"])
 def test_a_scenario_like_another_is_that_one(name):
-    raw = schema.load(ROOT / "scenarios" / f"{name}.toml")
+    raw = parsing.load(ROOT / "scenarios" / f"{name}.toml")
     written = tomllib.loads(new.text(None, raw))
-    assert schema.dump(from_tables(written)) == schema.dump(from_tables(raw))
+    assert parsing.dump(from_tables(written)) == parsing.dump(from_tables(raw))
     assert all(set(given) <= set(written[table]) for table, given in raw.items())
 
 
@@ -125,7 +125,7 @@ def test_what_cannot_be_written_is_refused():
     with pytest.raises(UsageError, match="--plant is boat, but must be spacecraft or chain or system"):
         new.text("boat", {})
     with pytest.raises(UsageError, match="--plant is chain, but the scenario of --like has"):
-        new.text("chain", schema.load(FLIGHT))
+        new.text("chain", parsing.load(FLIGHT))
     with pytest.raises(ScenarioError, match=r"controller\.eta is 1"):
         new.text(None, {"controller": {"eta": 1.0}})
 
@@ -141,7 +141,7 @@ def test_the_command_writes_a_file_that_flies(command, tmp_path):
         "over it\n",
     )
     assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
-    assert (tmp_path / "scenario.toml").read_text() == new.text(None, schema.load(FLIGHT)) != written
+    assert (tmp_path / "scenario.toml").read_text() == new.text(None, parsing.load(FLIGHT)) != written
     code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
     assert code == 1  # with the paper's gains, over its limit
     assert "peak_torque" in said
@@ -169,4 +169,4 @@ def test_what_is_off_has_the_values_it_would_get(tmp_path):
         (shown,) = (values(group)["gain"] for group in kinds(lines) if values(group)["kind"] == "finite_time")
         assert shown == pytest.approx([gain] * 3)
         given = {"controller": {"disturbance_rate_bound": bound}, "observer": {"kind": "finite_time"}}
-        assert schema.dump(from_tables(given))["observer"]["gain"] == shown
+        assert parsing.dump(from_tables(given))["observer"]["gain"] == shown

@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario import parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from tuning.search import own_parts
 from tuning.studies import campaign_folder
@@ -185,7 +185,7 @@ def test_reading_a_scenario_imports_no_module_and_no_package_around_it(tmp_path,
     Path("around/inside.py").write_text(PROGRAM)
     tables = {"plant": {"kind": "system", "system": "around.inside:mine", "x0": [1.0, 0.0]}}
     loaded = scenario.replace(scenario.from_tables(tables), controller__eta=4.0, tune={})
-    assert schema.dump(loaded)["plant"]["system"] == "around.inside:mine"
+    assert parsing.dump(loaded)["plant"]["system"] == "around.inside:mine"
     with pytest.raises(ScenarioError, match=r"running around\.inside fails: SystemExit: was run"):
         scenario.study(loaded)
     assert systems.digest("around.inside:mine") is None

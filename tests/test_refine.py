@@ -7,9 +7,9 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.test_trust import SPREAD
 from tuning.search import objective, refine
-from tuning.search.bounds import Bounds
 from tuning.search.descent import Best
 from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.shares import Bounds
 
 
 class Valley(Evaluator):

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.devices import sensors
 from ptsmc_jax.dispersions import attitudes
-from ptsmc_jax.scenario import from_tables, pace, read, reference_tables, replace, schema, study
+from ptsmc_jax.scenario import from_tables, parsing, read, reference_tables, replace, study, timing
 from ptsmc_jax.scenario.attitude_keys import quaternion
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.pace import Reach
+from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import clock
 from tests.bad_scenarios import BAD, ONE_KEY, SAMPLED
@@ -321,7 +321,7 @@ def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
     reach = Reach(
         6e4, 12e4, delta=1.0, smallest_delta=1.0, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3, surface_rate=1.0
     )
-    assert 120_020 <= pace.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
+    assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
     with pytest.raises(ScenarioError) as caught:
         study(scenario, reach=reach)
     check_sentence(str(caught.value), "tune.bounds.t_f asks for runs of 120010 s", "take 240020 steps, 1 a period")
@@ -336,8 +336,8 @@ def test_read_reads_the_scenario_that_comes_with_the_project():
 # replace
 def test_replace_changes_what_is_said_and_keeps_the_rest():
     before = from_tables(tomllib.loads(EVERYTHING))
-    kept = schema.dump(before)
-    after = schema.dump(
+    kept = parsing.dump(before)
+    after = parsing.dump(
         replace(before, controller__eta=5.0, observer__gain=[1.0, 2.0, 3.0], requirements={"effort": 7.0})
     )
     expected = copy.deepcopy(kept)
@@ -345,7 +345,7 @@ def test_replace_changes_what_is_said_and_keeps_the_rest():
     expected["observer"]["gain"] = [1.0, 2.0, 3.0]
     expected["requirements"] = {"effort": 7.0}
     assert after == expected
-    assert schema.dump(before) == kept
+    assert parsing.dump(before) == kept
 
 
 def test_replace_by_none_returns_a_key_to_its_default():
@@ -394,7 +394,7 @@ def test_replace_checks(changes, of_what, allowed):
 )
 def test_replace_takes_numpy_numbers_as_numbers(changes, plain_changes):
     scenario = from_tables({})
-    assert schema.dump(replace(scenario, **changes)) == schema.dump(replace(scenario, **plain_changes))
+    assert parsing.dump(replace(scenario, **changes)) == parsing.dump(replace(scenario, **plain_changes))
 
 
 # Round trip
@@ -484,9 +484,9 @@ def is_in(said, dumped):
 @given(tables=valid_scenarios())
 def test_what_is_dumped_loads_to_the_same_scenario(tmp_path_factory, tables):
     scenario = from_tables(tables)
-    dumped = schema.dump(scenario)
+    dumped = parsing.dump(scenario)
     path = tmp_path_factory.getbasetemp() / "scenario.toml"
     store.write_toml(path, dumped)
     again = read(path)
     assert again == scenario
-    assert is_in(tables, schema.dump(again))  # to the last bit
+    assert is_in(tables, parsing.dump(again))  # to the last bit

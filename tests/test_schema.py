@@ -4,14 +4,14 @@ import re
 
 import pytest
 
-from ptsmc_jax.scenario import errors, from_tables, schema
+from ptsmc_jax.scenario import errors, from_tables, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_tables import Baseline
+from ptsmc_jax.scenario.law_tables import BaselineTable
 from ptsmc_jax.scenario.plant_tables import ChainPlant
-from ptsmc_jax.scenario.reference_tables import Reference
+from ptsmc_jax.scenario.reference_tables import ReferenceTable
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
@@ -261,22 +261,22 @@ each_list = pytest.mark.parametrize(
 
 
 def test_defaults_are_the_papers_case_one():
-    assert schema.dump(from_tables({})) == DEFAULTS
-    assert schema.dump(from_tables({"tune": {}}))["tune"] == TUNE_DEFAULTS
+    assert parsing.dump(from_tables({})) == DEFAULTS
+    assert parsing.dump(from_tables({"tune": {}}))["tune"] == TUNE_DEFAULTS
 
 
 def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
-    assert schema.dump(from_tables({"plant": {"kind": "chain", "order": 3}})) == CHAIN_DEFAULTS
+    assert parsing.dump(from_tables({"plant": {"kind": "chain", "order": 3}})) == CHAIN_DEFAULTS
     second = from_tables({"plant": {"kind": "chain"}})
     assert (second.plant, second.controller.eta) == (ChainPlant(order=2, x0=(5.0, 3.0)), 3.0)
-    fourth = schema.dump(from_tables({"plant": {"kind": "chain", "x0": [1, 0, 0, 0]}, "tune": {}}))
+    fourth = parsing.dump(from_tables({"plant": {"kind": "chain", "x0": [1, 0, 0, 0]}, "tune": {}}))
     assert (fourth["plant"]["order"], fourth["controller"]["eta"], fourth["controller"]["a"]) == (4, 5.0, [1, 3, 3])
     assert fourth["tune"]["free"] == ["eta", "delta"]  # no observer, no gain
     assert fourth["tune"]["bounds"] == {"eta": [4.05, 10.0], "delta": [0.05, 2.525]}
 
 
 def test_off_when_absent():
-    scenario = schema.parse({}, CATALOGUES)
+    scenario = parsing.parse({}, CATALOGUES)
     assert scenario.hardware is scenario.dispersion is scenario.tune is None
     assert scenario.requirements == {}
 
@@ -292,12 +292,12 @@ def test_tables_of_these_tests_name_every_key_there_is():
                 visit(getattr(parsed, key) if isinstance(parsed, Table) else parsed[key], value)
 
     for tables in COMPLETE:
-        visit(schema.parse(tables, CATALOGUES), tables)
+        visit(parsing.parse(tables, CATALOGUES), tables)
     named.pop(Attitude)  # bases of others
     named.pop(Actuators)
     named.pop(WheelLimits)
-    named.pop(Reference)
-    named.pop(Baseline)
+    named.pop(ReferenceTable)
+    named.pop(BaselineTable)
     named.pop(SumDisturbance)  # of tables that are looked at like any other
     named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
     for wheels in (PyramidWheels, AxesWheels):
@@ -377,7 +377,7 @@ def test_values_are_shown_as_a_scenario_file_would_write_them(value, shown):
 
 
 def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
-    dumped = schema.dump(from_tables({"hardware": {"rate_noise": 0.0}, "loop": {"mode": "sampled"}}))
+    dumped = parsing.dump(from_tables({"hardware": {"rate_noise": 0.0}, "loop": {"mode": "sampled"}}))
     assert dumped["hardware"] == {"rate_noise": 0.0}
     assert {"requirements", "tune", "dispersion"}.isdisjoint(dumped)
 
@@ -398,11 +398,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
     path = tmp_path / "some.toml"
     path.mkdir() if content is None else path.write_bytes(content)
     with pytest.raises(ScenarioError) as caught:
-        schema.load(path)
+        parsing.load(path)
     assert f"the scenario file {path} {said}" in str(caught.value)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ScenarioError) as caught:
-        schema.load(tmp_path / "none.toml")
+        parsing.load(tmp_path / "none.toml")
     assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} is not there"

@@ -18,7 +18,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants import second_order
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario import parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
@@ -395,10 +395,10 @@ def test_files_of_users_may_import_their_own_and_cannot_end_the_command(tmp_path
 def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_read(tmp_path):
     tables = {"plant": {"kind": "system", "system": spacecraft_as_system(SPIN), "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
     made = scenario.from_tables(tables)
-    store.write_toml(tmp_path / "s.toml", schema.dump(made))
+    store.write_toml(tmp_path / "s.toml", parsing.dump(made))
     with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names nothing'):
         scenario.read(tmp_path / "s.toml")
-    assert store.previous(tmp_path, schema.dump(made), {"command": "tune", "seed": 0}) is None
+    assert store.previous(tmp_path, parsing.dump(made), {"command": "tune", "seed": 0}) is None
 
 
 def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypatch):

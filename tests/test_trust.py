@@ -13,8 +13,8 @@ from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, vector
 from tuning.search import evolution, objective, optimise, trust
-from tuning.search.bounds import Bounds
 from tuning.search.evaluate import Evaluator
+from tuning.search.shares import Bounds
 
 SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))

@@ -18,7 +18,7 @@ from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
 from tuning.output import sentences
-from tuning.search import bounds, confirm, descent, descents, gains, objective, optimise, refine, starts, worst
+from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, shares, starts, worst
 from tuning.search.evaluate import Evaluator, Sloped
 from tuning.studies import tune_files, tuner
 
@@ -86,7 +86,7 @@ def test_forward_and_reverse_mode_agree():
 
 
 def test_bounds_map_shares_into_the_interval_and_back():
-    some = bounds.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
+    some = shares.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.logarithmic) == [False, True, True]
     rng = np.random.default_rng(0)
     for share in rng.random((20, 3)):
@@ -104,7 +104,7 @@ def test_the_narrowest_sign_follows_the_observer():
     table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": {}}
     made = scenario.from_tables(table)
     ready = scenario.study(made)
-    some = bounds.of_scenario(made, ready.parts)
+    some = shares.of_scenario(made, ready.parts)
     for l_gain in (10.0, 100.0):
         moved = gains.with_gains(ready.parts, {"observer_gain": l_gain})
         share = some.share(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
@@ -115,15 +115,15 @@ def test_the_narrowest_sign_follows_the_observer():
         np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
     # bounds that are the user's stay as they are
     given = scenario.replace(made, tune={"bounds": {"sign_width": [1e-7, 1e-2]}})
-    assert bounds.of_scenario(given, ready.parts).hop == 0.0
+    assert shares.of_scenario(given, ready.parts).hop == 0.0
 
 
 def test_gains_handed_over_are_rounded_inside_their_bounds():
-    some = bounds.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
+    some = shares.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
     found = some.rounded(np.array([2.123456789, 1.23456789]), 6)
     assert found == {"eta": 2.12346, "k1": 1.23456789}
     assert some.rounded(np.array([2.5012345678, 0.1]), 6) == {"eta": 2.50123, "k1": 0.1}
-    times = bounds.Bounds(("delta",), (0.1,), (5.0,))  # on its sample, however long the period
+    times = shares.Bounds(("delta",), (0.1,), (5.0,))  # on its sample, however long the period
     assert times.rounded(np.array([7 * 0.123456789]), 6)["delta"] == pytest.approx(7 * 0.123456789, rel=1e-11)
 
 
@@ -186,7 +186,7 @@ def test_slopes_of_tail_and_share_agree_with_central_differences():
 @pytest.mark.long
 def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
     helpers.small_search(monkeypatch)
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     largest = {}
     for tail in (None, 1):
         some = replace(problem(), tail=tail)
@@ -235,7 +235,7 @@ def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail)
     left = np.delete(np.arange(8), 5)
     others = replace(eight, trials=eight.trials[left], coordinates={name: lost[left]}, averaged=7, tail=tail)
     share = np.array([[0.6, 0.4], [0.3, 0.55]])
-    evaluate = Evaluator(bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    evaluate = Evaluator(shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
     with_it, without = (evaluate.slopes(one, share) for one in (replace(eight, coordinates={name: lost}), others))
     np.testing.assert_allclose(with_it.f, without.f + np.log(objective.FAILED), rtol=1e-14)
     np.testing.assert_allclose(with_it.value, without.value, rtol=1e-13)
@@ -257,7 +257,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(starts, "SWEPT", 64)
     some = problem(peak_torque=0.9)
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     wanted = (Requirement("peak_torque", 0.9),)
     seen = []
     evaluate = Evaluator(limits)
@@ -292,7 +292,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
 
 @pytest.mark.long
 def test_starts_begin_with_the_first_one_and_differ():
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     share = starts.starting_points(Evaluator(limits), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)
     assert share.shape == (4, 2)
     np.testing.assert_array_equal(share[0], [0.2, 0.3])
@@ -362,7 +362,7 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(descents, "MANY", 64)
     monkeypatch.setattr(refine, "GENERATIONS", 25)
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
     for sloped, evaluate in evaluates.items():
         found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), 3, 40, 1, sloped=sloped)
@@ -381,7 +381,7 @@ class Valley(Evaluator):
         return Sloped(share, f, c, f, slope, np.zeros((*c.shape, 3)))
 
 
-THREE = bounds.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
+THREE = shares.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
 
 
 def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
@@ -433,7 +433,7 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
             c = np.full((1, 0, 8), -1.0)
             return Sloped(share, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2)))
 
-    limits = bounds.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     for steps, near in ((3, 1.0), (40, 1e-4)):
         evaluate, best, path = Bowl(limits), descent.Best(np.array([0.9, 0.1]), 0, 0.0), []
         descent.descend(evaluate.slopes, problem(), best, np.array([0.9, 0.1]), steps, path.append, close=1e-12)
@@ -482,7 +482,7 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     run = replace(run, clock=clock.anchored(0.2, 21.0, 40.0, 5.0))
     wanted = [Requirement("peak_torque", limit)]
     some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
-    evaluate = Evaluator(bounds.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
+    evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
     found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), 2, 20, 0)
     expected = eta * np.sqrt(2 * 14.0 * np.tan(theta / 2) / limit)
     # it keeps SURE_MARGIN of the limit, which costs half as much of t_f

@@ -1,7 +1,7 @@
 """Progress on one scale: what is done over what is done and left, whatever ends early or comes in addition."""
 
-from tuning.search.bounds import Bounds
 from tuning.search.evaluate import Evaluator
+from tuning.search.shares import Bounds
 from tuning.search.work import Work
 
 

@@ -13,8 +13,8 @@ from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, small_search, vector
 from tuning.search import objective, optimise, worst
-from tuning.search.bounds import Bounds
 from tuning.search.evaluate import Evaluator
+from tuning.search.shares import Bounds
 
 T_F, ETA = 20.0, 3.0
 LIMIT = 0.5

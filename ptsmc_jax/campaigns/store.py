@@ -15,7 +15,7 @@ from typing import Any
 
 import tomli_w
 
-from ptsmc_jax.scenario import schema
+from ptsmc_jax.scenario import parsing
 
 JOURNAL = "journal.bin"  # of a run that is not finished
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
@@ -93,7 +93,7 @@ def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any
     """What tells the run in the folder from this one, in words; None: nothing does."""
     there = made(folder)
     try:
-        known = schema.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
+        known = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
         return "something else"
     if not there or not all(isinstance(table, dict) for table in known.values()):

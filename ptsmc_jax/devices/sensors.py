@@ -42,7 +42,7 @@ class Sensor(Protocol):
 
 
 class Reading(NamedTuple):
-    """What a sensor says of a state near the true one, to first order, for `floor`.
+    """What a sensor says of a state near the true one, to first order, for `error_floor`.
 
     Of (x, own): the plant's local coordinates (n,), see `Plant.moved`, then states of the sensor's own, a gyro's bias.
     """

@@ -42,7 +42,7 @@ class Law:
     model: Any  # the nominal plant
     t_f: Leaf  # prescribed time, or when the error is judged [s]
     delta: Leaf  # hand-over this long before t_f [s]
-    free: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
+    tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
 
     @property
     def hand_over(self) -> Scalar:
@@ -96,7 +96,7 @@ class Prescribed(Law):
     k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
     sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
     surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
-    free: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
+    tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.comparison import Baseline
+from ptsmc_jax.laws.baseline import Baseline
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
@@ -34,7 +34,7 @@ class FixedTime(Baseline):
     m: Leaf
     n: Leaf
     sign_width: Leaf
-    free: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "sign_width", "t_f")
+    tunable: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "sign_width", "t_f")
 
     def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
         """As the class says, without K sign(s)."""

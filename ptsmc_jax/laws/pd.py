@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax.laws.comparison import Baseline
+from ptsmc_jax.laws.baseline import Baseline
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals.references import Target
@@ -27,7 +27,7 @@ class QuaternionPD(Baseline):
 
     k_p: Leaf  # [1/s^2]
     k_d: Leaf  # [1/s]
-    free: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
+    tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
 
     def clearance(self, x: AttitudeState, target: Target) -> Scalar:
         """1: it has no singularity."""

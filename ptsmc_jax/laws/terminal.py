@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.comparison import Baseline
+from ptsmc_jax.laws.baseline import Baseline
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
@@ -25,7 +25,7 @@ class Terminal(Baseline):
     b: Leaf  # [1/s^p]
     k: Leaf  # [1/s^2]
     sign_width: Leaf
-    free: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
+    tunable: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
 
     def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
         """As the class says, without K sign(s)."""

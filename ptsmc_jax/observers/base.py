@@ -37,7 +37,7 @@ class Bound(Protocol):
 
 
 class ErrorBound(NamedTuple):
-    """K2(t) >= |d_hat - d|_2, the right-hand side of (55) corrected: factor (e^(-rate t) start + (1 - e^..) floor)."""
+    """K2(t) >= |d_hat - d|_2, the right-hand side of (55) corrected: e^(-rate t) start + (1 - e^(-rate t)) floor."""
 
     rate: Array  # l_m [1/s]
     start: Array  # bound at t = 0 [N m]

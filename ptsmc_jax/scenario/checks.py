@@ -18,7 +18,7 @@ from ptsmc_jax.scenario import (
 )
 from ptsmc_jax.scenario.disturbance_tables import SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain import hand_over
+from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS, Kind
 from ptsmc_jax.simulation import catalogues

@@ -1,6 +1,5 @@
 """The tables of a scenario file that say what is drawn for each trial."""
 
-from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ class Numbers(Table, frozen=True):
     width: ClassVar[str] = "std"  # the key that says how far
     widest: ClassVar[float] = 0.0  # how far a vector of three goes, in times that: all but one in 10 000
 
-    def of(self, count: int = 1) -> Sequence[float]:
+    def of(self, count: int = 1) -> np.ndarray:
         """The width of so many numbers, of which a single one of the table stands for all."""
         return np.ones(count) * getattr(self, self.width)
 

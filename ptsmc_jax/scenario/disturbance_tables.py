@@ -24,7 +24,7 @@ from ptsmc_jax.scenario.values import (
 )
 
 
-class Disturbance(Kind, frozen=True):
+class DisturbanceTable(Kind, frozen=True):
     """A disturbance, alone or one of several."""
 
     sampled_only: ClassVar[bool] = False
@@ -47,13 +47,13 @@ class Disturbance(Kind, frozen=True):
         """1 sigma a second of its random walk, a number for each input; None: none."""
 
 
-class NoDisturbance(Disturbance, frozen=True):
+class NoDisturbance(DisturbanceTable, frozen=True):
     """Nothing disturbs."""
 
     kind: Literal["none"] = "none"
 
 
-class ConstantDisturbance(Disturbance, frozen=True):
+class ConstantDisturbance(DisturbanceTable, frozen=True):
     """A constant torque.
 
     Attributes:
@@ -75,7 +75,7 @@ class ConstantDisturbance(Disturbance, frozen=True):
         return Constant(vector(self.amplitude))
 
 
-class SinusoidDisturbance(Disturbance, frozen=True):
+class SinusoidDisturbance(DisturbanceTable, frozen=True):
     """The torque bias + amplitude sin(frequency t + phase), axis by axis.
 
     Attributes:
@@ -108,7 +108,7 @@ class SinusoidDisturbance(Disturbance, frozen=True):
         return Sinusoid(*(vector(value) for value in (self.amplitude, self.frequency, self.phase, self.bias)))
 
 
-class GravityGradient(Attitude, Disturbance, frozen=True):
+class GravityGradient(Attitude, DisturbanceTable, frozen=True):
     """The gravity gradient of a circular orbit, on the body that flies; the attitude key is that of the orbit's frame.
 
     The frame's z is along the orbit's normal, its x points to where the phase counts from.
@@ -140,7 +140,7 @@ class GravityGradient(Attitude, Disturbance, frozen=True):
         return disturbances.GravityGradient(inertia, *(vector(value) for value in (orbit, self.orbit_rate, self.phase)))
 
 
-class RandomWalk(Disturbance, frozen=True):
+class RandomWalk(DisturbanceTable, frozen=True):
     """A torque that wanders from zero, a new step each period; sampled loop only.
 
     Attributes:

@@ -16,7 +16,7 @@ from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario import attitude_keys, build, errors, pace
+from ptsmc_jax.scenario import attitude_keys, build, errors, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -78,7 +78,7 @@ def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     )
 
 
-def study(scenario: Scenario, saves: object = (), reach: pace.Reach | None = None, *, drawn: bool = True) -> Study:
+def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = None, *, drawn: bool = True) -> Study:
     """The parts of a checked scenario; `saves`: times [s] at which a continuous run must have nodes.
 
     drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
@@ -164,7 +164,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
 _path = programs.jit(solutions.exact_path)
 
 
-def _parts(scenario: Scenario, saves: object, reach: pace.Reach | None) -> Parts:
+def _parts(scenario: Scenario, saves: object, reach: timing.Reach | None) -> Parts:
     model, controller, initial, reference = build.plant(scenario)
     disturbance, walk = build.disturbance(scenario, model.inputs)
     loop = scenario.loop
@@ -183,5 +183,5 @@ def _parts(scenario: Scenario, saves: object, reach: pace.Reach | None) -> Parts
         actuators=build.actuators(scenario),
         walk_rate=walk,
     )
-    timing, substeps = pace.timing(scenario, parts, reach or pace.reach_of(scenario), saves)
-    return dataclasses.replace(parts, clock=timing, substeps=substeps)
+    clock_of_it, substeps = timing.timing(scenario, parts, reach or timing.reach_of(scenario), saves)
+    return dataclasses.replace(parts, clock=clock_of_it, substeps=substeps)

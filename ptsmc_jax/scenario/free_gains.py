@@ -5,9 +5,9 @@ import math
 import msgspec
 
 from ptsmc_jax import formulas
-from ptsmc_jax.scenario import device_tables, errors, scales, schema, tables
+from ptsmc_jax.scenario import device_tables, errors, parsing, scales, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain import Choice, Gain
+from ptsmc_jax.scenario.gain_bounds import Choice, GainBounds
 from ptsmc_jax.scenario.tables import Scenario
 
 
@@ -30,9 +30,10 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     """
     free = tune.free
     if free is None:
-        law, rest = scenario.controller.free
+        law = scenario.controller
+        rest = law.free_if_sampled if scenario.loop.mode == "sampled" else ()
         filtered = ("filter_bandwidth",) if _has_bandwidth(scenario) else ()
-        free = (*law, *scenario.observer.gains, *(rest if scenario.loop.mode == "sampled" else ()), *filtered)
+        free = (*law.free_by_default, *scenario.observer.gains, *rest, *filtered)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -90,7 +91,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 def _check_bounds(choice: Choice, name: str) -> None:
     key, (lower, upper) = f"tune.bounds.{name}", choice.bounds[name]
     if name not in tables.FREE:
-        raise ScenarioError(f"{key} is not a known gain; {schema.nearest(name, tables.FREE)}")
+        raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, tables.FREE)}")
     if name not in choice.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
     least, most, closed = _gain(choice.scenario, name).allowed(choice)
@@ -101,9 +102,11 @@ def _check_bounds(choice: Choice, name: str) -> None:
         raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")
 
 
-def _gain(scenario: Scenario, name: str) -> Gain:
-    """The record of a gain that the scenario has."""
-    return {**scenario.controller.gains, **scenario.observer.gains, "filter_bandwidth": Gain(_usual_bandwidth)}[name]
+def _gain(scenario: Scenario, name: str) -> GainBounds:
+    """The bounds of a gain that the scenario has."""
+    return {**scenario.controller.gains, **scenario.observer.gains, "filter_bandwidth": GainBounds(_usual_bandwidth)}[
+        name
+    ]
 
 
 def _usual_bandwidth(choice: Choice) -> tuple[float, float]:

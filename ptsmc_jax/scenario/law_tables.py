@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from ptsmc_jax.scenario import gain
+from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.gain import Choice, Gain, between
+from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, between
 from ptsmc_jax.scenario.values import NotNegative, Positive, Table
 
 Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
@@ -20,14 +20,15 @@ AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
 
 
-class Law(Table, frozen=True):
+class LawTable(Table, frozen=True):
     """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
 
-    # gains that tuning may move; those that are free where a scenario does not say, before the observer's gain and,
-    # in the sampled loop only, after it: without samples a larger K1 and a narrower sign cost nothing but steps
-    gains: ClassVar[Mapping[str, Gain]] = {}
-    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
-    prescribed: ClassVar[bool] = True  # hands over at t_f - delta, and flies in either loop; others when sampled only
+    gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
+    # those that are free where a scenario does not say; the second ones in the sampled loop only, since without samples
+    # a larger K1 and a narrower sign cost nothing but steps
+    free_by_default: ClassVar[tuple[str, ...]] = ()
+    free_if_sampled: ClassVar[tuple[str, ...]] = ()
+    prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
 
     def physics(self) -> Any:
         """What flies: a class of `laws`, its fields named as the keys."""
@@ -46,33 +47,35 @@ class Law(Table, frozen=True):
 
         made = self.physics()
         names = [field.name for field in dataclasses.fields(made) if field.name != "model"]
-        own = {name: gain.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
+        own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
         return made(model, **{name: vector(value) for name, value in own.items()})
 
 
-def _two(_: Any) -> float:
+def _eta_must_exceed_two(_: Any) -> float:
     return 2.0  # Theorems 1 and 2
 
 
-class Prescribed(Law, frozen=True):
+class PrescribedTable(LawTable, frozen=True):
     """The paper's gains, whatever the plant."""
 
-    gains: ClassVar[Mapping[str, Gain]] = {
-        "eta": gain.eta(_two),
-        "delta": gain.DELTA,
-        "k1": gain.K1,
-        "sign_width": gain.SIGN_WIDTH,
-        "surface_rate": gain.SURFACE_RATE,
-        "t_f": gain.T_F,
+    prescribed: ClassVar[bool] = True
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "eta": gain_bounds.eta(_eta_must_exceed_two),
+        "delta": gain_bounds.DELTA,
+        "k1": gain_bounds.K1,
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "surface_rate": gain_bounds.SURFACE_RATE,
+        "t_f": gain_bounds.T_F,
     }
-    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("eta", "delta"), ("k1", "sign_width"))
+    free_by_default: ClassVar[tuple[str, ...]] = ("eta", "delta")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("k1", "sign_width")
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at the start."""
         return "controller.eta", 2.0 * self.eta / t_f  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class Controller(Prescribed, frozen=True):
+class SpacecraftController(PrescribedTable, frozen=True):
     """The paper's law for a spacecraft: (56) and (57) before the hand-over, (59) and (60) after it.
 
     Attributes:
@@ -107,7 +110,7 @@ class Controller(Prescribed, frozen=True):
         return PrescribedTimeMultiplicative if self.error == "multiplicative" else PrescribedTime
 
 
-class Baseline(Law, frozen=True):
+class BaselineTable(LawTable, frozen=True):
     """What the laws to compare with have besides their gains.
 
     Attributes:
@@ -121,15 +124,14 @@ class Baseline(Law, frozen=True):
     disturbance_rate_bound: NotNegative = 1e-3
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
-    prescribed: ClassVar[bool] = False
 
 
-def _over_t_f(low: float, high: float, power: int = 1) -> Gain:
-    """What has the unit 1/s, or a power of it."""
-    return Gain(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
+def _over_t_f(low: float, high: float, power: int = 1) -> GainBounds:
+    """Bounds low / t_f^power and high / t_f^power."""
+    return GainBounds(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
 
 
-class PDController(Baseline, frozen=True):
+class PDController(BaselineTable, frozen=True):
     """Quaternion PD with the reference's motion fed forward (Wie, Weiss, Arapostathis 1989); sampled loop only.
 
     Attributes:
@@ -140,12 +142,12 @@ class PDController(Baseline, frozen=True):
     kind: Literal["pd"] = "pd"
     k_p: Positive = 0.2
     k_d: Positive = 0.6
-    gains: ClassVar[Mapping[str, Gain]] = {
+    gains: ClassVar[Mapping[str, GainBounds]] = {
         "k_p": _over_t_f(2.0, 2000.0, 2),
         "k_d": _over_t_f(0.3, 100.0),
-        "t_f": gain.T_F,
+        "t_f": gain_bounds.T_F,
     }
-    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("k_p", "k_d"), ())
+    free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
 
     def physics(self) -> Any:
         """`laws.pd`."""
@@ -154,11 +156,11 @@ class PDController(Baseline, frozen=True):
         return QuaternionPD
 
     def turning(self, t_f: float) -> tuple[str, float]:
-        """All of the potential energy of its spring."""
+        """The rate at the goal if all of its spring's potential energy had become motion."""
         return "controller.k_p", 2.0 * math.sqrt(self.k_p)
 
 
-class TerminalController(Baseline, frozen=True):
+class TerminalController(BaselineTable, frozen=True):
     """Nonsingular terminal sliding mode, s = v + sig^p(v') / b (Feng, Yu, Man 2002); sampled loop only.
 
     Attributes:
@@ -173,14 +175,15 @@ class TerminalController(Baseline, frozen=True):
     b: Positive = 0.1
     k: Positive = 0.1
     sign_width: NotNegative = 1e-3
-    gains: ClassVar[Mapping[str, Gain]] = {
-        "p": Gain(lambda _: (1.05, 1.95), between(1.0, 2.0)),
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
         "b": _over_t_f(0.01, 100.0),
         "k": _over_t_f(2.0, 2000.0, 2),
-        "sign_width": gain.SIGN_WIDTH,
-        "t_f": gain.T_F,
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
     }
-    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (("p", "b", "k"), ("sign_width",))
+    free_by_default: ClassVar[tuple[str, ...]] = ("p", "b", "k")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
 
     def physics(self) -> Any:
         """`laws.terminal`."""
@@ -198,9 +201,9 @@ def _usual_p(choice: Choice) -> tuple[float, float]:
     return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
 
 
-def _allowed_p(choice: Choice) -> tuple[float, float, bool]:
+def _allowed_p(choice: Choice) -> Allowed:
     """For gamma - 1/p > 1; where gamma is free too, it follows p."""
-    return 1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0, False
+    return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
 
 
 def _usual_gamma(choice: Choice) -> tuple[float, float]:
@@ -208,12 +211,12 @@ def _usual_gamma(choice: Choice) -> tuple[float, float]:
     return least + 0.05, least + 2.0
 
 
-def _allowed_gamma(choice: Choice) -> tuple[float, float, bool]:
+def _allowed_gamma(choice: Choice) -> Allowed:
     """Gamma - 1/p > 1, for every p."""
-    return 1.0 + 1.0 / choice.least("p"), math.inf, False
+    return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
 
 
-class FixedTimeController(Baseline, frozen=True):
+class FixedTimeController(BaselineTable, frozen=True):
     """Fixed-time sliding mode (Zuo 2015; Jiang, Hu, Friswell 2016), gamma - 1/p > 1; sampled loop only.
 
     Attributes:
@@ -238,20 +241,18 @@ class FixedTimeController(Baseline, frozen=True):
     m: AboveOne = 1.5
     n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
     sign_width: NotNegative = 1e-3
-    gains: ClassVar[Mapping[str, Gain]] = {
-        "p": Gain(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
         **dict.fromkeys(("a1", "b1"), _over_t_f(0.01, 100.0)),
-        **dict.fromkeys(("a2", "b2"), Gain(lambda _: (1e-4, 10.0))),
-        "gamma": Gain(_usual_gamma, _allowed_gamma),
-        "m": Gain(lambda _: (1.05, 3.0), between(1.0, math.inf)),
-        "n": Gain(lambda _: (0.05, 0.95), between(0.0, 1.0)),
-        "sign_width": gain.SIGN_WIDTH,
-        "t_f": gain.T_F,
+        **dict.fromkeys(("a2", "b2"), GainBounds(lambda _: (1e-4, 10.0))),
+        "gamma": GainBounds(_usual_gamma, _allowed_gamma),
+        "m": GainBounds(lambda _: (1.05, 3.0), between(1.0, math.inf)),
+        "n": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
     }
-    free: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (
-        ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n"),
-        ("sign_width",),
-    )
+    free_by_default: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
 
     def physics(self) -> Any:
         """`laws.fixed_time`."""
@@ -269,7 +270,7 @@ class FixedTimeController(Baseline, frozen=True):
             raise wrong("controller.gamma", self.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
 
-class SystemController(Prescribed, frozen=True):
+class SystemController(PrescribedTable, frozen=True):
     """The paper's law (29) for a second-order system, with (57)'s gains.
 
     Attributes:
@@ -315,9 +316,9 @@ class ChainController(SystemController, frozen=True):
     a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
         1.0,
     )
-    gains: ClassVar[Mapping[str, Gain]] = {
-        **Prescribed.gains,
-        "eta": gain.eta(lambda scenario: float(scenario.plant.order)),  # Theorem 3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        **PrescribedTable.gains,
+        "eta": gain_bounds.eta(lambda scenario: float(scenario.plant.order)),  # Theorem 3
     }
 
     def physics(self) -> Any:
@@ -328,9 +329,9 @@ class ChainController(SystemController, frozen=True):
 
 
 # by the kind of the plant and the kind of the law, the default first
-LAWS: dict[str, Mapping[str, type[Law]]] = {
+LAWS: dict[str, Mapping[str, type[LawTable]]] = {
     "spacecraft": {
-        "prescribed_time": Controller,
+        "prescribed_time": SpacecraftController,
         "pd": PDController,
         "terminal": TerminalController,
         "fixed_time": FixedTimeController,

@@ -10,14 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import Meta
 
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.gain import Choice, Gain, dead_beat
+from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, dead_beat
 from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
 
 
-class Observer(Kind, frozen=True):
+class ObserverTable(Kind, frozen=True):
     """An observer, whatever it is for."""
 
-    gains: ClassVar[Mapping[str, Gain]] = {}  # "observer_gain", where it has one
+    gains: ClassVar[Mapping[str, GainBounds]] = {}  # "observer_gain", where it has one
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""
@@ -34,7 +34,7 @@ class Observer(Kind, frozen=True):
         return model, vector(own), vector(law.disturbance_rate_bound), vector(law.initial_estimate_error)
 
 
-class NoObserver(Observer, frozen=True):
+class NoObserver(ObserverTable, frozen=True):
     """None: d_hat = 0, and K switches against the whole disturbance."""
 
     kind: Literal["none"] = "none"
@@ -48,11 +48,11 @@ class NoObserver(Observer, frozen=True):
 
 
 _DEAD_BEAT = {
-    "observer_gain": Gain(dead_beat, above="a dead-beat observer: nothing of its error is left after a period")
+    "observer_gain": GainBounds(dead_beat, above="a dead-beat observer: nothing of its error is left after a period")
 }
 
 
-class NonlinearObserver(Observer, frozen=True):
+class NonlinearObserver(ObserverTable, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
@@ -61,7 +61,7 @@ class NonlinearObserver(Observer, frozen=True):
 
     kind: Literal["nonlinear"] = "nonlinear"
     gain: ThreePositive = (10.0, 10.0, 10.0)
-    gains: ClassVar[Mapping[str, Gain]] = _DEAD_BEAT
+    gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
 
     def build(self, scenario: Any, model: Any) -> Any:
         """`observers.nonlinear`."""
@@ -81,7 +81,7 @@ class EachNonlinearObserver(NonlinearObserver, frozen=True):
     each: ClassVar[Mapping[str, float]] = {"gain": 10.0}
 
 
-class PrescribedTimeObserver(Observer, frozen=True):
+class PrescribedTimeObserver(ObserverTable, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
@@ -96,7 +96,7 @@ class PrescribedTimeObserver(Observer, frozen=True):
     t_o: Positive | None = None
     delta_o: Positive | None = None
     gain: ThreePositive = (10.0, 10.0, 10.0)
-    gains: ClassVar[Mapping[str, Gain]] = _DEAD_BEAT
+    gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
 
     def times(self, scenario: Any) -> tuple[float, float]:
         """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
@@ -139,12 +139,12 @@ def _usual_bound(choice: Choice) -> tuple[float, float]:
     return max(choice.law.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
 
 
-def _allowed_bound(choice: Choice) -> tuple[float, float, bool]:
+def _allowed_bound(choice: Choice) -> Allowed:
     least = choice.law.disturbance_rate_bound
-    return least, math.inf, least > 0.0
+    return Allowed(least, math.inf, least > 0.0)
 
 
-class FiniteTimeObserver(Observer, frozen=True):
+class FiniteTimeObserver(ObserverTable, frozen=True):
     """A super-twisting observer, exact after a finite time (Levant 1998).
 
     Attributes:
@@ -155,7 +155,7 @@ class FiniteTimeObserver(Observer, frozen=True):
     kind: Literal["finite_time"] = "finite_time"
     gain: ThreePositive | None = None
     sign_width: NotNegative = 1e-5
-    gains: ClassVar[Mapping[str, Gain]] = {"observer_gain": Gain(_usual_bound, _allowed_bound)}
+    gains: ClassVar[Mapping[str, GainBounds]] = {"observer_gain": GainBounds(_usual_bound, _allowed_bound)}
 
     each: ClassVar[Mapping[str, float]] = {"gain": 20.0}
 
@@ -195,7 +195,7 @@ _EACH: Kinds = {
     "prescribed_time": EachPrescribedTimeObserver,
 }
 # by the kind of the plant and the kind of the observer, the default first
-OBSERVERS: dict[str, Mapping[str, type[Observer]]] = {
+OBSERVERS: dict[str, Mapping[str, type[ObserverTable]]] = {
     "spacecraft": {
         "nonlinear": NonlinearObserver,
         "none": NoObserver,

@@ -6,19 +6,19 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import checks, free_gains, schema
+from ptsmc_jax.scenario import checks, free_gains, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 
 
 def read(path: str | Path) -> Scenario:
     """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
-    return from_tables(schema.load(path))
+    return from_tables(parsing.load(path))
 
 
 def from_tables(raw: Mapping[str, Any]) -> Scenario:
     """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence."""
-    scenario = checks.resolve(schema.parse(raw, catalogues.CATALOGUES))
+    scenario = checks.resolve(parsing.parse(raw, catalogues.CATALOGUES))
     checks.check(scenario)
     if scenario.tune is None:
         return scenario
@@ -37,7 +37,7 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
     Traceback (most recent call last):
     ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
-    tables = schema.dump(scenario)
+    tables = parsing.dump(scenario)
     for name, value in changes.items():
         table, _, key = name.partition("__")
         if value is None and _is_known(scenario, table, key):

@@ -22,7 +22,7 @@ class Initial(Attitude, frozen=True):
     rate: Three = (0.0, 0.0, 0.0)
 
 
-class Reference(Attitude, frozen=True):
+class ReferenceTable(Attitude, frozen=True):
     """What a spacecraft is to follow."""
 
     def frequencies(self) -> dict[str, float]:
@@ -43,7 +43,7 @@ class Reference(Attitude, frozen=True):
         return vector(attitude_keys.quaternion(self, "reference"))
 
 
-class FixedReference(Reference, frozen=True):
+class FixedReference(ReferenceTable, frozen=True):
     """An attitude to be held."""
 
     kind: Literal["fixed"] = "fixed"
@@ -55,7 +55,7 @@ class FixedReference(Reference, frozen=True):
         return Fixed(self._start())
 
 
-class SpinReference(Reference, frozen=True):
+class SpinReference(ReferenceTable, frozen=True):
     """The attitude at t = 0, turning from then on at a constant body rate.
 
     Attributes:
@@ -77,7 +77,7 @@ class SpinReference(Reference, frozen=True):
         return Spin(self._start(), vector(self.rate))
 
 
-class SinusoidReference(Reference, frozen=True):
+class SinusoidReference(ReferenceTable, frozen=True):
     """On top of the attitude, the rotation vector amplitude sin(frequency t + phase), axis by axis.
 
     Attributes:
@@ -104,7 +104,7 @@ class SinusoidReference(Reference, frozen=True):
         return Swing(self._start(), *(vector(value) for value in (self.amplitude, self.frequency, self.phase)))
 
 
-class SlewReference(Reference, frozen=True):
+class SlewReference(ReferenceTable, frozen=True):
     """From the attitude, at rest, to another one, at rest, about one axis.
 
     Attributes:

@@ -99,10 +99,10 @@ class Scenario(Table, frozen=True, kw_only=True):
     spacecraft: Spacecraft | None = None
     initial: Initial | None = None
     # the tables of their kinds, see `layouts.TABLES`
-    reference: Any = None  # `reference_tables.Reference`
-    disturbance: Any  # `disturbance_tables.Disturbance`, or several
-    controller: Any  # `law_tables.Law`
-    observer: Any  # `observer_tables.Observer`
+    reference: Any = None  # `reference_tables.ReferenceTable`
+    disturbance: Any  # `disturbance_tables.DisturbanceTable`, or several
+    controller: Any  # `law_tables.LawTable`
+    observer: Any  # `observer_tables.ObserverTable`
     loop: Loop
     hardware: Hardware | StateHardware | None = None
     wheels: PyramidWheels | AxesWheels | None = None

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ptsmc_jax.scenario import attitude_keys, schema
+from ptsmc_jax.scenario import attitude_keys, parsing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.reference_tables import Initial
@@ -34,7 +34,7 @@ def quaternion(given: Mapping[str, str | None]) -> np.ndarray:
     if key == "euler_deg":
         raw["sequence"] = given.get("sequence") or SEQUENCE
     try:
-        scenario = schema.parse({"initial": raw}, CATALOGUES)
+        scenario = parsing.parse({"initial": raw}, CATALOGUES)
         assert isinstance(scenario.initial, Initial)
         return attitude_keys.quaternion(scenario.initial, "initial")
     except ScenarioError as error:

@@ -68,12 +68,12 @@ def simulate(
 
     store.check(folder, force)
     from ptsmc_jax.campaigns import runs
-    from ptsmc_jax.scenario import pace, study
+    from ptsmc_jax.scenario import study, timing
     from tuning.studies import single
 
     ready = study(loaded, drawn=number is not None)
-    if pace.steps(ready.parts) > LONG and not quiet:
-        terminal.say(f"flying {pace.steps(ready.parts)} integration steps, with their history")
+    if timing.steps(ready.parts) > LONG and not quiet:
+        terminal.say(f"flying {timing.steps(ready.parts)} integration steps, with their history")
     run = runs.fly(ready, key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
@@ -366,9 +366,9 @@ def _search(
 ) -> int:
     """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
     from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import schema, study
+    from ptsmc_jax.scenario import parsing, study
 
-    tables = schema.dump(loaded)
+    tables = parsing.dump(loaded)
     done = None if force else store.previous(folder, tables, known_by)
     if done is not None and done["status"] != "interrupted":
         if not quiet:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax import scenario
-from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, schema
+from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.observer_tables import PrescribedTimeObserver
 from ptsmc_jax.scenario.tables import Scenario, Tune
@@ -60,9 +60,9 @@ class _File:
 
     def __init__(self, said: Scenario, resolved: Scenario):
         self.resolved, self.plant = resolved, resolved.plant.kind
-        self.live = schema.dump(said)
-        self.values = schema.dump(resolved)
-        self.values.setdefault("tune", schema.plain(free_gains.resolve(resolved, Tune())))
+        self.live = parsing.dump(said)
+        self.values = parsing.dump(resolved)
+        self.values.setdefault("tune", parsing.plain(free_gains.resolve(resolved, Tune())))
 
     def lines(self) -> Iterator[str]:
         """All of them."""
@@ -138,7 +138,7 @@ class _File:
         if isinstance(table, PrescribedTimeObserver):
             t_o, delta_o = table.times(self.resolved)
             table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
-        return {key: value for key, value in schema.plain(table).items() if value not in ([], {})}
+        return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
         """A value for a key that is off, or drawn: its default, or what it might be."""
@@ -151,7 +151,7 @@ class _File:
 
 
 def text(plant: str | None, raw: Mapping[str, Any]) -> str:
-    """A commented scenario file: that of `raw`, tables as `schema.load` reads them, or the default one of this plant.
+    """A commented scenario file: that of `raw`, tables as `parsing.load` reads them, or the default one of this plant.
 
     Raises ScenarioError where raw is no scenario, UsageError where there is no such plant or raw has another one.
     """
@@ -159,7 +159,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
     kind = plant or "spacecraft"
     given = raw or {"plant": {"kind": kind, **({"system": EXAMPLES["plant.system"]} if kind == "system" else {})}}
-    said = schema.parse(given, catalogues.CATALOGUES)
+    said = parsing.parse(given, catalogues.CATALOGUES)
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
     # a system stands in a file that its user has yet to write: it cannot be checked

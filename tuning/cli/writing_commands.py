@@ -42,11 +42,11 @@ def new(
     Exit status: 0 done, 2 bad input.
     """
     from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import schema
+    from ptsmc_jax.scenario import parsing
     from tuning.cli import new as templates
 
     store.check_file(file, force)
-    raw = schema.load(like) if like is not None else {}
+    raw = parsing.load(like) if like is not None else {}
     store.write_text(file, templates.text(plant, raw))
     if not quiet:
         terminal.say(f"scenario in {file}")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import schema
+from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
 from tuning.output import margin_sentences, page_charts, sentences
 
@@ -92,7 +92,7 @@ def read(folder: Path) -> Result:
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8")) if command != "map" else {}
         path = folder / "scenario.toml"
-        scenario = schema.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
+        scenario = parsing.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
         raise _unfinished(folder, versions) from None
     except (ValueError, RecursionError) as error:

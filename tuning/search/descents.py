@@ -14,11 +14,11 @@ import numpy as np
 
 from ptsmc_jax.simulation.clock import Anchored
 from tuning.search.abreast import Ask, in_step
-from tuning.search.bounds import TIMES
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import FAILED, Problem, failures, fewer_trials
 from tuning.search.refine import GENERATIONS, WIDELY, refine
+from tuning.search.shares import TIMES
 from tuning.search.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, spread, starting_points
 from tuning.search.work import ROUND, SLOPED
 

@@ -9,9 +9,9 @@ import numpy as np
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import montecarlo
 from tuning.search import margin_rows
-from tuning.search.bounds import Bounds
 from tuning.search.journal import Journal
 from tuning.search.objective import Problem, ended, measure
+from tuning.search.shares import Bounds
 
 FLOWN = 16  # points without slopes in one call of the compiled program
 

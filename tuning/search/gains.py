@@ -16,7 +16,7 @@ from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.scenario import keys, plant_tables
 from ptsmc_jax.scenario.device_tables import SteadyStateFilter
-from ptsmc_jax.scenario.law_tables import LAWS, Baseline
+from ptsmc_jax.scenario.law_tables import LAWS, BaselineTable
 from ptsmc_jax.scenario.observer_tables import OBSERVERS, NonlinearObserver
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
@@ -101,12 +101,12 @@ def _check_clock(parts: Parts) -> None:
 def gains_of(parts: Parts) -> dict[str, float]:
     """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
     controller = parts.controller
-    law = [name for name in controller.free if name not in ("k1", "sign_width", "surface_rate", "t_f")]
+    law = [name for name in controller.tunable if name not in ("k1", "sign_width", "surface_rate", "t_f")]
     gains = {name: float(getattr(controller, name)) for name in law}
     each = [float(v) for v in getattr(parts.observer, "gain", ())]
     if each:
         gains["observer_gain"] = sum(each) / len(each)
-    gains |= {name: float(getattr(controller, name)) for name in controller.free if name not in law}
+    gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
     if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
     return {**gains, **{f"{_AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
@@ -151,7 +151,7 @@ def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
     if not table.prescribed:
-        kept = {key: getattr(table, key) for key in Baseline.__struct_fields__}
+        kept = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
         law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)

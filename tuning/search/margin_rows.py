@@ -21,8 +21,8 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import over
 from ptsmc_jax.theory import margins
 from tuning.search import gains as gain_names
-from tuning.search.bounds import Bounds
 from tuning.search.gains import with_gains
+from tuning.search.shares import Bounds
 
 CASES = 2  # loops with drawn inertias, those that come nearest to a limit
 WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin

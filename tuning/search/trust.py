@@ -8,10 +8,10 @@ import numpy as np
 from scipy import stats
 
 from ptsmc_jax.campaigns import montecarlo
-from tuning.search.bounds import TIMES, Bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.gains import with_gains
 from tuning.search.objective import Problem
+from tuning.search.shares import TIMES, Bounds
 
 DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
 STEP = 1e-2  # of the gains, relative, for sensitivities

@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns import margin_verdicts, rows, runs, store
 from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import Study, schema, systems
+from ptsmc_jax.scenario import Study, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import own_parts
@@ -100,7 +100,7 @@ class Folder:
 
     @property
     def _key(self) -> bytes:
-        return rows.key_of(schema.dump(self.scenario), self.told)
+        return rows.key_of(parsing.dump(self.scenario), self.told)
 
     @cached_property
     def ready(self) -> Study | None:
@@ -152,7 +152,7 @@ class Folder:
 
 def begin(wanted: Folder, force: bool) -> None:
     """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
-    tables, path = schema.dump(wanted.scenario), wanted.path
+    tables, path = parsing.dump(wanted.scenario), wanted.path
     if force and path.is_dir():
         for kept in (wanted.rows, wanted.plan):
             for file in kept.folder.glob("*.parquet"):

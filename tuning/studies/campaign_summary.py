@@ -16,7 +16,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.scenario import schema
+from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import STATUS
@@ -142,7 +142,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     names = list(pl.read_parquet_schema(parts[0].path))
     allowed = [name for name in names if name not in ("trial", "status", "reason", "bad_time")]
     if by not in allowed:
-        raise RefusedError(f"--by is {by}, but must be a column of the rows; {schema.nearest(by, allowed)}")
+        raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.nearest(by, allowed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
     failed = ~flying.finished(frame)
     chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)

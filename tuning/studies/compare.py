@@ -13,9 +13,9 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import errors, plant_tables, replace, schema, study, tables
+from ptsmc_jax.scenario import errors, parsing, plant_tables, replace, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_tables import LAWS, Baseline
+from ptsmc_jax.scenario.law_tables import LAWS, BaselineTable
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -83,7 +83,7 @@ def contenders(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
     assert scenario.tune is not None
     table, tune = scenario.controller, scenario.tune
-    common = {key: getattr(table, key) for key in Baseline.__struct_fields__}
+    common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     found = {}
     for kind in laws():
@@ -145,6 +145,7 @@ def _papers(flown: Scenario, fresh_seed: int) -> Contender:
 def figures_of(one: Contender) -> dict[str, Any]:
     """What is said of a contender: over the trials that were flown to the end, but for the counts."""
     trials = one.trials
+    rank: Any = stats.spearmanr
     angle, done = trials.drawn["initial_angle"], trials.finished
     settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[done]
     settled = done & np.isfinite(settling)
@@ -165,7 +166,7 @@ def figures_of(one: Contender) -> dict[str, Any]:
         "unsettled": int(trials.status.size - known.size),
         "settling_time": {str(q): _quantile(late, q) for q in (0.01, 0.5, 0.99)},
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
-        "settling_by_angle": float(stats.spearmanr(angle[settled], known).statistic) if spread else None,
+        "settling_by_angle": float(rank(angle[settled], known)[0]) if spread else None,
         "settling_near_far": _near_far(angle, late) if spread else None,
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
     }
@@ -200,13 +201,13 @@ def summary(made: Comparison) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     store.write_json(folder / "versions.json", store.versions(**known_by))
     said = summary(made)
     store.write_json(folder / "summary.json", said)
     (folder / "scenarios").mkdir()
     for law, one in made.contenders.items():
-        store.write_toml(folder / "scenarios" / f"{law}.toml", schema.dump(one.flown))
+        store.write_toml(folder / "scenarios" / f"{law}.toml", parsing.dump(one.flown))
     columns = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
                "settling_by_angle")  # fmt: skip
     rows = [[law, *(found[name] for name in columns), *((found["settling_time"] or {}).get(q) for q in _SHARES),

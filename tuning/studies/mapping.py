@@ -12,7 +12,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.observers.base import Linear
 from ptsmc_jax.observers.none import NoObserver
-from ptsmc_jax.scenario import Study, schema, study, systems
+from ptsmc_jax.scenario import Study, parsing, study, systems
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -198,7 +198,7 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
 
 def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     trials = max((cell.trials for cell in cells), default=0)
     source = systems.source(getattr(scenario.plant, "system", None))
     store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials, **source))

@@ -17,8 +17,8 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics import statistics
+from ptsmc_jax.scenario import parsing, study, systems
 from ptsmc_jax.scenario import replace as changed
-from ptsmc_jax.scenario import schema, study, systems
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.simulation import catalogues
@@ -147,7 +147,7 @@ def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:
     """The scenario with a requirement on the peak torque, and its own limit, if there is one."""
     known = scenario.requirements.get(TORQUE)
     if known is None:
-        requirements = {**schema.dump(scenario).get("requirements", {}), TORQUE: OFF}
+        requirements = {**parsing.dump(scenario).get("requirements", {}), TORQUE: OFF}
         return changed(scenario, requirements=requirements), None
     return scenario, known.limit if isinstance(known, Limit) else float(known)
 
@@ -286,7 +286,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_by: dict[str, Any]) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     store.write_json(folder / "versions.json", store.versions(**known_by))
     store.write_json(folder / "summary.json", summary(front, scenario))
     names = gains.named(scenario)

@@ -11,7 +11,7 @@ from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import run_plots, style
 from ptsmc_jax.paper import claims, remark_2, slips
 from ptsmc_jax.plants.integrator_chain import Chain
-from ptsmc_jax.scenario import from_tables, schema
+from ptsmc_jax.scenario import from_tables, parsing
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def write(folder: Path, made: Reproduction, figures: bool) -> None:
     (folder / "claims.md").write_text(_markdown(made), encoding="utf-8")
     (folder / "scenarios").mkdir()
     for name, (_, _, tables) in claims.CASES.items():
-        store.write_toml(folder / "scenarios" / f"{name}.toml", schema.dump(from_tables(tables)))
+        store.write_toml(folder / "scenarios" / f"{name}.toml", parsing.dump(from_tables(tables)))
     if figures:
         style.save(_figures(made), folder / "figures")
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.scenario import schema, systems
+from ptsmc_jax.scenario import parsing, systems
 from ptsmc_jax.scenario.tables import Scenario
 
 
@@ -24,7 +24,7 @@ def summary(run: Run) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     source = systems.source(getattr(scenario.plant, "system", None))
     store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
     store.write_json(folder / "summary.json", summary(run))

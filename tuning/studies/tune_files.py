@@ -12,7 +12,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import free_gains, schema, systems
+from ptsmc_jax.scenario import free_gains, parsing, systems
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
@@ -133,9 +133,9 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
-    """Fill a result folder; known_by: see `sentences`."""
-    store.write_toml(folder / "scenario.toml", schema.dump(scenario))
-    store.write_toml(folder / "tuned.toml", schema.dump(tuning.tuned))
+    """Fill a result folder; known_by: see `told`."""
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
+    store.write_toml(folder / "tuned.toml", parsing.dump(tuning.tuned))
     store.write_json(folder / "versions.json", store.versions(**known_by))
     store.write_json(folder / "summary.json", summary(tuning))
     assert scenario.tune is not None

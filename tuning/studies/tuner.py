@@ -14,12 +14,12 @@ from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.scenario import Study, replace, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.pace import Reach, reach_of
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, least_within
 from ptsmc_jax.theory import margins
-from tuning.search import bounds as gain_bounds
 from tuning.search import confirm, evolution, gains, margin_rows, objective, trust
+from tuning.search import shares as gain_bounds
 from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import Check
@@ -37,7 +37,7 @@ SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering"
 
 @dataclass(frozen=True)
 class Trust:
-    """What makes the result believable, see `tuning.trust`."""
+    """What makes the result believable, see `trust`."""
 
     slope_error: tuple[float, float] | None  # at the first start and at the end; None: flown with the exact sign
     profiles: dict[str, Profile]

@@ -17,7 +17,7 @@ from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import checks, plant_tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain import hand_over
+from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock

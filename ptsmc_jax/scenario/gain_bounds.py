@@ -24,45 +24,53 @@ class Choice(NamedTuple):
 
     @property
     def law(self) -> Any:
-        """Its table."""
+        """The table of the scenario's law."""
         return self.scenario.controller
 
     @property
     def t_f(self) -> float:
-        """The scenario's own [s]."""
+        """The prescribed time of the scenario [s]."""
         return self.law.t_f
 
     @property
     def sampled(self) -> bool:
-        """Whether the loop is."""
+        """Whether the loop is sampled."""
         return self.scenario.loop.mode == "sampled"
 
     @property
-    def shortest(self) -> float:
+    def shortest_delta(self) -> float:
         """The shortest delta [s]: a period, if there is one."""
         return self.scenario.loop.period if self.sampled else 0.0
 
-    def least(self, name: str) -> float:
+    def smallest(self, name: str) -> float:
         """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
         return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
 
 
-def _positive(_: Choice) -> tuple[float, float, bool]:
-    return 0.0, math.inf, False
+class Allowed(NamedTuple):
+    """Between which numbers bounds of a gain may be set, the upper one excluded."""
+
+    lower: float
+    upper: float
+    lower_included: bool = False
 
 
-class Gain(NamedTuple):
-    """Its bounds by a choice: the usual ones; lowest and highest that may be set, and whether the lowest itself may."""
+def _positive(_: Choice) -> Allowed:
+    return Allowed(0.0, math.inf)
 
-    usual: Callable[[Choice], Interval]
-    allowed: Callable[[Choice], tuple[float, float, bool]] = _positive
+
+class GainBounds(NamedTuple):
+    """The bounds of a gain, as functions of a `Choice`."""
+
+    usual: Callable[[Choice], Interval]  # where a scenario gives none
+    allowed: Callable[[Choice], Allowed] = _positive
     below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
-    above: str | None = None
+    above: str | None = None  # and above the upper one
 
 
-def between(least: float, most: float) -> Callable[[Choice], tuple[float, float, bool]]:
+def between(least: float, most: float) -> Callable[[Choice], Allowed]:
     """Bounds that lie between two numbers."""
-    return lambda _: (least, most, False)
+    return lambda _: Allowed(least, most)
 
 
 def rounded(bound: float) -> float:
@@ -89,20 +97,20 @@ def _converged(scenario: Any) -> float:
 
 
 def _usual_t_f(choice: Choice) -> Interval:
-    shortest = 4.0 * choice.shortest if "delta" in choice.free else hand_over(choice.scenario)
+    shortest = 4.0 * choice.shortest_delta if "delta" in choice.free else hand_over(choice.scenario)
     return max(0.5 * choice.t_f, 1.05 * shortest, 1.05 * _converged(choice.scenario)), 2.0 * choice.t_f
 
 
-def _allowed_t_f(choice: Choice) -> tuple[float, float, bool]:
-    loop, shortest = choice.scenario.loop, choice.shortest
+def _allowed_t_f(choice: Choice) -> Allowed:
+    loop, shortest = choice.scenario.loop, choice.shortest_delta
     least = max(shortest if "delta" in choice.free else hand_over(choice.scenario), _converged(choice.scenario))
     hold = loop.t_end - choice.t_f
-    return least, MOST_STEPS * loop.period - hold if choice.sampled else math.inf, False
+    return Allowed(least, MOST_STEPS * loop.period - hold if choice.sampled else math.inf)
 
 
 def _usual_delta(choice: Choice) -> Interval:
-    t_f = choice.least("t_f")  # below every one
-    lower = choice.shortest or min(0.05, t_f / 4)
+    t_f = choice.smallest("t_f")  # below every one
+    lower = choice.shortest_delta or min(0.05, t_f / 4)
     return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
 
 
@@ -124,29 +132,29 @@ def _usual_rate(choice: Choice) -> Interval:
     return 0.01 * high, high
 
 
-T_F = Gain(_usual_t_f, _allowed_t_f)
-DELTA = Gain(
+T_F = GainBounds(_usual_t_f, _allowed_t_f)
+DELTA = GainBounds(
     _usual_delta,
-    lambda choice: (choice.shortest, choice.least("t_f"), choice.shortest > 0.0),
+    lambda choice: Allowed(choice.shortest_delta, choice.smallest("t_f"), choice.shortest_delta > 0.0),
     below="one period, the shortest hand-over that there is",
 )
-SIGN_WIDTH = Gain(
+SIGN_WIDTH = GainBounds(
     _usual_width,
     below="a narrower one is lost in the noise, or hops from side to side",
     above="so wide that hardly a switching term is left",
 )
-K1 = Gain(_usual_k1, above="the stability border of the sampled loop")
-SURFACE_RATE = Gain(_usual_rate)
+K1 = GainBounds(_usual_k1, above="the stability border of the sampled loop")
+SURFACE_RATE = GainBounds(_usual_rate)
 
 
-def eta(order: Callable[[Any], float]) -> Gain:
+def eta(order: Callable[[Any], float]) -> GainBounds:
     """The power of the approach, which must exceed a number that the scenario tells: 2, or the order of a chain."""
 
     def usual(choice: Choice) -> Interval:
         least = order(choice.scenario)
         return least + 0.05, least + 6.0
 
-    return Gain(usual, lambda choice: (order(choice.scenario), math.inf, False))
+    return GainBounds(usual, lambda choice: Allowed(order(choice.scenario), math.inf))
 
 
 def dead_beat(choice: Choice) -> Interval:
