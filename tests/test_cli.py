@@ -13,7 +13,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs, store
-from ptsmc_jax.scenario import timing
+from ptsmc_jax.scenario import parsing, timing
 from ptsmc_jax.simulation import catalogues
 from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
@@ -283,7 +283,7 @@ def test_a_run_that_fails_says_so(command, tmp_path):
 
 @pytest.mark.parametrize("met", [True, False])
 def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
-    tables = scenario.schema.dump(scenario.read(tmp_path / "s.toml"))
+    tables = parsing.dump(scenario.read(tmp_path / "s.toml"))
     folder = tmp_path / "done"
     folder.mkdir()
     store.write_toml(folder / "scenario.toml", tables)
