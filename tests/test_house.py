@@ -122,7 +122,7 @@ def imported(source):
 
 LAZY = (  # imports by names that cannot be read here
     "importlib.import_module(place)",  # `systems`: what a user names
-    "importlib.import_module(f'ptsmc_jax.scenario.{_EXPORTS[name]}')",  # what `scenario` offers, read below
+    "importlib.import_module(f'ptsmc_jax.scenario.{_EXPORTS[name]}')",  # `scenario`'s, see below
 )
 
 
@@ -208,25 +208,28 @@ print(json.dumps([changed, started, len(before)]))
     assert changed[2] > 50  # it did look
 
 
-def test_every_export_resolves():
-    assert ptsmc_jax._EXPORTS
-    for name, module in ptsmc_jax._EXPORTS.items():
-        assert getattr(ptsmc_jax, name) is getattr(importlib.import_module(f"ptsmc_jax.{module}"), name)
-    assert set(ptsmc_jax._EXPORTS) <= set(dir(ptsmc_jax))
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_every_export_resolves(package):
+    offering = importlib.import_module(package)
+    assert offering._EXPORTS
+    for name, module in offering._EXPORTS.items():
+        assert getattr(offering, name) is getattr(importlib.import_module(f"{package}.{module}"), name)
+    assert set(offering._EXPORTS) <= set(dir(offering))
     with pytest.raises(AttributeError, match="no_such_name"):
-        ptsmc_jax.no_such_name  # noqa: B018
+        offering.no_such_name  # noqa: B018
 
 
-def test_type_checkers_see_the_same_exports():
-    tree = ast.parse((ROOT / "ptsmc_jax" / "__init__.py").read_text())
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_type_checkers_see_the_same_exports(package):
+    tree = ast.parse(modules()[package].read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     seen = {}
     for node in block.body:
         assert isinstance(node, ast.ImportFrom)
         for alias in node.names:
             assert alias.asname == alias.name  # marks a re-export
-            seen[alias.name] = str(node.module).removeprefix("ptsmc_jax.")
-    assert seen == ptsmc_jax._EXPORTS
+            seen[alias.name] = str(node.module).removeprefix(f"{package}.")
+    assert seen == importlib.import_module(package)._EXPORTS
 
 
 def sources():

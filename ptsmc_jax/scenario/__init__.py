@@ -28,3 +28,7 @@ def __getattr__(name: str) -> Any:
     if name in _EXPORTS:
         return getattr(importlib.import_module(f"ptsmc_jax.scenario.{_EXPORTS[name]}"), name)
     raise AttributeError(f"module 'ptsmc_jax.scenario' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_EXPORTS]

@@ -24,6 +24,7 @@ from ptsmc_jax.scenario import (
 )
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances, references
+from ptsmc_jax.simulation.rollout import Parts
 
 
 def plant(scenario: Scenario) -> tuple[Plant, Any, Any, Any]:
@@ -45,10 +46,10 @@ def plant(scenario: Scenario) -> tuple[Plant, Any, Any, Any]:
     return model, scenario.controller.build(scenario, model), initial, made
 
 
-def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
-    """The disturbance as a function of time and state, and the rate of its random walk (None: none)."""
+def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
+    """The disturbance of the plant that flies, by time and state, and the rate of its random walk (None: none)."""
     signal, walk = [], None
-    inertia = None if scenario.spacecraft is None else true_body(scenario).inertia
+    inertia = getattr(plant, "inertia", None)
     for table in checks.terms(scenario):
         acting, step = table.build(inertia), table.walk(scenario.loop.period)
         signal += [] if acting is None else [acting]
@@ -56,7 +57,7 @@ def disturbance(scenario: Scenario, inputs: int) -> tuple[Any, Any]:
             walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # independent walks add up to one
     if len(signal) > 1:
         return disturbances.Sum(tuple(signal)), walk
-    return (signal[0] if signal else disturbances.Constant(jnp.zeros(inputs))), walk
+    return (signal[0] if signal else disturbances.Constant(jnp.zeros(plant.inputs))), walk
 
 
 def true_body(scenario: Scenario) -> rigid_body.Spacecraft:
@@ -111,14 +112,12 @@ def actuators(scenario: Scenario) -> Actuators | None:
     return Actuators(limit, rate_limit, lag, step, wheels, delay)
 
 
-def dispersion(scenario: Scenario) -> variation.Dispersion:
-    """What is drawn for each trial."""
+def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
+    """What is drawn for each trial, about these parts."""
     table = scenario.dispersion
     if table is None:
         return variation.Dispersion()
-    m = checks.inputs(scenario)
-    signal, _ = disturbance(scenario, m)
-    phases, amplitudes = (disturbances.values(signal, what).size for what in ("phase", "amplitude"))
+    phases, amplitudes = (disturbances.values(parts.disturbance, what).size for what in ("phase", "amplitude"))
 
     def drawn(key: str, *how: Any) -> Any:
         asked = getattr(table, key, None)
@@ -128,7 +127,7 @@ def dispersion(scenario: Scenario) -> variation.Dispersion:
     common = {
         "phase": None if table.disturbance_phase is None else numbers.UniformPhase(phases),
         "amplitude": drawn("disturbance_amplitude", amplitudes),
-        "bias": drawn("disturbance_bias", m),
+        "bias": drawn("disturbance_bias", parts.plant.inputs),
         "levels": {key: level for key, level in levels.items() if level is not None},
     }
     if isinstance(table, dispersion_tables.StateDispersion):
@@ -136,7 +135,7 @@ def dispersion(scenario: Scenario) -> variation.Dispersion:
     return variation.Dispersion(
         attitude=drawn("attitude"),
         rate=drawn("rate", 3),
-        inertia=drawn("inertia", true_body(scenario).inertia),
+        inertia=drawn("inertia", parts.plant.inertia),
         reference=drawn("reference"),
         **common,
     )

@@ -18,9 +18,15 @@ class Numbers(Table, frozen=True):
         """The width of so many numbers, of which a single one of the table stands for all."""
         return np.ones(count) * getattr(self, self.width)
 
-    def build(self, count: int = 1) -> Any:
-        """A part of `dispersions.numbers`, of so many numbers."""
+    def physics(self) -> Any:
+        """A class of `dispersions.numbers`."""
         raise NotImplementedError
+
+    def build(self, count: int = 1) -> Any:
+        """That part, of so many numbers."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return self.physics()(vector(self.of(count)))
 
 
 class Normal(Numbers, frozen=True):
@@ -28,12 +34,11 @@ class Normal(Numbers, frozen=True):
 
     widest: ClassVar[float] = 4.6
 
-    def build(self, count: int = 1) -> Any:
+    def physics(self) -> Any:
         """`numbers.Normal`."""
         from ptsmc_jax.dispersions.numbers import Normal as Physics
-        from ptsmc_jax.numerics.pytrees import vector
 
-        return Physics(vector(self.of(count)))
+        return Physics
 
 
 class Uniform(Numbers, frozen=True):
@@ -42,12 +47,11 @@ class Uniform(Numbers, frozen=True):
     width: ClassVar[str] = "half_width"
     widest: ClassVar[float] = float(np.sqrt(3.0))
 
-    def build(self, count: int = 1) -> Any:
+    def physics(self) -> Any:
         """`numbers.Uniform`."""
         from ptsmc_jax.dispersions.numbers import Uniform as Physics
-        from ptsmc_jax.numerics.pytrees import vector
 
-        return Physics(vector(self.of(count)))
+        return Physics
 
 
 class UniformAttitude(Table, frozen=True):
@@ -159,12 +163,11 @@ class RelativeNormal(Numbers, frozen=True):
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
 
-    def build(self, count: int = 1) -> Any:
+    def physics(self) -> Any:
         """`numbers.TruncatedNormal`."""
         from ptsmc_jax.dispersions.numbers import TruncatedNormal
-        from ptsmc_jax.numerics.pytrees import vector
 
-        return TruncatedNormal(vector(self.of(count)))
+        return TruncatedNormal
 
 
 class RelativeUniform(Uniform, frozen=True):

@@ -86,7 +86,7 @@ def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = N
     where the law meets its singularity on the way from the initial state to the reference.
     """
     parts = _parts(scenario, saves, reach)
-    dispersion = build.dispersion(scenario)
+    dispersion = build.dispersion(scenario, parts)
     if isinstance(parts.controller, prescribed_time.PrescribedTime):
         _check_reference(scenario, parts)
     if isinstance(parts.plant, System):
@@ -166,10 +166,11 @@ _path = programs.jit(solutions.exact_path)
 
 def _parts(scenario: Scenario, saves: object, reach: timing.Reach | None) -> Parts:
     model, controller, initial, reference = build.plant(scenario)
-    disturbance, walk = build.disturbance(scenario, model.inputs)
+    plant = model if scenario.spacecraft is None else build.true_body(scenario)
+    disturbance, walk = build.disturbance(scenario, plant)
     loop = scenario.loop
     parts = Parts(
-        plant=model if scenario.spacecraft is None else build.true_body(scenario),
+        plant=plant,
         disturbance=disturbance,
         reference=reference,
         controller=controller,
