@@ -59,11 +59,17 @@ def scenarios() -> str:
                 parts += [f"As for {seen[next(iter(kinds.values()))]}."]
                 continue
             for kind, struct in kinds.items():
+                if struct in seen:
+                    continue
                 default = " (default)" if kind == next(iter(kinds)) else ""
                 said = f'`kind = "{kind}"`{default}: ' if kind else ""
                 said = f'`kind = "{plant}"`: ' if name == "plant" else said
                 parts += [said + keys.about(struct), *_keys(name, struct, plant)]
-                seen[struct] = title[0].lower() + title[1:]
+            known = [(f'`"{kind}"`', seen[struct]) for kind, struct in kinds.items() if struct in seen]
+            if known:
+                named = ", ".join(kind for kind, _ in known)
+                parts += [f"As for {known[0][1]}, in the plant's own units: `kind =` {named}."]
+            seen = dict.fromkeys(kinds.values(), title[0].lower() + title[1:]) | seen
         if plant == "spacecraft":
             parts += ["### [requirements]", REQUIREMENTS, *_keys("requirements", Limit, plant)]
         else:
@@ -102,7 +108,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
         yield from _dispersion(struct)
         return
     borrowed = issubclass(struct, Attitude) and table != "initial"
-    fallback = layouts.defaults(plant, 2).get(table, {}) if table == "initial" else {}
+    fallback = layouts.defaults(plant, 2, "prescribed_time").get(table, {}) if table == "initial" else {}
     rows = [
         [f"`{key.name}`", key.allowed, _default(fallback.get(key.name, key.default)), key.unit, key.meaning]
         for key in keys.of(struct)

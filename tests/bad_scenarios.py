@@ -378,8 +378,13 @@ BAD = [
     ),
     # what the contract knows and the project cannot do yet
     ("controller.kind = 'pd'", 'controller.kind = "pd" needs the sampled loop', 'loop.mode is "continuous"'),
-    ("controller.kind = 'lqr'", 'controller.kind is "lqr"', '"prescribed_time" or "pd" or "terminal" or "fixed_time"'),
-    ("plant.kind = 'chain'\ncontroller.kind = 'pd'", 'controller.kind is "pd"', '"prescribed_time"'),
+    ("controller.kind = 'lqr'", 'controller.kind is "lqr"', 'one of "prescribed_time", "pd", "terminal", "fixed_time"'),
+    ("plant.kind = 'chain'\ncontroller.kind = 'pd'", 'controller.kind = "pd" needs', 'loop.mode is "continuous"'),
+    (
+        "plant = { kind = 'chain', order = 3 }\ncontroller.kind = 'pd'\nloop.mode = 'sampled'",
+        "plant.order is 3",
+        '2 with controller.kind = "pd", a law of second order',
+    ),
     ("controller = { kind = 'pd', eta = 3.0 }", "controller.eta is not", "controller."),
     ("controller = { kind = 'terminal', p = 2.0 }", "controller.p is 2.0", "between 1 and 2"),
     (

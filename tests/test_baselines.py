@@ -1,6 +1,7 @@
 """The laws to compare with, against the identities and closed forms that they are made for."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,9 @@ from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.laws import fixed_time, pd, terminal
+from ptsmc_jax.laws.acceleration import on
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.laws.error_motions import ErrorQuaternion
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances, references
@@ -19,12 +23,18 @@ from tests.helpers import FULL_INERTIA, vector
 
 BODY = rigid_body.spacecraft(FULL_INERTIA)
 COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
-LAWS = {
+
+
+def of_attitudes(law) -> Any:
+    return on(ErrorQuaternion, law)
+
+
+LAWS: dict[str, Any] = {
     "pd": pd.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
-    "terminal": terminal.Terminal(
+    "terminal": of_attitudes(terminal.Terminal)(
         **COMMON, p=vector(1.3), b=vector(0.6), k=vector(0.5), sign_width=vector(1e-3)
     ),
-    "fixed_time": fixed_time.FixedTime(
+    "fixed_time": of_attitudes(fixed_time.FixedTime)(
         **COMMON, a1=vector(0.3), b1=vector(0.5), a2=vector(1.2), b2=vector(0.7), p=vector(1.25), gamma=vector(2.0),
         m=vector(1.5), n=vector(0.5), sign_width=vector(1e-3),
     ),
@@ -34,11 +44,12 @@ T = vector(1.3)
 TARGET = references.Spin(vector(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()), vector([0.02, -0.01, 0.03]))(T)
 X = rigid_body.AttitudeState(vector(Rotation.from_rotvec([1.1, 0.4, -0.8]).as_quat()), vector([0.05, -0.11, 0.07]))
 D = vector([0.02, -0.01, 0.015])
+NOW = Sample(T, jnp.asarray(False), vector(0.1))
 
 
 def accelerated(law, k2=0.0):
     """V'' of the error quaternion under the law, with d known exactly, by the plant's own equations."""
-    u, s = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(k2))
+    u, s, _ = law.command(None, NOW, X, TARGET, D, vector(k2))
     motion = BODY.rate(T, X, u, D)
 
     def v_dot(t):  # along the motion, to first order in t; the reference moves on too

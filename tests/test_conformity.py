@@ -38,6 +38,7 @@ QUICK = {  # gains that reach the goal in so short a run; others fly with their 
     "pd": {"k_p": 2.0, "k_d": 2.5},
     "terminal": {"p": 1.3, "b": 1.0, "k": 1.0},
     "fixed_time": {"a1": 0.5, "b1": 0.8},
+    "super_twisting": {"surface_rate": 1.5, "lipschitz": 0.5},
 }
 ROWS: dict[str, dict] = {
     "continuous": {"controller": SLEW, "loop": SHORT, "dispersion": SPREAD},
@@ -157,7 +158,7 @@ KINDS = (
     "filter, every axis device, random walk",
     "wheels, flight clock, uniform attitudes",
     "multiplicative error, prescribed-time observer",
-    "baseline terminal",
+    "baseline time_base_sliding",
     "sampled system with noise",
     "chain, finite-time observer",
 )

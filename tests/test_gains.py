@@ -268,6 +268,6 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
 @pytest.mark.parametrize(("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws])
 def test_a_laws_table_has_bounds_for_what_its_physics_lets_tuning_move(plant, kind):
     table = LAWS[plant][kind]
-    assert set(table.gains) == set(table().physics().tunable)
+    assert set(table.gains) == set(table().physics(plant).tunable)
     assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
     assert set(table.gains) <= set(gains.units(plant))

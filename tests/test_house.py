@@ -22,7 +22,12 @@ HOUSE = {
         "batching": "components | lanes | kernel",
         "plants": "base | integrator_chain rigid_body second_order",
         "signals": "disturbances references",
-        "laws": "base error_quaternion | baseline prescribed_time | fixed_time pd terminal",
+        "laws": """
+            error_motions
+            base
+            acceleration prescribed_time
+            fixed_time pd predefined_time scaling super_twisting terminal time_base
+        """,
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
         "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
@@ -33,7 +38,9 @@ HOUSE = {
             attitude_keys device_tables dispersion_tables keys plant_tables
             disturbance_tables reference_tables scales
             gain_bounds
-            law_tables observer_tables
+            law_record observer_tables
+            baseline_tables
+            law_tables
             tables
             layouts
             checks parsing

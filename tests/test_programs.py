@@ -66,7 +66,7 @@ class _Other(_Law):
 
 
 for _kind in (_Law, _Other):
-    _kind.__module__ = "ptsmc_jax.laws.error_quaternion"
+    _kind.__module__ = "ptsmc_jax.laws.error_motions"
 pytrees.pytree(_Other)
 
 

@@ -6,10 +6,10 @@ import pytest
 
 from ptsmc_jax.scenario import errors, from_tables, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_tables import BaselineTable
 from ptsmc_jax.scenario.plant_tables import ChainPlant
 from ptsmc_jax.scenario.reference_tables import ReferenceTable
 from ptsmc_jax.scenario.tables import Scenario
@@ -104,6 +104,11 @@ BASELINES = {
     "fixed_time": {
         "a1": 0.1, "b1": 0.2, "a2": 1.0, "b2": 1.0, "p": 1.25, "gamma": 2.0, "m": 1.5, "n": 0.5, "sign_width": 1e-3,
     },
+    "time_base_pd": {"k_p": 1.0, "k_d": 2.0},
+    "time_base_sliding": {"surface_rate": 1.0, "k": 1.0, "sign_width": 1e-3},
+    "scaling": {"delta": 2.0, "m": 1.0, "k1": 1.0, "k": 1e-3},
+    "predefined_time": {"share": 0.6, "q1": 0.3, "q2": 0.3, "sign_width": 1e-2},
+    "super_twisting": {"surface_rate": 0.4, "lipschitz": 0.01, "sign_width": 1e-3},
 }  # fmt: skip
 # every key of every table, one table at a time so that what is made wrong in it is all that is wrong
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"

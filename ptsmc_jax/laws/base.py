@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import formulas
+from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf
 
@@ -32,14 +33,17 @@ class Motion(NamedTuple):
     clearance: Array  # how far from a singularity, positive on this side of it
 
 
-class Law:
-    """What the rollout asks of a law, and what it needs no law of its own to say.
+class Sample(NamedTuple):
+    """When a law is computed."""
 
-    Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
-    and inputs' own units. A law is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
-    """
+    t: Scalar  # [s]
+    hold: Bool[Array, ""]  # after the hand-over
+    dt: Scalar  # length of the control period that begins, over which the input is held [s]
 
-    model: Any  # the nominal plant
+
+class Law(ErrorMotion):
+    """What the rollout asks of a law, besides the error that it drives to zero."""
+
     t_f: Leaf  # prescribed time, or when the error is judged [s]
     delta: Leaf  # hand-over this long before t_f [s]
     tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
@@ -49,36 +53,30 @@ class Law:
         """t_s = t_f - delta [s]."""
         return self.t_f - self.delta
 
-    def align(self, x: Any, target: Any) -> Any:
-        """The initial state in the form that the law can bring to the target."""
-        return x
-
-    def clearance(self, x: Any, target: Any) -> Scalar:
-        """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
-        return jnp.ones_like(self.t_f)
-
-    def whole_clearance(self, first: Scalar) -> Scalar:
-        """What clearances are counted in, from that of the initial state: its sign, so that the first is positive."""
-        return jnp.where(first < 0.0, -1.0, 1.0)
-
     def torque(
         self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector]:
         """Commanded input (m,) and sliding variable; d_hat: estimated disturbance, k2: K2, bound on its error."""
         raise NotImplementedError
 
+    def begin(self) -> Any:
+        """What the law remembers before its first sample, a pytree of arrays; None: nothing, ever."""
+        return None
+
+    def command(
+        self, memory: Any, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector, Any]:
+        """The same as `torque` in the sampled loop, for laws that remember something, or look at the period ahead.
+
+        Commanded input (m,), sliding variable, and the memory that the next sample finds.
+        """
+        u, s = self.torque(now.t, now.hold, x, target, d_hat, k2)
+        return u, s, memory
+
     @property
     def order(self) -> int:
         """Order n of the error's motion: 2, or that of a chain."""
         return 2
-
-    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
-        """What is driven to zero, (m,), and its derivative."""
-        raise NotImplementedError
-
-    def angle(self, x: Any, target: Any) -> Scalar:
-        """What settles: the angle to the reference [rad], for other plants |x_1|."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -149,14 +147,6 @@ class SecondOrder(Prescribed):
     def surface(self) -> Float[Array, "1"]:
         """(c,) [1/s]."""
         return jnp.reshape(self.surface_rate, 1)
-
-    def influence(self, x: Any, target: Any) -> Scalar:
-        """The factor N, what a unit of disturbance does to 2 eps'' at most."""
-        raise NotImplementedError
-
-    def invert(self, x: Any, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
-        """Input (m,) for which 2 eps'' is `wanted` if the disturbance is d_hat."""
-        raise NotImplementedError
 
     def motion(self, target: Any, start: Any, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
         """State and w' for which the error and its derivatives are these; start: the initial state, for branches."""

@@ -6,16 +6,15 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.baseline import Baseline
+from ptsmc_jax.laws.acceleration import SlidingLaw
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf
 
 Vector = Float[Array, " m"]
 
 
-@pytree
 @dataclass(frozen=True)
-class FixedTime(Baseline):
+class FixedTime(SlidingLaw):
     """s = v + sig^p(v'/kappa), kappa = a1 |v|^(gamma-1/p) + b1; 1 < p < 2, gamma - 1/p > 1, m > 1 > n > 0.
 
     alpha = kappa' v'^2/kappa - (kappa^p/p) (sig^(2-p)(v') + a2 sig^m(s) + b2 sig^n(s)) - K sign(s). Surface: Zuo,
@@ -36,12 +35,12 @@ class FixedTime(Baseline):
     sign_width: Leaf
     tunable: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "sign_width", "t_f")
 
-    def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
+    def surface(self, error: Vector, error_rate: Vector) -> tuple[Vector, Vector]:
         """As the class says, without K sign(s)."""
         bend = self.gamma - 1.0 / self.p
-        kappa = self.a1 * guards.signed_power(jnp.abs(v), bend) + self.b1
-        kappa_slope = self.a1 * bend * guards.signed_power(v, bend - 1.0)
-        s = v + guards.signed_power(v_dot / kappa, self.p)
-        pull = guards.signed_power(v_dot, 2.0 - self.p)
+        kappa = self.a1 * guards.signed_power(jnp.abs(error), bend) + self.b1
+        kappa_slope = self.a1 * bend * guards.signed_power(error, bend - 1.0)
+        s = error + guards.signed_power(error_rate / kappa, self.p)
+        pull = guards.signed_power(error_rate, 2.0 - self.p)
         pull = pull + self.a2 * guards.signed_power(s, self.m) + self.b2 * guards.signed_power(s, self.n)
-        return s, kappa_slope * v_dot * v_dot / kappa - guards.signed_power(kappa, self.p) / self.p * pull
+        return s, kappa_slope * error_rate * error_rate / kappa - guards.signed_power(kappa, self.p) / self.p * pull

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax.laws.base import Motion, Prescribed, SecondOrder
-from ptsmc_jax.laws.error_quaternion import ErrorQuaternion
+from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
 from ptsmc_jax.numerics import attitude, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.plants.integrator_chain import Chain
@@ -37,10 +37,6 @@ class _Attitude(SecondOrder):
         """K1 of (60) [1/s]: half of what (29)'s K1 does."""
         return self.k1
 
-    def angle(self, x: AttitudeState, target: Target) -> Scalar:
-        """Angle between the attitude and its reference [rad]."""
-        return attitude.angle(x.q, target.q)
-
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
         return 0.5 * guards.norm(self.model.inertia_inverse) * k2
@@ -48,7 +44,7 @@ class _Attitude(SecondOrder):
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTime(_Attitude):
+class PrescribedTime(ErrorVector, _Attitude):
     """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
 
     (56), (57) before and (59), (60) after the hand-over. Besides what `SecondOrder` says: `T` of (1) is both torque and
@@ -59,32 +55,6 @@ class PrescribedTime(_Attitude):
     from 150 to -150 degrees about an axis the body turns by 300 degrees. After the hand-over nothing stays "at the
     origin": the rates are c (`surface_rate`, 1 1/s in the paper) and K1/2.
     """
-
-    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
-        """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""
-        opposite = x.q[3] * target.q[3] < 0.0
-        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
-
-    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
-        """q4 counted positive on the reference's side [-]: at 0 the law is singular, beyond it cannot come back."""
-        return jnp.where(target.q[3] < 0.0, -x.q[3], x.q[3])
-
-    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
-        """eps_1 [-] and its derivative [1/s], (4)."""
-        reference_rate, _ = target.vector_rates()
-        v_dot, _ = attitude.vector_rates(x.q, x.w, jnp.zeros(3))
-        return x.q[:3] - target.q[:3], v_dot - reference_rate
-
-    def influence(self, x: AttitudeState, target: Target) -> Scalar:
-        """|T J^-1| of (57) [1/(kg m^2)]."""
-        return guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
-
-    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 eps_1'' = wanted [1/s^2]: w x J w - d_hat + J T^-1 (wanted + 2 q_1f'' - T' w)."""
-        _, reference_acceleration = target.vector_rates()
-        t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
-        turned = attitude.t_inverse_times(x.q, wanted + 2.0 * reference_acceleration - t_dot_w)
-        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
 
     def motion(
         self, target: Target, start: AttitudeState, error: Vector, error_rate: Vector, acceleration: Vector
@@ -127,7 +97,7 @@ class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeSystem(SecondOrder):
+class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
     """Law (29) for a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation.
 
     x_1 is the error, so F may know the time: a moving reference is part of it. dF/dx2 G must be invertible along the
@@ -137,33 +107,6 @@ class PrescribedTimeSystem(SecondOrder):
     """
 
     model: System  # the nominal plant
-
-    def clearance(self, x: State, target: Scalar) -> Scalar:
-        """Det of dF/dx2 G: at 0 the law is singular."""
-        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
-        return matrices.determinant(slope @ gain)
-
-    def whole_clearance(self, first: Scalar) -> Scalar:
-        """The determinant at the start: the ratio does not depend on units."""
-        return first
-
-    def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:
-        """x_1 and F(t, x), (n,) each."""
-        return self.model.position(x), self.model.position_rate(target, x)
-
-    def angle(self, x: State, target: Scalar) -> Scalar:
-        """|x_1|."""
-        return guards.norm(self.model.position(x))
-
-    def influence(self, x: State, target: Scalar) -> Scalar:
-        """2 |dF/dx2 D|."""
-        return 2.0 * guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
-
-    def invert(self, x: State, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
-        """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
-        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
-        pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
-        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
 
     def motion(self, target: Scalar, start: State, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
         """x_2 from F(t, x_1, x_2) = x_1' by Newton's method from the initial x_2: one step where F is linear in x_2."""
@@ -196,7 +139,7 @@ def expansion(eta: Scalar, order: int) -> list[Scalar]:
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeChain(Prescribed):
+class PrescribedTimeChain(ErrorOfChain, Prescribed):
     """Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
 
     For order 2 it is (24) on (6). Differences from the paper: its sums of (38), (40) and (52) run to n-1, but x_(n+1)
@@ -213,14 +156,6 @@ class PrescribedTimeChain(Prescribed):
     def order(self) -> int:
         """Order n of the chain."""
         return self.model.order
-
-    def errors(self, x: Float[Array, " n"], target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-        """x_1 and x_2, (1,) each: the origin is the target."""
-        return x[:1], x[1:2]
-
-    def angle(self, x: Float[Array, " n"], target: Any) -> Scalar:
-        """|x_1|."""
-        return jnp.abs(x[0])
 
     def torque(
         self, t: Scalar, hold: Bool[Array, ""], x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar

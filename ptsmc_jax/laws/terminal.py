@@ -5,16 +5,15 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.baseline import Baseline
+from ptsmc_jax.laws.acceleration import SlidingLaw
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf
 
 Vector = Float[Array, " m"]
 
 
-@pytree
 @dataclass(frozen=True)
-class Terminal(Baseline):
+class Terminal(SlidingLaw):
     """s = v + sig^p(v')/b, alpha = -(b/p) sig^(2-p)(v') - k s - K sign(s), with sig^a(x) = sign(x) |x|^a, 1 < p < 2.
 
     Feng, Yu, Man, Non-singular terminal sliding mode control of rigid manipulators, Automatica 38(12), 2002. On s = 0 a
@@ -27,7 +26,7 @@ class Terminal(Baseline):
     sign_width: Leaf
     tunable: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
 
-    def surface(self, v: Vector, v_dot: Vector) -> tuple[Vector, Vector]:
+    def surface(self, error: Vector, error_rate: Vector) -> tuple[Vector, Vector]:
         """As the class says, without K sign(s)."""
-        s = v + guards.signed_power(v_dot, self.p) / self.b
-        return s, -self.b / self.p * guards.signed_power(v_dot, 2.0 - self.p) - self.k * s
+        s = error + guards.signed_power(error_rate, self.p) / self.b
+        return s, -self.b / self.p * guards.signed_power(error_rate, 2.0 - self.p) - self.k * s

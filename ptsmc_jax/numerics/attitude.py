@@ -93,6 +93,24 @@ def from_rotation_vector(r: Vector) -> Quaternion:
     return jnp.append(scale * r, scalar)
 
 
+def rotation_vector(v: Vector) -> Vector:
+    """Rotation vector [rad] of the unit quaternion with the vector part v, |v| < 1, and a scalar that is positive.
+
+    Smooth at v = 0.
+
+    >>> bool(
+    ...     jnp.allclose(rotation_vector(from_rotation_vector(jnp.array([0.1, 0.0, 2.0]))[:3]), jnp.array([0.1, 0, 2]))
+    ... )
+    True
+    """
+    square = jnp.dot(v, v)
+    small = square < 1e-6  # beyond the series' four terms: 1e-6^4
+    size = jnp.sqrt(jnp.where(small, 0.25, square))
+    scalar = jnp.sqrt(jnp.maximum(1.0 - square, 1e-12))
+    series = 2.0 + square / 3 + 3 * square**2 / 20 + 5 * square**3 / 56
+    return v * jnp.where(small, series, 2.0 * jnp.arctan2(size, jnp.where(small, 0.5, scalar)) / size)
+
+
 def angle(q: Quaternion, reference: Quaternion) -> Float[Array, ""]:
     """Angle of the rotation from one attitude to another [rad], 0 to pi, accurate down to 0; gradient 0 there.
 

@@ -109,7 +109,7 @@ def _check_plant(scenario: Scenario) -> None:
     if isinstance(plant, plant_tables.SystemPlant):
         _check_system(plant)
     else:
-        _check_chain(plant, scenario.controller)
+        _check_chain(plant)
     m, n = inputs(scenario), len(plant.x0)
     for k, term in enumerate(terms(scenario)):
         name = f"disturbance.terms[{k}]" if len(terms(scenario)) > 1 else "disturbance"
@@ -154,19 +154,10 @@ def system(plant: plant_tables.SystemPlant) -> "System":
     return found
 
 
-def _check_chain(plant: plant_tables.ChainPlant, controller: Any) -> None:
+def _check_chain(plant: plant_tables.ChainPlant) -> None:
     n = plant.order
     if len(plant.x0) != n:
         raise wrong("plant.x0", plant.x0, f"a list of plant.order = {n} numbers")
-    if not controller.eta > n:
-        theorem = "Theorem 1" if n == 2 else "Theorem 3"
-        raise wrong("controller.eta", controller.eta, f"greater than plant.order, {n} ({theorem})")
-    if len(controller.a) != n - 1:
-        raise wrong("controller.a", controller.a, f"a list of plant.order - 1 = {n - 1} numbers")
-    if not formulas.hurwitz(controller.a):
-        raise wrong(
-            "controller.a", controller.a, "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
-        )
 
 
 def terms(scenario: Scenario) -> tuple[Any, ...]:
@@ -221,7 +212,7 @@ def _check_loop(scenario: Scenario) -> None:
     if not controller.prescribed and not sampled:
         kind = errors.show(scenario.controller.kind)
         raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
-    controller.check()
+    controller.check(scenario)
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     assert loop.t_end is not None  # `resolve` filled it in

@@ -1,54 +1,22 @@
-"""The laws of a scenario file: each a table with its keys, its gains, what it is refused for, and what it is made into.
+"""The paper's laws of a scenario file: each a table with its keys, its gains, what it is refused for, how it is built.
 
-A law is its physics in a file of `laws`, a table here, and a row in `LAWS`.
+A law is its physics in a file of `laws`, a table, and a row: here, or among those to compare with.
 """
 
-import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
+from ptsmc_jax import formulas
 from ptsmc_jax.scenario import gain_bounds
+from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, between
-from ptsmc_jax.scenario.values import NotNegative, Positive, Table
+from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.law_record import LawTable
+from ptsmc_jax.scenario.values import NotNegative, Positive
 
-Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
-AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
-
-
-class LawTable(Table, frozen=True):
-    """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
-
-    gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
-    # those that are free where a scenario does not say; the second ones in the sampled loop only, since without samples
-    # a larger K1 and a narrower sign cost nothing but steps
-    free_by_default: ClassVar[tuple[str, ...]] = ()
-    free_if_sampled: ClassVar[tuple[str, ...]] = ()
-    prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
-
-    def physics(self) -> Any:
-        """What flies: a class of `laws`, its fields named as the keys."""
-        raise NotImplementedError
-
-    def turning(self, t_f: float) -> tuple[str, float]:
-        """How fast it turns the body [rad/s], at most, and the key that says so."""
-        raise NotImplementedError
-
-    def check(self) -> None:
-        """Raise ScenarioError where its keys contradict each other."""
-
-    def build(self, scenario: Any, model: Any) -> Any:
-        """The law of a plant's model."""
-        from ptsmc_jax.numerics.pytrees import vector
-
-        made = self.physics()
-        names = [field.name for field in dataclasses.fields(made) if field.name != "model"]
-        own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
-        return made(model, **{name: vector(value) for name, value in own.items()})
 
 
 def _eta_must_exceed_two(_: Any) -> float:
@@ -103,171 +71,11 @@ class SpacecraftController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self) -> Any:
+    def physics(self, plant: str) -> Any:
         """By its error."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeMultiplicative
 
         return PrescribedTimeMultiplicative if self.error == "multiplicative" else PrescribedTime
-
-
-class BaselineTable(LawTable, frozen=True):
-    """What the laws to compare with have besides their gains.
-
-    Attributes:
-        t_f: when the law is judged [s]
-        disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
-        initial_estimate_error: bound on the observer's error at t = 0 [N m]
-    """
-
-    t_f: Positive = 30.0
-    disturbance_rate_bound: NotNegative = 1e-3
-    disturbance_bound: NotNegative = 0.01
-    initial_estimate_error: NotNegative = 0.0
-
-
-def _over_t_f(low: float, high: float, power: int = 1) -> GainBounds:
-    """Bounds low / t_f^power and high / t_f^power."""
-    return GainBounds(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
-
-
-class PDController(BaselineTable, frozen=True):
-    """Quaternion PD with the reference's motion fed forward (Wie, Weiss, Arapostathis 1989); sampled loop only.
-
-    Attributes:
-        k_p: gain on the vector part of the error quaternion [1/s^2]
-        k_d: gain on the rate error [1/s]
-    """
-
-    kind: Literal["pd"] = "pd"
-    k_p: Positive = 0.2
-    k_d: Positive = 0.6
-    gains: ClassVar[Mapping[str, GainBounds]] = {
-        "k_p": _over_t_f(2.0, 2000.0, 2),
-        "k_d": _over_t_f(0.3, 100.0),
-        "t_f": gain_bounds.T_F,
-    }
-    free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
-
-    def physics(self) -> Any:
-        """`laws.pd`."""
-        from ptsmc_jax.laws.pd import QuaternionPD
-
-        return QuaternionPD
-
-    def turning(self, t_f: float) -> tuple[str, float]:
-        """The rate at the goal if all of its spring's potential energy had become motion."""
-        return "controller.k_p", 2.0 * math.sqrt(self.k_p)
-
-
-class TerminalController(BaselineTable, frozen=True):
-    """Nonsingular terminal sliding mode, s = v + sig^p(v') / b (Feng, Yu, Man 2002); sampled loop only.
-
-    Attributes:
-        p: power of the surface
-        b: scale of the surface [1/s^p]
-        k: reaching gain [1/s^2]
-        sign_width: of the smooth sign; 0 is the exact sign
-    """
-
-    kind: Literal["terminal"] = "terminal"
-    p: Power = 1.3
-    b: Positive = 0.1
-    k: Positive = 0.1
-    sign_width: NotNegative = 1e-3
-    gains: ClassVar[Mapping[str, GainBounds]] = {
-        "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
-        "b": _over_t_f(0.01, 100.0),
-        "k": _over_t_f(2.0, 2000.0, 2),
-        "sign_width": gain_bounds.SIGN_WIDTH,
-        "t_f": gain_bounds.T_F,
-    }
-    free_by_default: ClassVar[tuple[str, ...]] = ("p", "b", "k")
-    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
-
-    def physics(self) -> Any:
-        """`laws.terminal`."""
-        from ptsmc_jax.laws.terminal import Terminal
-
-        return Terminal
-
-    def turning(self, t_f: float) -> tuple[str, float]:
-        """On its surface, at |v| = 1."""
-        return "controller.b", 2.0 * self.b ** (1.0 / self.p)
-
-
-def _usual_p(choice: Choice) -> tuple[float, float]:
-    least = _allowed_p(choice)[0]
-    return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
-
-
-def _allowed_p(choice: Choice) -> Allowed:
-    """For gamma - 1/p > 1; where gamma is free too, it follows p."""
-    return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
-
-
-def _usual_gamma(choice: Choice) -> tuple[float, float]:
-    least = _allowed_gamma(choice)[0]
-    return least + 0.05, least + 2.0
-
-
-def _allowed_gamma(choice: Choice) -> Allowed:
-    """Gamma - 1/p > 1, for every p."""
-    return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
-
-
-class FixedTimeController(BaselineTable, frozen=True):
-    """Fixed-time sliding mode (Zuo 2015; Jiang, Hu, Friswell 2016), gamma - 1/p > 1; sampled loop only.
-
-    Attributes:
-        a1: surface, weight of |v|^gamma, which rules far from the goal [1/s]
-        b1: surface, weight of |v|^(1/p), which rules near it [1/s]
-        a2: reaching law, weight of |s|^m, which rules far from the surface [1/s^(2-p)]
-        b2: reaching law, weight of |s|^n, which rules near it [1/s^(2-p)]
-        p: power of the surface
-        gamma: power of the surface
-        m: power of the reaching law
-        n: power of the reaching law
-        sign_width: of the smooth sign; 0 is the exact sign
-    """
-
-    kind: Literal["fixed_time"] = "fixed_time"
-    a1: Positive = 0.1
-    b1: Positive = 0.2
-    a2: Positive = 1.0
-    b2: Positive = 1.0
-    p: Power = 1.25
-    gamma: AboveOne = 2.0
-    m: AboveOne = 1.5
-    n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
-    sign_width: NotNegative = 1e-3
-    gains: ClassVar[Mapping[str, GainBounds]] = {
-        "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
-        **dict.fromkeys(("a1", "b1"), _over_t_f(0.01, 100.0)),
-        **dict.fromkeys(("a2", "b2"), GainBounds(lambda _: (1e-4, 10.0))),
-        "gamma": GainBounds(_usual_gamma, _allowed_gamma),
-        "m": GainBounds(lambda _: (1.05, 3.0), between(1.0, math.inf)),
-        "n": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
-        "sign_width": gain_bounds.SIGN_WIDTH,
-        "t_f": gain_bounds.T_F,
-    }
-    free_by_default: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n")
-    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
-
-    def physics(self) -> Any:
-        """`laws.fixed_time`."""
-        from ptsmc_jax.laws.fixed_time import FixedTime
-
-        return FixedTime
-
-    def turning(self, t_f: float) -> tuple[str, float]:
-        """On its surface, at |v| = 1."""
-        return "controller.a1", 2.0 * (self.a1 + self.b1)
-
-    def check(self) -> None:
-        """Its surface is nonsingular for gamma - 1/p > 1 only."""
-        if not self.gamma - 1.0 / self.p > 1.0:
-            raise wrong("controller.gamma", self.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
 
 class SystemController(PrescribedTable, frozen=True):
@@ -296,7 +104,7 @@ class SystemController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self) -> Any:
+    def physics(self, plant: str) -> Any:
         """`laws.prescribed_time`."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
 
@@ -321,21 +129,31 @@ class ChainController(SystemController, frozen=True):
         "eta": gain_bounds.eta(lambda scenario: float(scenario.plant.order)),  # Theorem 3
     }
 
-    def physics(self) -> Any:
+    def physics(self, plant: str) -> Any:
         """`laws.prescribed_time`."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain
 
         return PrescribedTimeChain
+
+    def check(self, scenario: Any) -> None:
+        """Theorems 1 and 3, and a surface (39) that is stable."""
+        n = scenario.plant.order
+        if not self.eta > n:
+            theorem = "Theorem 1" if n == 2 else "Theorem 3"
+            raise wrong("controller.eta", self.eta, f"greater than plant.order, {n} ({theorem})")
+        if len(self.a) != n - 1:
+            raise wrong("controller.a", self.a, f"a list of plant.order - 1 = {n - 1} numbers")
+        if not formulas.hurwitz(self.a):
+            stable = "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
+            raise wrong("controller.a", self.a, stable)
 
 
 # by the kind of the plant and the kind of the law, the default first
 LAWS: dict[str, Mapping[str, type[LawTable]]] = {
     "spacecraft": {
         "prescribed_time": SpacecraftController,
-        "pd": PDController,
-        "terminal": TerminalController,
-        "fixed_time": FixedTimeController,
+        **BASELINES,
     },
-    "chain": {"prescribed_time": ChainController},
-    "system": {"prescribed_time": SystemController},
+    "chain": {"prescribed_time": ChainController, **BASELINES},
+    "system": {"prescribed_time": SystemController, **BASELINES},
 }

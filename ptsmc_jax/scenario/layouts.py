@@ -71,12 +71,13 @@ _CASE_I: dict[str, Mapping[str, Any]] = {
 }
 
 
-def defaults(kind: str, order: int) -> dict[str, Mapping[str, Any]]:
+def defaults(kind: str, order: int, law: object) -> dict[str, Mapping[str, Any]]:
     """Defaults that no single key tells: the paper's Case I; a chain's, Figs. 1 and 2 for order 2 and 3."""
     if kind == "spacecraft":
         return _CASE_I
+    others: Mapping[str, Any] = {} if law == "prescribed_time" else {"t_f": 5.0}  # the paper's, for every law
     if kind == "system":
-        return {}
+        return {"controller": others}
     x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
     poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
-    return {"plant": {"x0": x0}, "controller": {"eta": order + 1.0, "a": poles_at_minus_one}}
+    return {"plant": {"x0": x0}, "controller": others or {"eta": order + 1.0, "a": poles_at_minus_one}}

@@ -98,7 +98,8 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
         if order < 2:
             raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
-    fallback = layouts.defaults(kind, order)
+    law = raw.get("controller", {}).get("kind", next(iter(layouts.LAWS[kind])))
+    fallback = layouts.defaults(kind, order, law)
     found: dict[str, Any] = {}
     for name in layout:
         if name not in raw and name in layouts.OPTIONAL:
@@ -201,7 +202,8 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Tab
         return _fields(name, raw, kinds)
     kind = raw.get("kind", next(iter(kinds)))
     if not isinstance(kind, str) or kind not in kinds:
-        raise wrong(f"{name}.kind", kind, " or ".join(map(show, kinds)))
+        known = list(map(show, kinds))
+        raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 7 else f"one of {', '.join(known)}")
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
         return _sum(name, raw, kinds)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.actuators import Actuators, Drive
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.simulation.assembly import Parts
 
@@ -24,6 +25,7 @@ class Computer(NamedTuple):
     sensing: Any  # memory of the sensors
     seen: Any  # state as the law saw it at the last sample
     memory: Array  # of the observer
+    law: Any  # memory of the law; None where it has none
     # what the observer is told of the last period: mean torque [N m], and momentum of the wheels in it [N m s]
     told: tuple[Array, Array | None] | None  # None: kept elsewhere
 
@@ -74,13 +76,14 @@ def boot(parts: Parts, seed: Whole, trial: Whole, x0: Any, first: Ticks) -> Comp
     sensing = None if parts.sensors is None else parts.sensors.begin(seed, trial, x0, first)
     none = jnp.zeros(parts.plant.inputs)
     wheels = parts.actuators is not None and parts.actuators.wheels is not None
-    return Computer(sensing, x0, parts.observer.begin(), (none, none if wheels else None))
+    told = none, none if wheels else None
+    return Computer(sensing, x0, parts.observer.begin(), parts.controller.begin(), told)
 
 
 def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) -> tuple[Decision, Computer]:
     """The flight software in a control period: sensors, observer, law; k2: its K2(t) [s]; x: the true state.
 
-    `sentences` of the computer that comes back is the old one: what the period's command brings about is not known yet.
+    `told` of the computer that comes back is the old one: what the period's command brings about is not known yet.
     """
     now, dt_before, matrix = period
     law, observer, sensors = parts.controller, parts.observer, parts.sensors
@@ -95,8 +98,10 @@ def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) ->
     memory = observer.update(matrix, computer.memory, impulse, now.t, dt_before)
     memory = jnp.where(dt_before > 0.0, memory, computer.memory)
     d_hat = observer.estimate(memory)
-    u, s = law.torque(now.t, now.hold, seen, target, d_hat, k2(now.t))
-    return Decision(target, d_hat, u, s, w), Computer(sensing, seen, memory, computer.told)
+    sample = Sample(now.t, now.hold, period.length)
+    u, s, kept = law.command(computer.law, sample, seen, target, d_hat, k2(now.t))
+    kept = jax.tree.map(lambda new, old: jnp.where(period.length > 0.0, new, old), kept, computer.law)
+    return Decision(target, d_hat, u, s, w), Computer(sensing, seen, memory, kept, computer.told)
 
 
 def told(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:

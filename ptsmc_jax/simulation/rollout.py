@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators, Drive
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import draws, guards, integrators, matrices
 from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.observers.base import Observer
@@ -285,8 +286,13 @@ def _finish(parts: Parts, course, first, state: _State, memory: Array, k2, rows,
         target = parts.reference(judged.t_end)
         hold = judged.t_end >= parts.controller.hand_over
         d_hat = parts.observer.estimate(memory)
-        u, s = parts.controller.torque(judged.t_end, hold, state.x, target, d_hat, k2(judged.t_end))
-        u = u if world is None else state.u  # sampled: held
+        about = state.x, target, d_hat, k2(judged.t_end)
+        if world is None:
+            u, s = parts.controller.torque(judged.t_end, hold, *about)
+        else:  # the input is held
+            sample = Sample(judged.t_end, hold, parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+            _, s, _ = parts.controller.command(world.computer.law, sample, *about)
+            u = state.u
         pushed = None if world is None else world.pushed
         wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
         last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)

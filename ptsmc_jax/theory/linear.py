@@ -168,15 +168,16 @@ class _Local:
     def _rest(self, carry: Carry) -> Any:
         computer = carry.computer
         kept = None if self._turned else _numbers(computer.sensing)
-        return carry.acting, computer.memory, computer.told, carry.model, kept
+        return carry.acting, computer.memory, computer.told, carry.model, kept, _numbers(computer.law)
 
     def moved(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
-        acting, memory, told, model, kept = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
+        acting, memory, told, model, kept, law = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
         inside = base.computer.sensing
         inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
-        computer = Computer(inside, plant.moved(base.computer.seen, seen), memory, told)
+        law = _with_numbers(base.computer.law, law)
+        computer = Computer(inside, plant.moved(base.computer.seen, seen), memory, law, told)
         return Carry(plant.moved(base.x, x), acting, computer, model)
 
     def apart(self, other: Carry) -> Array:
@@ -190,7 +191,7 @@ class _Local:
 
 
 def _numbers(memory: Any) -> list[Array]:
-    """The numbers of a sensor's memory that can change by a little."""
+    """The numbers of a memory, of sensors or a law, that can change by a little."""
     return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
 
 

@@ -15,8 +15,9 @@ from jaxtyping import Array
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.scenario import keys, plant_tables
+from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.device_tables import SteadyStateFilter
-from ptsmc_jax.scenario.law_tables import LAWS, BaselineTable
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS, NonlinearObserver
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table

@@ -14,8 +14,9 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
 from ptsmc_jax.scenario import errors, parsing, plant_tables, replace, study, tables
+from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_tables import LAWS, BaselineTable
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict

@@ -1,0 +1,211 @@
+"""The errors that laws drive to zero, each with how inputs and disturbances move it: eps'' = .. + (gain) u + .. d.
+
+A law knows one of these; what it wants of eps'' is turned into the plant's input.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics import attitude, guards, matrices
+from ptsmc_jax.plants.integrator_chain import Chain
+from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.plants.second_order import System
+from ptsmc_jax.signals.references import Target
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
+State = Float[Array, " states"]
+
+
+class ErrorMotion:
+    """What an error eps of a plant is, and how its input moves it.
+
+    Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
+    and inputs' own units. It is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
+    """
+
+    model: Any  # the nominal plant
+
+    def align(self, x: Any, target: Any) -> Any:
+        """The initial state in the form that the law can bring to the target."""
+        return x
+
+    def clearance(self, x: Any, target: Any) -> Scalar:
+        """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
+        return jnp.ones(())
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """The unit of `clearance`, by that of the initial state: its sign, so that every run begins on the side 1."""
+        return jnp.where(first < 0.0, -1.0, 1.0)
+
+    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
+        """What is driven to zero, (m,), and its derivative."""
+        raise NotImplementedError
+
+    def angle(self, x: Any, target: Any) -> Scalar:
+        """What settles: the angle to the reference [rad], for other plants |x_1|."""
+        raise NotImplementedError
+
+    def influence(self, x: Any, target: Any) -> Scalar:
+        """The factor N, what a unit of disturbance does to 2 eps'' at most."""
+        raise NotImplementedError
+
+    def invert(self, x: Any, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (m,) for which 2 eps'' is `wanted` if the disturbance is d_hat."""
+        raise NotImplementedError
+
+    def straight(self, error: Vector) -> Vector:
+        """The error (m,) in coordinates in which the plain way to zero is a straight line; they vanish with it."""
+        return error
+
+    def error_at(self, straight: Vector) -> Vector:
+        """The error (m,) where those coordinates are these."""
+        return straight
+
+
+class ErrorVector(ErrorMotion):
+    """The paper's eps_1 = q_1 - q_1f (4); singular at q4 = 0, see `prescribed_time.PrescribedTime`."""
+
+    model: Spacecraft
+
+    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
+        """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""
+        opposite = x.q[3] * target.q[3] < 0.0
+        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+
+    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+        """q4 counted positive on the reference's side [-]: at 0 the law is singular, beyond it cannot come back."""
+        return jnp.where(target.q[3] < 0.0, -x.q[3], x.q[3])
+
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
+
+    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
+        """eps_1 [-] and its derivative [1/s], (4)."""
+        reference_rate, _ = target.vector_rates()
+        v_dot, _ = attitude.vector_rates(x.q, x.w, jnp.zeros(3))
+        return x.q[:3] - target.q[:3], v_dot - reference_rate
+
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T J^-1| of (57) [1/(kg m^2)]."""
+        return guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
+
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 eps_1'' = wanted [1/s^2]: w x J w - d_hat + J T^-1 (wanted + 2 q_1f'' - T' w)."""
+        _, reference_acceleration = target.vector_rates()
+        t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
+        turned = attitude.t_inverse_times(x.q, wanted + 2.0 * reference_acceleration - t_dot_w)
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
+
+
+class ErrorQuaternion(ErrorMotion):
+    """The vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
+
+    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2.
+    """
+
+    model: Spacecraft
+
+    def align(self, x: AttitudeState, target: Target) -> AttitudeState:
+        """The same attitude with the sign of q for which q_e4 >= 0."""
+        opposite = jnp.dot(x.q, target.q) < 0.0
+        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+
+    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+        """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""
+        return jnp.dot(x.q, target.q)
+
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
+
+    def relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
+        """Of the relative motion q_e [-], w_e, R w_f [rad/s] and (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]."""
+        q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
+        back = attitude.conjugate(q_e)
+        carried = attitude.rotate(back, target.w)
+        w_e = x.w - carried
+        return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
+
+    def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
+        """The vector part v [-] and its derivative [1/s]."""
+        q_e, w_e, _, _ = self.relative(x, target)
+        v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
+        return q_e[:3], v_dot
+
+    def influence(self, x: AttitudeState, target: Target) -> Scalar:
+        """|T(q_e) J^-1| [1/(kg m^2)]."""
+        q_e, *_ = self.relative(x, target)
+        return guards.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
+
+    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 v'' = wanted [1/s^2]."""
+        q_e, w_e, _, feedforward = self.relative(x, target)
+        turned = attitude.t_inverse_times(q_e, wanted + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
+
+    def straight(self, error: Vector) -> Vector:
+        """The rotation vector of q_e [rad]: a straight line is a rotation about the eigenaxis."""
+        return attitude.rotation_vector(error)
+
+    def error_at(self, straight: Vector) -> Vector:
+        """The vector part of the rotation's quaternion [-]."""
+        return attitude.from_rotation_vector(straight)[:3]
+
+
+class ErrorOfSystem(ErrorMotion):
+    """x_1 of a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation."""
+
+    model: System
+
+    def clearance(self, x: State, target: Scalar) -> Scalar:
+        """Det of dF/dx2 G: at 0 the law is singular."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        return matrices.determinant(slope @ gain)
+
+    def whole_clearance(self, first: Scalar) -> Scalar:
+        """The determinant at the start: the ratio does not depend on units."""
+        return first
+
+    def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:
+        """x_1 and F(t, x), (n,) each."""
+        return self.model.position(x), self.model.position_rate(target, x)
+
+    def angle(self, x: State, target: Scalar) -> Scalar:
+        """|x_1|."""
+        return guards.norm(self.model.position(x))
+
+    def influence(self, x: State, target: Scalar) -> Scalar:
+        """2 |dF/dx2 D|."""
+        return 2.0 * guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
+
+    def invert(self, x: State, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
+        slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
+        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
+
+
+class ErrorOfChain(ErrorMotion):
+    """x_1 of the integrator chain (35); it can be inverted for order 2, (6)."""
+
+    model: Chain
+
+    def errors(self, x: State, target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+        """x_1 and x_2, (1,) each: the origin is the target."""
+        return x[:1], x[1:2]
+
+    def angle(self, x: State, target: Any) -> Scalar:
+        """|x_1|."""
+        return jnp.abs(x[0])
+
+    def influence(self, x: State, target: Any) -> Scalar:
+        """2."""
+        return 2.0 * jnp.ones(())
+
+    def invert(self, x: State, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
+        """Input (1,) for 2 x_1'' = wanted: (wanted/2 - f(x) - d_hat) / g(x)."""
+        return (0.5 * wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)

@@ -1,0 +1,391 @@
+"""The laws of a scenario file to compare with: each its physics in a file of `laws`, a table here, and a row below."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import Meta
+
+from ptsmc_jax.scenario import gain_bounds
+from ptsmc_jax.scenario.errors import show, wrong
+from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, between
+from ptsmc_jax.scenario.law_record import LawTable
+from ptsmc_jax.scenario.values import NotNegative, Positive
+
+Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
+AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
+
+
+class BaselineTable(LawTable, frozen=True):
+    """What the laws to compare with have besides their gains; they fly in the sampled loop only.
+
+    Attributes:
+        t_f: when the law is judged [s]
+        disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
+        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
+        initial_estimate_error: bound on the observer's error at t = 0 [N m]
+    """
+
+    t_f: Positive = 30.0
+    disturbance_rate_bound: NotNegative = 1e-3
+    disturbance_bound: NotNegative = 0.01
+    initial_estimate_error: NotNegative = 0.0
+
+    def law(self) -> Any:
+        """The law of eps'' = a + d, a class of `laws` with a field for each gain."""
+        raise NotImplementedError
+
+    def physics(self, plant: str) -> Any:
+        """The law on the error of this kind of plant."""
+        from ptsmc_jax.laws import error_motions
+        from ptsmc_jax.laws.acceleration import on
+
+        errors = {"chain": error_motions.ErrorOfChain, "system": error_motions.ErrorOfSystem}
+        return on(errors.get(plant, error_motions.ErrorQuaternion), self.law())
+
+    def check(self, scenario: Any) -> None:
+        """They are laws of second order."""
+        order = getattr(scenario.plant, "order", 2)
+        if order != 2:
+            raise wrong("plant.order", order, f"2 with controller.kind = {show(self.kind)}, a law of second order")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _over_t_f(low: float, high: float, power: int = 1) -> GainBounds:
+    """Bounds low / t_f^power and high / t_f^power."""
+    return GainBounds(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
+
+
+class PDController(BaselineTable, frozen=True):
+    """Quaternion PD with the reference's motion fed forward (Wie, Weiss, Arapostathis 1989).
+
+    Attributes:
+        k_p: gain on the vector part of the error quaternion [1/s^2]
+        k_d: gain on the rate error [1/s]
+    """
+
+    kind: Literal["pd"] = "pd"
+    k_p: Positive = 0.2
+    k_d: Positive = 0.6
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "k_p": _over_t_f(2.0, 2000.0, 2),
+        "k_d": _over_t_f(0.3, 100.0),
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
+
+    def law(self) -> Any:
+        """`laws.pd`."""
+        from ptsmc_jax.laws.pd import PD
+
+        return PD
+
+    def physics(self, plant: str) -> Any:
+        """That of a spacecraft turns the body, not the error vector."""
+        from ptsmc_jax.laws.pd import QuaternionPD
+
+        return QuaternionPD if plant == "spacecraft" else super().physics(plant)
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """The rate at the goal if all of its spring's potential energy had become motion."""
+        return "controller.k_p", 2.0 * math.sqrt(self.k_p)
+
+
+class TerminalController(BaselineTable, frozen=True):
+    """Nonsingular terminal sliding mode, s = v + sig^p(v') / b (Feng, Yu, Man 2002).
+
+    Attributes:
+        p: power of the surface
+        b: scale of the surface [1/s^p]
+        k: reaching gain [1/s^2]
+        sign_width: of the smooth sign; 0 is the exact sign
+    """
+
+    kind: Literal["terminal"] = "terminal"
+    p: Power = 1.3
+    b: Positive = 0.1
+    k: Positive = 0.1
+    sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
+        "b": _over_t_f(0.01, 100.0),
+        "k": _over_t_f(2.0, 2000.0, 2),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("p", "b", "k")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def law(self) -> Any:
+        """`laws.terminal`."""
+        from ptsmc_jax.laws.terminal import Terminal
+
+        return Terminal
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.b", 2.0 * self.b ** (1.0 / self.p)
+
+
+def _usual_p(choice: Choice) -> tuple[float, float]:
+    least = _allowed_p(choice)[0]
+    return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
+
+
+def _allowed_p(choice: Choice) -> Allowed:
+    """For gamma - 1/p > 1; where gamma is free too, it follows p."""
+    return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
+
+
+def _usual_gamma(choice: Choice) -> tuple[float, float]:
+    least = _allowed_gamma(choice)[0]
+    return least + 0.05, least + 2.0
+
+
+def _allowed_gamma(choice: Choice) -> Allowed:
+    """Gamma - 1/p > 1, for every p."""
+    return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
+
+
+class FixedTimeController(BaselineTable, frozen=True):
+    """Fixed-time sliding mode (Zuo 2015; Jiang, Hu, Friswell 2016), gamma - 1/p > 1.
+
+    Attributes:
+        a1: surface, weight of |v|^gamma, which rules far from the goal [1/s]
+        b1: surface, weight of |v|^(1/p), which rules near it [1/s]
+        a2: reaching law, weight of |s|^m, which rules far from the surface [1/s^(2-p)]
+        b2: reaching law, weight of |s|^n, which rules near it [1/s^(2-p)]
+        p: power of the surface
+        gamma: power of the surface
+        m: power of the reaching law
+        n: power of the reaching law
+        sign_width: of the smooth sign; 0 is the exact sign
+    """
+
+    kind: Literal["fixed_time"] = "fixed_time"
+    a1: Positive = 0.1
+    b1: Positive = 0.2
+    a2: Positive = 1.0
+    b2: Positive = 1.0
+    p: Power = 1.25
+    gamma: AboveOne = 2.0
+    m: AboveOne = 1.5
+    n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
+    sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
+        **dict.fromkeys(("a1", "b1"), _over_t_f(0.01, 100.0)),
+        **dict.fromkeys(("a2", "b2"), GainBounds(lambda _: (1e-4, 10.0))),
+        "gamma": GainBounds(_usual_gamma, _allowed_gamma),
+        "m": GainBounds(lambda _: (1.05, 3.0), between(1.0, math.inf)),
+        "n": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def law(self) -> Any:
+        """`laws.fixed_time`."""
+        from ptsmc_jax.laws.fixed_time import FixedTime
+
+        return FixedTime
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.a1", 2.0 * (self.a1 + self.b1)
+
+    def check(self, scenario: Any) -> None:
+        """Its surface is nonsingular for gamma - 1/p > 1 only."""
+        super().check(scenario)
+        if not self.gamma - 1.0 / self.p > 1.0:
+            raise wrong("controller.gamma", self.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
+
+
+def _until_sampling(low: float, high: float, power: int = 1) -> GainBounds:
+    """Bounds low / t_f^power and high / h^power, h the period: to where samples come too seldom for a larger gain."""
+    return GainBounds(
+        lambda choice: (low / choice.t_f**power, high / choice.scenario.loop.period**power),
+        above="so large that the sampled loop comes near its border of stability",
+    )
+
+
+class TimeBasePDController(BaselineTable, frozen=True):
+    """A profile from the first error to zero at t_f, a quintic about the eigenaxis, under PD (Becerra and others 2018).
+
+    Attributes:
+        k_p: gain on what the error is apart from its profile [1/s^2]
+        k_d: gain on its rate [1/s]
+    """
+
+    kind: Literal["time_base_pd"] = "time_base_pd"
+    k_p: Positive = 1.0
+    k_d: Positive = 2.0
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "k_p": _until_sampling(2.0, 0.25, 2),
+        "k_d": _until_sampling(0.3, 1.0),
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
+
+    def law(self) -> Any:
+        """`laws.time_base`."""
+        from ptsmc_jax.laws.time_base import TimeBasePD
+
+        return TimeBasePD
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """In the middle of half a turn."""
+        return _profile(t_f)
+
+
+def _profile(t_f: float) -> tuple[str, float]:
+    return "controller.t_f", 15.0 / 8.0 * math.pi / t_f
+
+
+class TimeBaseSlidingController(BaselineTable, frozen=True):
+    """The same profile under a sliding mode, s = E' + c E (Becerra and others 2018).
+
+    Attributes:
+        surface_rate: c, rate on the surface [1/s]
+        k: rate of s [1/s]
+        sign_width: of the smooth sign; 0 is the exact sign
+    """
+
+    kind: Literal["time_base_sliding"] = "time_base_sliding"
+    surface_rate: Positive = 1.0
+    k: Positive = 1.0
+    sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "surface_rate": _until_sampling(0.3, 1.0),
+        "k": _until_sampling(0.3, 1.0),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("surface_rate", "k")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def law(self) -> Any:
+        """`laws.time_base`."""
+        from ptsmc_jax.laws.time_base import TimeBaseSliding
+
+        return TimeBaseSliding
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """In the middle of half a turn."""
+        return _profile(t_f)
+
+
+class ScalingController(BaselineTable, frozen=True):
+    """Prescribed time by scaling with (t_f/(t_f - t))^(2+m) (Song, Wang, Holloway, Krstic 2017).
+
+    Attributes:
+        delta: gains are held from so long before t_f on [s]
+        m: excess of the power of the scaling
+        k1: rate of the scaled error [1/s]
+        k: rate of its surface, while the scaling is 1 [1/s]
+    """
+
+    kind: Literal["scaling"] = "scaling"
+    delta: Positive = 2.0
+    m: Annotated[float, Meta(ge=1, description="a number, at least 1")] = 1.0
+    k1: Positive = 1.0
+    k: Positive = 1e-3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "delta": gain_bounds.DELTA,
+        "m": GainBounds(lambda _: (1.0, 5.0), lambda _: Allowed(1.0, math.inf, lower_included=True)),
+        "k1": _until_sampling(0.3, 0.5),
+        "k": GainBounds(lambda choice: (1e-5 / choice.t_f, 10.0 / choice.t_f)),
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("delta", "m", "k1", "k")
+
+    def law(self) -> Any:
+        """`laws.scaling`."""
+        from ptsmc_jax.laws.scaling import Scaling
+
+        return Scaling
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """At the start."""
+        return "controller.m", 2.0 * (2.0 + self.m) / t_f
+
+
+class PredefinedTimeController(BaselineTable, frozen=True):
+    """Predefined-time sliding mode (Sanchez-Torres and others 2018; Jimenez-Rodriguez and others 2020).
+
+    Attributes:
+        share: of t_f in which the error settles on the surface, after the rest, in which the surface is reached
+        q1: power of the surface
+        q2: power of the reaching law
+        sign_width: of the smooth sign; 0 is the exact sign
+    """
+
+    kind: Literal["predefined_time"] = "predefined_time"
+    share: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.6
+    q1: Annotated[float, Meta(gt=0, le=0.5, description="a number above 0 and at most 0.5")] = 0.3
+    q2: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.3
+    sign_width: NotNegative = 1e-2
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "share": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
+        "q1": GainBounds(lambda _: (0.05, 0.49), between(0.0, 0.5)),
+        "q2": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("share", "q1", "q2")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def law(self) -> Any:
+        """`laws.predefined_time`."""
+        from ptsmc_jax.laws.predefined_time import PredefinedTime
+
+        return PredefinedTime
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.q1", 2.0 * math.pi / (self.q1 * self.share * t_f)
+
+
+class SuperTwistingController(BaselineTable, frozen=True):
+    """Super-twisting, s = eps' + c eps (Levant 1998; Moreno, Osorio 2012).
+
+    Attributes:
+        surface_rate: c, rate of the error on the surface [1/s]
+        lipschitz: L, bound on each component of the derivative of eps'' that the disturbance makes [1/s^3]
+        sign_width: of the smooth sign; 0 is the exact sign
+    """
+
+    kind: Literal["super_twisting"] = "super_twisting"
+    surface_rate: Positive = 0.4
+    lipschitz: Positive = 0.01
+    sign_width: NotNegative = 1e-3
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "surface_rate": _until_sampling(3.0, 0.2),
+        "lipschitz": GainBounds(lambda choice: (0.1 / choice.t_f**3, 1e4 / choice.t_f**3)),
+        "sign_width": gain_bounds.SIGN_WIDTH,
+        "t_f": gain_bounds.T_F,
+    }
+    free_by_default: ClassVar[tuple[str, ...]] = ("surface_rate", "lipschitz")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def law(self) -> Any:
+        """`laws.super_twisting`."""
+        from ptsmc_jax.laws.super_twisting import SuperTwisting
+
+        return SuperTwisting
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """On its surface, at |v| = 1."""
+        return "controller.surface_rate", 2.0 * self.surface_rate
+
+
+BASELINES: Mapping[str, type[BaselineTable]] = {
+    "pd": PDController,
+    "terminal": TerminalController,
+    "fixed_time": FixedTimeController,
+    "time_base_pd": TimeBasePDController,
+    "time_base_sliding": TimeBaseSlidingController,
+    "scaling": ScalingController,
+    "predefined_time": PredefinedTimeController,
+    "super_twisting": SuperTwistingController,
+}

@@ -1,0 +1,40 @@
+"""What every law of a scenario file is: a table of keys, the gains among them, and what they are made into."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from ptsmc_jax.scenario import gain_bounds
+from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.values import Table
+
+
+class LawTable(Table, frozen=True):
+    """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
+
+    gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
+    # those that are free where a scenario does not say; the second ones in the sampled loop only, since without samples
+    # a larger K1 and a narrower sign cost nothing but steps
+    free_by_default: ClassVar[tuple[str, ...]] = ()
+    free_if_sampled: ClassVar[tuple[str, ...]] = ()
+    prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
+
+    def physics(self, plant: str) -> Any:
+        """What flies on this kind of plant: a class of `laws`, its fields named as the keys."""
+        raise NotImplementedError
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """How fast it turns the body [rad/s], at most, and the key that says so."""
+        raise NotImplementedError
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """The law of a plant's model."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        made = self.physics(scenario.plant.kind)
+        names = [field.name for field in dataclasses.fields(made) if field.name != "model"]
+        own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
+        return made(model, **{name: vector(value) for name, value in own.items()})
