@@ -22,6 +22,11 @@ _EXPORTS = {
     "Target": "signals.references",
     "Chain": "plants.integrator_chain",
     "chain": "plants.integrator_chain",
+    "AccelerationLaw": "laws.acceleration",
+    "SampledObserver": "observers.base",
+    "Disturbance": "signals.disturbances",
+    "Reference": "signals.references",
+    "gain": "numerics.pytrees",
     "PrescribedTime": "laws.prescribed_time",
     "PrescribedTimeChain": "laws.prescribed_time",
     "NoObserver": "observers.none",
@@ -59,10 +64,13 @@ if TYPE_CHECKING:
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
+    from ptsmc_jax.laws.acceleration import AccelerationLaw as AccelerationLaw
     from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem as PrescribedTimeSystem
+    from ptsmc_jax.numerics.pytrees import gain as gain
+    from ptsmc_jax.observers.base import SampledObserver as SampledObserver
     from ptsmc_jax.observers.finite_time import FiniteTimeObserver as FiniteTimeObserver
     from ptsmc_jax.observers.none import NoObserver as NoObserver
     from ptsmc_jax.observers.nonlinear import NonlinearObserver as NonlinearObserver
@@ -81,8 +89,10 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
     from ptsmc_jax.scenario.tables import Scenario as Scenario
     from ptsmc_jax.signals.disturbances import Constant as Constant
+    from ptsmc_jax.signals.disturbances import Disturbance as Disturbance
     from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid
     from ptsmc_jax.signals.references import Fixed as Fixed
+    from ptsmc_jax.signals.references import Reference as Reference
     from ptsmc_jax.signals.references import Slew as Slew
     from ptsmc_jax.signals.references import Spin as Spin
     from ptsmc_jax.signals.references import Swing as Swing

@@ -36,16 +36,18 @@ HOUSE = {
         "scenario": """
             errors systems values
             attitude_keys device_tables dispersion_tables keys plant_tables
-            disturbance_tables reference_tables scales
+            scales
             gain_bounds
-            law_record observer_tables
+            own
+            disturbance_tables law_record observer_tables reference_tables
             baseline_tables
+            own_laws
             law_tables
             tables
             layouts
             checks parsing
             free_gains timing
-            build reading
+            build own_checks reading
             flyable
         """,
         "campaigns": "margin_verdicts montecarlo rows store | campaign runs | cluster",

@@ -386,10 +386,10 @@ def test_files_of_users_may_import_their_own_and_cannot_end_the_command(tmp_path
     for name, said in (("leaves.py", "SystemExit: 0"), ("broken.py", "SyntaxError: ")):
         with pytest.raises(ValueError, match=rf"^running .*{name} fails: {said}[^\n]*$"):
             systems.load(f"{tmp_path}/{name}:mine")
-    before = systems.source(f"{tmp_path}/future.py:mine")
+    before = systems.digest(f"{tmp_path}/future.py:mine")
     (tmp_path / "future.py").write_text(FILES["future.py"] + "# changed\n")
-    assert systems.source(f"{tmp_path}/future.py:mine") != before
-    assert systems.source(spacecraft_as_system(SPIN)) == {}
+    assert systems.digest(f"{tmp_path}/future.py:mine") != before
+    assert systems.digest(spacecraft_as_system(SPIN)) is None
 
 
 def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_read(tmp_path):

@@ -1,8 +1,9 @@
-"""Parts as pytrees: what a part's class is decorated with, and the type of its numbers."""
+"""Parts as pytrees: what a part's class is decorated with, the type of its numbers, and gains among them."""
 
-from collections.abc import Iterable
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import field, fields
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +44,33 @@ def pytree(cls: _Class) -> _Class:
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
     return cls
+
+
+class Gain(NamedTuple):
+    """What is known of a gain of one's own."""
+
+    usual: tuple[float, float] | Callable | None
+    above: float
+    below: float
+    unit: str
+    meaning: str
+
+
+def gain(
+    default: float,
+    usual: tuple[float, float] | Callable[[float, float], tuple[float, float]] | None = None,
+    *,
+    above: float = 0.0,
+    below: float = math.inf,
+    unit: str = "",
+    meaning: str = "",
+) -> Any:
+    """A field of a part of one's own that tuning may move: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s")`.
+
+    usual: the bounds of a search where a scenario gives none, two numbers or a function of t_f and the period [s];
+    where they are more than a factor of 10 apart it is searched on a log scale. above, below: what it must lie between.
+    """
+    return field(default=default, metadata={"gain": Gain(usual, above, below, unit, meaning)})
 
 
 def vector(values: Any) -> Array:

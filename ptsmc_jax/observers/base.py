@@ -7,7 +7,7 @@ Digital: one update a period from the impulse that the model leaves unexplained,
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -59,6 +59,7 @@ class Observer(ABC):
     """What the rollout asks of an observer."""
 
     model: Plant  # the nominal plant
+    tunable: ClassVar[tuple[str, ...]] = ()  # fields that tuning may move, besides `gain`
 
     def begin(self) -> Memory:
         """Memory at t = 0: d_hat = 0 [N m]."""
@@ -95,6 +96,45 @@ class Observer(ABC):
     def nodes(self) -> tuple[float, ...]:
         """Times that the continuous loop must step on [s]."""
         return ()
+
+
+@dataclass(frozen=True)
+class SampledObserver(Observer):
+    """What an observer of one's own is derived from; it flies in the sampled loop.
+
+    Its memory is any pytree of arrays; `begin`'s default is an estimate of zero.
+    """
+
+    disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]
+
+    def step(self, memory: Any, seen: Vector, t: Scalar, dt: Scalar) -> Any:
+        """The memory at t [s] from that a period dt [s] earlier; seen: the mean disturbance in it, (m,) [N m].
+
+        It is what the nominal model leaves unexplained of the motion between two samples, with their noise.
+        """
+        raise NotImplementedError
+
+    def error_bound(self) -> ErrorBound:
+        """K2, which the law switches against; if nothing else is said sqrt(m) K, as without an observer."""
+        bound = jnp.sqrt(float(self.model.inputs)) * self.disturbance_bound
+        return ErrorBound(jnp.zeros_like(bound), bound, bound)
+
+    def update(self, matrix: Matrix, memory: Any, impulse: Vector, t: Scalar, dt: Scalar) -> Any:
+        """`step` over periods that have a length, of the mean impulse / dt [N m]."""
+        length = jnp.where(dt > 0.0, dt, 1.0)
+        return self.step(memory, impulse / length, t, length)
+
+    def update_matrix(self, dt: Scalar) -> Matrix:
+        """Not used."""
+        return jnp.zeros((0, 0))
+
+    def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
+        """Not used: of the continuous loop."""
+        raise NotImplementedError
+
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Any, seen: Vector) -> Any:
+        """Not used: of the continuous loop."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,12 @@ class BaselineTable(LawTable, frozen=True):
         from ptsmc_jax.laws import error_motions
         from ptsmc_jax.laws.acceleration import on
 
-        errors = {"chain": error_motions.ErrorOfChain, "system": error_motions.ErrorOfSystem}
-        return on(errors.get(plant, error_motions.ErrorQuaternion), self.law())
+        errors: dict[str, type[error_motions.ErrorMotion]] = {
+            "spacecraft": error_motions.ErrorQuaternion,
+            "chain": error_motions.ErrorOfChain,
+            "system": error_motions.ErrorOfSystem,
+        }
+        return on(errors[plant], self.law())
 
     def check(self, scenario: Any) -> None:
         """They are laws of second order."""

@@ -12,6 +12,7 @@ from msgspec import Meta
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.errors import ScenarioError, brief
+from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import (
     Each,
     EachNotNegative,
@@ -211,10 +212,42 @@ class EachSinusoid(SinusoidDisturbance, frozen=True):
     each: ClassVar[Mapping[str, float]] = {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0}
 
 
+class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
+    """A disturbance of one's own, a class derived from ptsmc_jax.Disturbance; its fields are further keys.
+
+    Attributes:
+        code: the class, "FILE.py:NAME" or "package.module:NAME"
+    """
+
+    kind: Literal["own"] = "own"
+    code: Code
+
+    @classmethod
+    def base(cls) -> type:
+        """`signals.disturbances.Disturbance`."""
+        from ptsmc_jax.signals.disturbances import Disturbance
+
+        return Disturbance
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """What it is at a time, in a state."""
+        return ("__call__",)
+
+    def quickest(self) -> float:
+        """As it says itself; nothing is known before its code is run."""
+        return 0.0 if self.waits else float(build(self).fastest())
+
+    def build(self, inertia: Any) -> Any:
+        """What the code names."""
+        return build(self)
+
+
 _EACH: Kinds = {
     "sinusoid": EachSinusoid,
     "constant": EachConstant,
     "random_walk": EachRandomWalk,
+    "own": OwnDisturbance,
     "sum": SumDisturbance,
 }
 # by the kind of the plant and the kind of the disturbance, the default first
@@ -225,6 +258,7 @@ DISTURBANCES: dict[str, Mapping[str, type[Kind]]] = {
         "constant": ConstantDisturbance,
         "gravity_gradient": GravityGradient,
         "random_walk": RandomWalk,
+        "own": OwnDisturbance,
         "sum": SumDisturbance,
     },
     "chain": {"sinusoid": EachSinusoid, "none": NoDisturbance, **_EACH},

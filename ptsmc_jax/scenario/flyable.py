@@ -11,12 +11,12 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions import variation
-from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.laws.error_motions import ErrorVector
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario import attitude_keys, build, errors, timing
+from ptsmc_jax.scenario import attitude_keys, build, errors, own_checks, reading, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -85,9 +85,11 @@ def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = N
     Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
     where the law meets its singularity on the way from the initial state to the reference.
     """
+    scenario = reading.complete(scenario)
     parts = _parts(scenario, saves, reach)
+    own_checks.check(parts, scenario)
     dispersion = build.dispersion(scenario, parts)
-    if isinstance(parts.controller, prescribed_time.PrescribedTime):
+    if isinstance(parts.controller, ErrorVector):
         _check_reference(scenario, parts)
     if isinstance(parts.plant, System):
         _check_system(scenario, parts.plant, parts)
@@ -141,7 +143,7 @@ def _scalar_part(parts: Parts, times: Array) -> Array:
 def _check_start(scenario: Scenario, parts: Parts) -> None:
     """Refuse an initial attitude from which the law meets its singularity on the way."""
     assert scenario.initial is not None
-    additive, law = isinstance(parts.controller, prescribed_time.PrescribedTime), parts.controller
+    additive, law = isinstance(parts.controller, ErrorVector), parts.controller
     singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {errors.brief(value)}"

@@ -53,19 +53,20 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     assert free is not None  # `resolve` filled it in
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    if not set(free) <= set(tables.FREE):
+    if not set(free) <= {*tables.FREE, *scenario.controller.gains, *scenario.observer.gains}:
         raise wrong("tune.free", free, tables.FREE_TOLD)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in ("observer_gain", "filter_bandwidth", *scenario.controller.gains):
-            known = list(scenario.controller.gains)
+        if name not in ("observer_gain", "filter_bandwidth", *scenario.controller.gains, *scenario.observer.gains):
+            known = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, "observer_gain"))
             raise ScenarioError(
                 f"{said} the law of controller.kind = {errors.show(scenario.controller.kind)} has no {name}; "
-                f"allowed is some of {', '.join(known)}, observer_gain, filter_bandwidth"
+                f"allowed is some of {', '.join(known)}, filter_bandwidth"
             )
-    if "observer_gain" in free and not scenario.observer.gains:
+    if "observer_gain" in free and "observer_gain" not in scenario.observer.gains:
         raise ScenarioError(
-            f'{said} observer.kind = "none" has no gain; allowed is observer_gain with an observer of another kind'
+            f"{said} observer.kind = {errors.show(scenario.observer.kind)} has none; "
+            "allowed is observer_gain with an observer of another kind"
         )
     if "filter_bandwidth" in free and not _has_bandwidth(scenario):
         raise ScenarioError(
@@ -90,8 +91,9 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 
 def _check_bounds(choice: Choice, name: str) -> None:
     key, (lower, upper) = f"tune.bounds.{name}", choice.bounds[name]
-    if name not in tables.FREE:
-        raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, tables.FREE)}")
+    known = dict.fromkeys((*choice.scenario.controller.gains, *choice.scenario.observer.gains, *tables.FREE))
+    if name not in known:
+        raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
     if name not in choice.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
     least, most, closed = _gain(choice.scenario, name).allowed(choice)
@@ -134,8 +136,14 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
     """The scenario's gain of this name, on each axis where it has several; none if it has none."""
     if name == "observer_gain":
         return getattr(scenario.observer, "gain", None) or ()
-    value = getattr(scenario.controller, name, None)
+    law = name in scenario.controller.gains
+    value = getattr(scenario.controller if law else scenario.observer, name if law else _field(name), None)
     return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)
+
+
+def _field(name: str) -> str:
+    """The key of an observer that a gain's name stands for."""
+    return name.removeprefix("observer_")
 
 
 def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:

@@ -80,7 +80,7 @@ def rounded(bound: float) -> float:
 
 def hand_over(scenario: Any) -> float:
     """How long before t_f the law hands over [s]; a period for a law that does not."""
-    return getattr(scenario.controller, "delta", scenario.loop.period)
+    return getattr(scenario.controller, "delta", None) or scenario.loop.period
 
 
 def size(scenario: Any) -> float:

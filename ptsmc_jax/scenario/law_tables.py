@@ -14,6 +14,7 @@ from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_bounds import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
+from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
 from ptsmc_jax.scenario.values import NotNegative, Positive
 
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
@@ -153,7 +154,8 @@ LAWS: dict[str, Mapping[str, type[LawTable]]] = {
     "spacecraft": {
         "prescribed_time": SpacecraftController,
         **BASELINES,
+        "own": OwnAttitudeLaw,
     },
-    "chain": {"prescribed_time": ChainController, **BASELINES},
-    "system": {"prescribed_time": SystemController, **BASELINES},
+    "chain": {"prescribed_time": ChainController, **BASELINES, "own": OwnLaw},
+    "system": {"prescribed_time": SystemController, **BASELINES, "own": OwnLaw},
 }

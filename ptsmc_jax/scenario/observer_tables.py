@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, dead_beat
+from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
 
 
@@ -189,10 +190,49 @@ class EachFiniteTimeObserver(FiniteTimeObserver, frozen=True):
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
+class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
+    """An observer of one's own, a class derived from ptsmc_jax.SampledObserver; its fields are further keys.
+
+    Attributes:
+        code: the class, "FILE.py:NAME" or "package.module:NAME"
+    """
+
+    kind: Literal["own"] = "own"
+    code: Code
+    prefix: ClassVar[str] = "observer_"
+
+    @classmethod
+    def base(cls) -> type:
+        """`observers.base.SampledObserver`."""
+        from ptsmc_jax.observers.base import SampledObserver
+
+        return SampledObserver
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """What it does in a period."""
+        return ("step",)
+
+    def check(self, scenario: Any) -> None:
+        """It is written for samples."""
+        mode = scenario.loop.mode
+        if mode != "sampled":
+            raise ScenarioError(f'observer.kind = "own" needs the sampled loop, but loop.mode is "{mode}"')
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """What the code names."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        made = build(self, model=model, disturbance_bound=vector(scenario.controller.disturbance_bound))
+        type(made).tunable = tuple(name.removeprefix(self.prefix) for name in self.gains)
+        return made
+
+
 _EACH: Kinds = {
     "nonlinear": EachNonlinearObserver,
     "finite_time": EachFiniteTimeObserver,
     "prescribed_time": EachPrescribedTimeObserver,
+    "own": OwnObserver,
 }
 # by the kind of the plant and the kind of the observer, the default first
 OBSERVERS: dict[str, Mapping[str, type[ObserverTable]]] = {
@@ -201,6 +241,7 @@ OBSERVERS: dict[str, Mapping[str, type[ObserverTable]]] = {
         "none": NoObserver,
         "finite_time": FiniteTimeObserver,
         "prescribed_time": PrescribedTimeObserver,
+        "own": OwnObserver,
     },
     "chain": {"none": NoObserver, **_EACH},
     "system": {"none": NoObserver, **_EACH},

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import attitude_keys, disturbance_tables, keys, layouts
+from ptsmc_jax.scenario import attitude_keys, disturbance_tables, keys, layouts, own, systems
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import TABLES
@@ -47,7 +47,7 @@ def toml(text: str, name: str) -> dict[str, Any]:
 def load(path: str | Path) -> dict[str, Any]:
     """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML.
 
-    A Python file that it names (plant.system) is looked for beside it, and not run.
+    A Python file that it names is looked for beside it, and not run.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
@@ -60,18 +60,17 @@ def load(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
     raw = toml(text, f"the scenario file {path}")
-    plant = raw.get("plant")
-    where = plant.get("system") if isinstance(plant, dict) else None
-    file, _, name = where.rpartition(":") if isinstance(where, str) else ("", "", "")
-    if isinstance(plant, dict) and file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
-        plant["system"] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
+    for table, key in own.named(raw):
+        file, _, name = table[key].rpartition(":")
+        if file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
+            table[key] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
     return raw
 
 
-def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Scenario:
+def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]], *, run: bool = False) -> Scenario:
     """Scenario from raw tables, absent keys at their defaults; raises ScenarioError.
 
-    metrics: names of the metrics by the kind of the plant.
+    metrics: names of the metrics by the kind of the plant; run: code of one's own may be run, for its keys.
     """
     _check_shape(raw)
     for name, table in raw.items():
@@ -108,7 +107,7 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]]) -> Sce
         if name == "dispersion":
             found[name] = _dispersion(given, kind)
         else:
-            found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name])
+            found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
     if kind == "chain" and "order" not in raw.get("plant", {}):
         found["plant"] = msgspec.structs.replace(found["plant"], order=order)
     for name in ("initial", "reference"):
@@ -167,19 +166,19 @@ def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Map
 
 def dump(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
-    own = getattr(scenario.plant, "system", None)
-    if own is None or isinstance(own, str):
-        return plain(scenario)
-    rest = dump(msgspec.structs.replace(scenario, plant=msgspec.structs.replace(scenario.plant, system="")))
-    return {**rest, "plant": {**rest["plant"], "system": own}}  # made in Python: stays what it is
+    return plain(scenario)
 
 
 def plain(table: Table) -> dict[str, Any]:
     """A table as a scenario file would have it; what is None is left out."""
-    return typing.cast(dict, _without_none(msgspec.to_builtins(table)))
+    return typing.cast(dict, _without_none(table))
 
 
 def _without_none(value: Any) -> Any:
+    """Structs as mappings, lists for tuples; what is made in Python, a system or a class, stays what it is."""
+    if isinstance(value, msgspec.Struct):
+        value = {key: getattr(value, key) for key in value.__struct_fields__}
+        value |= value.pop("rest", {})
     if isinstance(value, Mapping):
         kept = {k: _without_none(v) for k, v in value.items() if v is not None}
         return {k: v for k, v in kept.items() if v != {} or k not in ("requirements", "bounds")}
@@ -197,7 +196,7 @@ def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
     return f"known are {', '.join(form.format(one) for one in known)}"
 
 
-def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Table:
+def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: bool = False) -> Table:
     if not isinstance(kinds, Mapping):
         return _fields(name, raw, kinds)
     kind = raw.get("kind", next(iter(kinds)))
@@ -206,18 +205,34 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds) -> Tab
         raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 7 else f"one of {', '.join(known)}")
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
-        return _sum(name, raw, kinds)
-    return _fields(name, raw, struct)
+        return _sum(name, raw, kinds, run)
+    return _own(name, raw, struct, run) if issubclass(struct, own.Own) else _fields(name, raw, struct)
 
 
-def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds) -> Table:
+def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
+    """A table of one's own: with the keys of the class that it names, if that may be run or is there already."""
+    code = raw.get("code")
+    if code is None:
+        raise ScenarioError(f"{name}.code is absent, but must be given: {systems.WHERE}")
+    if isinstance(code, str):
+        try:
+            systems.named(code, systems.WHERE)
+        except ValueError as error:
+            raise ScenarioError(f"{name}.code is {brief(code)}: {error}") from None
+    if run or not isinstance(code, str):
+        return _fields(name, raw, own.read(struct, name, code))
+    known = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
+    return _fields(name, {**known, "rest": {k: v for k, v in raw.items() if k not in known}}, own.waiting(struct))
+
+
+def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
     """A table whose `terms` are tables of the other kinds."""
     _fields(name, {key: value for key, value in raw.items() if key != "terms"}, disturbance_tables.SumDisturbance)
     terms = raw.get("terms", ())
     if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
         raise wrong(f"{name}.terms", terms, disturbance_tables.TERMS)
     single = {kind: struct for kind, struct in kinds.items() if struct is not disturbance_tables.SumDisturbance}
-    found = tuple(_table(f"{name}.terms[{k}]", term, single) for k, term in enumerate(terms))
+    found = tuple(_table(f"{name}.terms[{k}]", term, single, run) for k, term in enumerate(terms))
     return disturbance_tables.SumDisturbance(terms=found)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import checks, free_gains, parsing
+from ptsmc_jax.scenario import checks, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 
@@ -16,13 +16,21 @@ def read(path: str | Path) -> Scenario:
     return from_tables(parsing.load(path))
 
 
-def from_tables(raw: Mapping[str, Any]) -> Scenario:
-    """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence."""
-    scenario = checks.resolve(parsing.parse(raw, catalogues.CATALOGUES))
+def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
+    """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence.
+
+    run: code of one's own may be run, without which its keys and gains are not known, and not checked: see `complete`.
+    """
+    scenario = checks.resolve(parsing.parse(raw, catalogues.CATALOGUES, run=run))
     checks.check(scenario)
-    if scenario.tune is None:
+    if scenario.tune is None or own.waits(scenario):
         return scenario
     return msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+
+
+def complete(scenario: Scenario) -> Scenario:
+    """The scenario with the keys and gains of parts of one's own, whose files are run; raises ScenarioError."""
+    return from_tables(parsing.dump(scenario), run=True) if own.waits(scenario) else scenario
 
 
 def replace(scenario: Scenario, **changes: Any) -> Scenario:
@@ -49,7 +57,7 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
             tables[table] = {"kind": value}
         else:
             tables[table] = {**tables.get(table, {}), key: value}
-    return from_tables(tables)
+    return from_tables(tables, run=not own.waits(scenario))
 
 
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import Four, Kinds, Positive, Three
 
 
@@ -147,10 +148,42 @@ class SlewReference(ReferenceTable, frozen=True):
         return Slew(self._start(), vector(self.turn()), vector(self.duration))
 
 
+class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
+    """An attitude of one's own, a class derived from ptsmc_jax.Reference; its fields are further keys.
+
+    Attributes:
+        code: the class, "FILE.py:NAME" or "package.module:NAME"
+    """
+
+    kind: Literal["own"] = "own"
+    code: Code
+
+    @classmethod
+    def base(cls) -> type:
+        """`signals.references.Reference`."""
+        from ptsmc_jax.signals.references import Reference
+
+        return Reference
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """What it is at a time."""
+        return ("attitude",)
+
+    def frequencies(self) -> dict[str, float]:
+        """As it says itself."""
+        return {"reference.code": float(self.build().fastest())}
+
+    def build(self) -> Any:
+        """What the code names."""
+        return build(self, q=self._start())
+
+
 # by kind, the default first
 REFERENCES: Kinds = {
     "fixed": FixedReference,
     "spin": SpinReference,
     "sinusoid": SinusoidReference,
     "slew": SlewReference,
+    "own": OwnReference,
 }

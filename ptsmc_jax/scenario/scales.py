@@ -60,7 +60,8 @@ def noise_of_s(scenario: Any) -> float:
     table, law = scenario.hardware, scenario.controller
     if isinstance(table, device_tables.StateHardware):
         a = getattr(law, "a", (1.0,))  # of a chain's surface
-        weights = [one * law.surface_rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
+        rate = getattr(law, "surface_rate", 1.0)
+        weights = [one * rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
         noises = table.state_noise or [0.0] * len(weights)
         if len(noises) == len(weights):
             return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=True)))

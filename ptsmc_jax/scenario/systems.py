@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 import os
 import sys
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -73,11 +74,17 @@ def item(where: str, allowed: str) -> object:
         with _importing_from(_home(place)):
             module = _run(path, content) if place.endswith(".py") else importlib.import_module(place)
     except (Exception, SystemExit) as error:
-        first = (str(error).splitlines() or [""])[0]
-        raise ValueError(f"running {place} fails: {type(error).__name__}: {first}") from error
+        raise ValueError(f"running {place} fails: {failure(error, place)}") from error
     if not hasattr(module, name):
         raise ValueError(f"{place} has no such name; allowed is {allowed}")
     return getattr(module, name)
+
+
+def failure(error: BaseException, place: str) -> str:
+    """What went wrong in code of one's own, in one line: the error, and the last line of that file that led to it."""
+    said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+    lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == place]
+    return f"{said} (line {lines[-1]} of {Path(place).name})" if lines else said
 
 
 def digest(where: object) -> str | None:
@@ -98,12 +105,6 @@ def digest(where: object) -> str | None:
         return None if not file else hashlib.sha256(Path(file).read_bytes()).hexdigest()
     except (OSError, ValueError):
         return None
-
-
-def source(where: object, key: str = "system_sha256") -> dict[str, str]:
-    """What a result depends on besides its scenario: the digest of the system, or the function, that it names."""
-    found = digest(where)
-    return {} if found is None else {key: found}
 
 
 def _content(path: Path) -> bytes:

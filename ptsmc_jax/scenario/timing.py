@@ -166,6 +166,8 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     if key == "plant.system":
         return ScenarioError(f"plant.system is too fast, in its own modes or in time: {asks}")
     table, _, name = key.partition(".")
+    if name == "code":
+        return ScenarioError(f"{key} says that it is too fast: {asks}")
     if key == "controller.eta":  # over a short t_f: eta itself may have no room below
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.loop.mode == "sampled" else ""
@@ -173,7 +175,9 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     value = getattr(getattr(scenario, table), name, None)
     if value is None:  # of a term in a sum
         value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
-    return wrong(key, value, f"{'longer' if key == 'reference.duration' else 'lower'}: {asks}")
+    if value == []:
+        return ScenarioError(f"{table} is too fast: {asks}")
+    return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {asks}")
 
 
 @programs.jit  # one program, where each of its operations would be one

@@ -13,6 +13,19 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 Time = Float[Array, ""]
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """What a disturbance of one's own is derived from: a function of time and of the true state."""
+
+    def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
+        """Disturbance at t [s] in the state x, (m,) [N m]."""
+        raise NotImplementedError
+
+    def fastest(self) -> float:
+        """How fast it changes at most [rad/s], which the integration steps follow; 0: slowly."""
+        return 0.0
+
+
 @pytree
 @dataclass(frozen=True)
 class Constant:

@@ -63,6 +63,25 @@ def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
     return Target(q, 2.0 * attitude.multiply(inverse, q_dot)[:3], 2.0 * attitude.multiply(inverse, q_ddot)[:3])
 
 
+@dataclass(frozen=True)
+class Reference:
+    """What a reference attitude of one's own is derived from: q_f(t) = q attitude(t)."""
+
+    q: Leaf  # (4,) the attitude that it turns from
+
+    def attitude(self, t: Time) -> Float[Array, "4"]:
+        """Unit quaternion at t [s], twice differentiable: the rates that the law needs are its derivatives."""
+        raise NotImplementedError
+
+    def fastest(self) -> float:
+        """How fast it turns and changes at most [rad/s], which the integration steps follow."""
+        return 0.0
+
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]."""
+        return moving(lambda t: attitude.multiply(self.q, self.attitude(t)), t)
+
+
 @pytree
 @dataclass(frozen=True)
 class Swing:

@@ -96,12 +96,19 @@ def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) ->
         applied = applied - jnp.cross((parts.plant.velocity(computer.seen) + w) / 2, stored)
     impulse = model.unexplained_impulse(now.t, computer.seen, seen, applied, dt_before)
     memory = observer.update(matrix, computer.memory, impulse, now.t, dt_before)
-    memory = jnp.where(dt_before > 0.0, memory, computer.memory)
+    memory = _kept(dt_before > 0.0, memory, computer.memory)
     d_hat = observer.estimate(memory)
-    sample = Sample(now.t, now.hold, period.length)
+    flown = period.length > 0.0
+    # a length that one may divide by, also in a period that is none
+    sample = Sample(now.t, now.hold, jnp.where(flown, period.length, parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
     u, s, kept = law.command(computer.law, sample, seen, target, d_hat, k2(now.t))
-    kept = jax.tree.map(lambda new, old: jnp.where(period.length > 0.0, new, old), kept, computer.law)
+    kept = _kept(flown, kept, computer.law)
     return Decision(target, d_hat, u, s, w), Computer(sensing, seen, memory, kept, computer.told)
+
+
+def _kept(flown: Array, new: Any, old: Any) -> Any:
+    """A memory after a period; one without length changes none."""
+    return jax.tree.map(lambda one, other: jnp.where(flown, one, other), new, old)
 
 
 def told(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:

@@ -27,7 +27,7 @@ Trust = Annotated[
     bool,
     Parameter(
         negative="",
-        help="Run the Python file that results name (plant.system, --metrics): read it before, it can do what you can.",
+        help="Run Python files that results name (system, code, --metrics): read them first: they can do what you can.",
     ),
 ]
 
@@ -81,4 +81,5 @@ def prepare(
         from tuning.search import own_parts
 
         own_parts.allow_scenario(scenario, loaded, trust)
+    loaded = reading.complete(loaded)
     return loaded, out if out is not None else Path("out") / f"{command}-{name}"

@@ -73,7 +73,7 @@ def tuning(summary: Summary) -> Table:
     groups = {name: group for name, group in groups.items() if group is not None}
     rows: list[tuple[str, ...]] = []
     kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
-    known = units(kind)
+    known = units(kind) | summary.get("gain_units", {})
     for gain in dict.fromkeys(name for group in groups.values() for name in group["gains"]):
         cells = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
         if len(set(cells)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):

@@ -42,9 +42,29 @@ def units(plant: str) -> dict[str, str]:
     return found
 
 
+def units_of(scenario: Scenario) -> dict[str, str]:
+    """The same of a scenario, with those of a law of one's own."""
+    found = units(scenario.plant.kind)
+    for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_")):
+        named = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}
+        found |= {name: unit for name, unit in named.items() if name in table.gains}
+    return found
+
+
 def base(name: str) -> str:
     """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
     return "observer_gain" if name.startswith(_AXIS) else name
+
+
+def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
+    """Gains of an observer of one's own, by its fields."""
+    found = {name.removeprefix("observer_"): v for name, v in gains.items() if name.startswith("observer_")}
+    return {name: v for name, v in found.items() if base(f"observer_{name}") != "observer_gain"}
+
+
+def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
+    """Gains of the law."""
+    return {k: v for k, v in gains.items() if not k.startswith("observer_") and k != "filter_bandwidth"}
 
 
 def named(scenario: Scenario) -> tuple[str, ...]:
@@ -68,8 +88,10 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
     if "t_f" in gains:
         parts = parts.with_t_f(gains["t_f"])
-    law = {k: v for k, v in gains.items() if base(k) not in ("t_f", "observer_gain", "filter_bandwidth")}
+    law = {name: value for name, value in of_law(gains).items() if name != "t_f"}
     parts = replace(parts, controller=replace(parts.controller, **law))
+    if of_observer(gains):
+        parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
     each = _each(gains, list(getattr(parts.observer, "gain", ())))
     if each is not None:
         parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
@@ -107,6 +129,7 @@ def gains_of(parts: Parts) -> dict[str, float]:
     each = [float(v) for v in getattr(parts.observer, "gain", ())]
     if each:
         gains["observer_gain"] = sum(each) / len(each)
+    gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
     if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
@@ -121,9 +144,8 @@ def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
 
 def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
     """The scenario with other gains, checked; with another t_f the time after it is kept, unless it was free."""
-    changes: dict[str, Any] = {
-        f"controller__{k}": v for k, v in gains.items() if base(k) not in ("observer_gain", "filter_bandwidth")
-    }
+    changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
+    changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
     each = _each(gains, list(getattr(scenario.observer, "gain", ())))
     if each is not None:
         changes["observer__gain"] = each

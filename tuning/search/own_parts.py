@@ -1,4 +1,4 @@
-"""Programs that scenarios name: systems and metrics of one's own, which flying runs and reading does not.
+"""Programs that scenarios name: parts and metrics of one's own, which flying runs and reading does not.
 
 A scenario that a user names is the user's own program. One that a ptsmc command left may come from anybody, with
 everything in its folder, the digests too: what it names is run with `--trust` only, and as it was when that was made.
@@ -12,17 +12,13 @@ from typing import Any
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import systems
+from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.tables import Scenario
-
-DIGESTS = {"plant.system": "system_sha256", "--metrics": "metrics_sha256"}  # names in `versions.json`
 
 
 def named(scenario: Scenario, metrics: str | None = None) -> dict[str, str]:
     """What flying a scenario, and metrics of one's own, runs: where it stands, by the key that names it."""
-    system = getattr(scenario.plant, "system", None)
-    found = {"plant.system": system, "--metrics": metrics}
-    return {key: where for key, where in found.items() if isinstance(where, str)}
+    return own.programs(scenario) | ({} if metrics is None else {"--metrics": metrics})
 
 
 def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
@@ -56,7 +52,7 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
 def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> None:
     """Raise RefusedError where a program is not the one that results were made with."""
     for key, where in programs.items():
-        was, now = made.get(DIGESTS[key]), systems.digest(where)
+        was, now = made.get(own.digest_name(key)), systems.digest(where)
         if was is not None and now is not None and now != was:
             raise RefusedError(
                 f"{results} was made with another {key} than {systems.location(where)} is now "

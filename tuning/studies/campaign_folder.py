@@ -3,8 +3,8 @@
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns import margin_verdicts, rows, runs, store
 from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import Study, parsing, systems
+from ptsmc_jax.scenario import Study, own, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import own_parts
@@ -36,8 +36,6 @@ class Made(msgspec.Struct, frozen=True):
     precision: Literal[32, 64]
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
-    metrics_sha256: str | None = None
-    system_sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class Folder:
     own: str | None = None  # where the function stands that makes metrics of one's own
     bits: int = 64  # of every number
     made: Made | None = None  # as its folder says; None: it is yet to be begun
+    digests: Mapping[str, str] = field(default_factory=dict)  # of what it was begun with, as its folder says
     trusted: bool = True  # systems and metrics of one's own may be run
 
     @cached_property
@@ -61,11 +60,8 @@ class Folder:
     @cached_property
     def told(self) -> dict[str, Any]:
         """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
-        digests = {
-            name: getattr(self.made, name) if self.made else systems.digest(self.programs[key])
-            for key, name in own_parts.DIGESTS.items()
-            if key in self.programs
-        }
+        names = {own.digest_name(key): where for key, where in self.programs.items()}
+        digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
         more = {} if self.own is None else {"metrics": self.own}
         known = {name: found for name, found in digests.items() if found is not None}
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **known}
@@ -105,10 +101,11 @@ class Folder:
     @cached_property
     def ready(self) -> Study | None:
         """What is flown, without metrics of one's own; None where that would run a system that nobody trusts."""
-        if "plant.system" in self.programs:
-            if not self.trusted:
-                return None
-            self._check_unchanged("plant.system")
+        named = set(self.programs) - {"--metrics"}
+        if named and not self.trusted:
+            return None
+        for key in named:
+            self._check_unchanged(key)
         return scenario.study(self.scenario)
 
     @cached_property
@@ -120,10 +117,10 @@ class Folder:
             return Campaign(self.ready, self.seed)
         self._check_unchanged("--metrics")
         try:
-            own: Any = systems.item(self.own, OWN)
-            if not isinstance(own, Callable):
-                raise ValueError(f"it is a {type(own).__name__}; allowed is {OWN}")
-            made = Campaign(self.ready, self.seed, own)
+            found: Any = systems.item(self.own, OWN)
+            if not isinstance(found, Callable):
+                raise ValueError(f"it is a {type(found).__name__}; allowed is {OWN}")
+            made = Campaign(self.ready, self.seed, found)
             made.own_names()
             return made
         except ValueError as error:
@@ -172,7 +169,7 @@ def begin(wanted: Folder, force: bool) -> None:
                 raise RefusedError(
                     f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
                 )
-            if before.trials == wanted.trials and before.made == _made(wanted):
+            if before.trials == wanted.trials and before.made == _made(wanted) and before.told == wanted.told:
                 return
 
     def fill(making: Path) -> None:
@@ -200,7 +197,8 @@ def opened(path: Path) -> Folder:
         raise
     except (ValueError, msgspec.ValidationError):
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
-    return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, trusted=False)
+    kept = {name: value for name, value in said.items() if name.endswith("_sha256") and isinstance(value, str)}
+    return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, kept, trusted=False)
 
 
 def _made(folder: Folder) -> Made:

@@ -77,7 +77,7 @@ def check(scenario: Scenario) -> None:
 
 def laws() -> list[str]:
     """The kinds of laws that are compared, the paper's first."""
-    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if not law.prescribed)]
+    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if not law.prescribed and kind != "own")]
 
 
 def contenders(scenario: Scenario) -> dict[str, Scenario]:

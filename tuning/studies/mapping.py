@@ -12,7 +12,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.observers.base import Linear
 from ptsmc_jax.observers.none import NoObserver
-from ptsmc_jax.scenario import Study, parsing, study, systems
+from ptsmc_jax.scenario import Study, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -200,7 +200,7 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     trials = max((cell.trials for cell in cells), default=0)
-    source = systems.source(getattr(scenario.plant, "system", None))
+    source = own.digests(scenario)
     store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials, **source))
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)

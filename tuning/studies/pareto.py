@@ -17,7 +17,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.scenario import parsing, study, systems
+from ptsmc_jax.scenario import own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Limit, Scenario
@@ -258,7 +258,7 @@ def knee_of(points: np.ndarray) -> int:
 
 def told(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
     """By what a finished or interrupted front is known again."""
-    source = systems.source(getattr(scenario.plant, "system", None))
+    source = own.digests(scenario)
     return {"command": "pareto", "seed": seed, "points": points, **source}
 
 

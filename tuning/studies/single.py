@@ -7,7 +7,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.scenario import parsing, systems
+from ptsmc_jax.scenario import own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
 
@@ -25,7 +25,7 @@ def summary(run: Run) -> dict[str, Any]:
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    source = systems.source(getattr(scenario.plant, "system", None))
+    source = own.digests(scenario)
     store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
     store.write_json(folder / "summary.json", summary(run))
     columns = run.columns()

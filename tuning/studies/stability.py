@@ -8,7 +8,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.plants.rigid_body import Spacecraft
-from ptsmc_jax.scenario import Study, errors, parsing, study, systems
+from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import margins
@@ -96,7 +96,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     """Fill a result folder."""
     scenario = ready.scenario
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    source = systems.source(getattr(scenario.plant, "system", None))
+    source = own.digests(scenario)
     store.write_json(folder / "versions.json", store.versions("margins", None, **source))
     store.write_json(folder / "summary.json", summary(ready, course))
     inputs, _ = names(ready)

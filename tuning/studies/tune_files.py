@@ -12,7 +12,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import free_gains, parsing, systems
+from ptsmc_jax.scenario import free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
@@ -59,6 +59,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     return {
         "status": tuning.status,
         "plant": kind,
+        "gain_units": gain_names.units_of(tuning.tuned),
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
         **_accuracy_gain(tuning.fresh),
@@ -159,7 +160,7 @@ def _paths(history: Sequence[Step]) -> list[list[Step]]:
 
 def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
     """By what a finished or interrupted run is known again."""
-    source = systems.source(getattr(scenario.plant, "system", None))
+    source = own.digests(scenario)
     return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
 
 
@@ -167,7 +168,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Figures of a tuning run by name."""
     assert scenario.tune is not None
     kind, names = scenario.plant.kind, gain_names.named(scenario)
-    known = gain_names.units(kind)
+    known = gain_names.units_of(scenario)
     units = [known[gain_names.base(name)] for name in names]
     paths = _paths(tuning.search.history)
     longest = max(map(len, paths))

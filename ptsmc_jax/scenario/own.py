@@ -1,0 +1,218 @@
+"""Parts of one's own: `kind = "own"` and `code = "FILE.py:NAME"`, a class whose fields are further keys of its table.
+
+Reading a scenario runs nothing that it names: until `reading.complete` does, such a table keeps these keys as they are.
+"""
+
+import dataclasses
+import functools
+import inspect
+import math
+import re
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+from msgspec import Meta
+
+from ptsmc_jax.scenario import systems
+from ptsmc_jax.scenario.errors import ScenarioError, brief, show
+from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds
+from ptsmc_jax.scenario.values import Table
+
+Code = Annotated[Any, Meta(description=systems.WHERE)]
+
+
+class Own:
+    """What the tables of parts of one's own share, besides their key `code`."""
+
+    __slots__ = ()
+    waits: ClassVar[bool] = False  # until its code is run: it holds the keys that are not known yet in `rest`
+    gains: ClassVar[Mapping[str, GainBounds]] = {}
+    free_by_default: ClassVar[tuple[str, ...]] = ()
+    made: ClassVar[Any] = None  # the class that the code names
+
+    prefix: ClassVar[str] = ""  # of the names of its gains
+
+    @classmethod
+    def base(cls) -> type:
+        """What such a class is derived from; loads JAX."""
+        raise NotImplementedError
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """Methods of which it must have one."""
+        raise NotImplementedError
+
+
+def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
+    """The tables of a parsed file that name code, and the key that does, in tables within tables too."""
+    for table in _tables(raw):
+        for key in ("system", "code"):
+            if isinstance(table.get(key), str):
+                yield table, key
+
+
+def _tables(value: Any) -> Iterator[dict]:
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if isinstance(value, dict):
+        yield value
+    for one in inside:
+        yield from _tables(one)
+
+
+def programs(scenario: Table) -> dict[str, str]:
+    """What flying a scenario runs: where it stands, by the key that names it."""
+    found = {}
+    for name in scenario.__struct_fields__:
+        table = getattr(scenario, name)
+        terms = getattr(table, "terms", None)
+        places = {name: table} if terms is None else {f"{name}.terms[{k}]": term for k, term in enumerate(terms)}
+        for place, one in places.items():
+            for key in ("system", "code"):
+                if isinstance(getattr(one, key, None), str):
+                    found[f"{place}.{key}"] = getattr(one, key)
+    return found
+
+
+def digest_name(key: str) -> str:
+    """By what `versions.json` knows the digest of what a key names.
+
+    >>> digest_name("plant.system"), digest_name("controller.code"), digest_name("disturbance.terms[0].code")
+    ('system_sha256', 'controller_sha256', 'disturbance_terms_0_sha256')
+    """
+    place = key.removeprefix("plant.").removesuffix(".code").lstrip("-")
+    return re.sub(r"\W+", "_", place).strip("_") + "_sha256"
+
+
+def digests(scenario: Table) -> dict[str, str]:
+    """What a result depends on besides its scenario: the digests of the files that it names, as they are now."""
+    found = {digest_name(key): systems.digest(where) for key, where in programs(scenario).items()}
+    return {name: digest for name, digest in found.items() if digest is not None}
+
+
+def waits(scenario: Table) -> bool:
+    """Whether a scenario has a table of one's own whose code was not run yet."""
+    found = (getattr(scenario, name) for name in scenario.__struct_fields__)
+    return any(getattr(one, "waits", False) for table in found for one in getattr(table, "terms", (table,)))
+
+
+@functools.cache
+def waiting(table: Any) -> Any:
+    """The same table before its code is run."""
+    rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
+    space = {"__doc__": table.__doc__, "__module__": table.__module__, "waits": True}
+    return msgspec.defstruct(table.__name__, [rest], bases=(table,), frozen=True, kw_only=True, namespace=space)
+
+
+def read(table: Any, name: str, code: object) -> Any:
+    """The table with the keys of the class that is named, which is run for it, or is there.
+
+    name: of the table in the scenario. Raises ScenarioError where there is no such class.
+    """
+    try:
+        found = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
+        return _with_keys(table, found)
+    except ValueError as error:
+        shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
+        raise ScenarioError(f"{name}.code is {shown}: {error}") from None
+
+
+@functools.lru_cache(maxsize=256)
+def _with_keys(table: Any, found: Any) -> Any:
+    base = table.base()
+    if not (isinstance(found, type) and issubclass(found, base)):
+        said = f"a class {found.__name__}" if isinstance(found, type) else f"a {type(found).__name__}"
+        raise ValueError(f"it names {said}, which is not derived from ptsmc_jax.{base.__name__}")
+    if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs()):
+        raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs())}")
+    if "__dataclass_fields__" not in found.__dict__:
+        dataclasses.dataclass(frozen=True)(found)
+    common = {field.name: field for field in dataclasses.fields(base)}
+    keys, gains, meanings = [], {}, []
+    for field in dataclasses.fields(found):
+        if common.get(field.name) is not None and common[field.name].default is field.default:
+            continue
+        about = field.metadata.get("gain")
+        keys.append((field.name, *_key(field, about)))
+        meaning = "" if about is None else about.meaning
+        unit = f" [{about.unit}]" if about is not None and about.unit else ""
+        meanings.append(f"    {field.name}: {meaning or 'of one of its own'}{unit}")
+        if about is not None:
+            if table.prefix + field.name == "observer_gain":
+                raise ValueError("a gain of its must have another name than gain, which has a number for each axis")
+            gains[table.prefix + field.name] = _bounds(field.name, about)
+    first = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
+    return msgspec.defstruct(
+        found.__name__, keys, bases=(table,), frozen=True, kw_only=True,
+        namespace={
+            "__doc__": first + "\n\nAttributes:\n" + "\n".join(meanings),
+            "__module__": found.__module__,
+            "gains": {**table.gains, **gains},
+            "free_by_default": tuple(gains),
+            "made": found,
+        },
+    )  # fmt: skip
+
+
+def build(table: Any, **common: Any) -> Any:
+    """The part that the code of a table names, with its keys; common: what the fields of its base are."""
+    from ptsmc_jax.numerics.pytrees import vector
+
+    fields = [field.name for field in dataclasses.fields(table.made) if field.name not in common]
+    return _registered(table.made)(**common, **{name: vector(getattr(table, name)) for name in fields})
+
+
+@functools.cache
+def _registered(made: type) -> type:
+    from ptsmc_jax.numerics.pytrees import pytree
+
+    return pytree(made)
+
+
+def _key(field: dataclasses.Field, about: Any) -> tuple[Any, Any]:
+    """Type and default of a field as a key."""
+    value, missing = typing.cast(Any, field.default), dataclasses.MISSING
+    if about is None and isinstance(value, tuple) and value and all(map(_plain, value)):
+        count, numbers = len(value), tuple(map(float, value))
+        said = f"a list of {count} numbers"
+        return Annotated[tuple[float, ...], Meta(min_length=count, max_length=count, description=said)], numbers
+    if not _plain(value):
+        shown = "none" if value is missing else show(value)
+        allowed = "a number, or a tuple of numbers" if about is None else "a number, the first argument of gain"
+        raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
+    if about is None:
+        return Annotated[float, Meta(description="a number")], float(value)
+    said = " and ".join([f"{word} {limit:g}" for word, limit in (("above", about.above), ("below", about.below))
+                         if math.isfinite(limit)])  # fmt: skip
+    if not about.above < value < about.below:
+        raise ValueError(f"the default of {field.name} is {value:g}, but must be a number {said}")
+    above, below = (limit if math.isfinite(limit) else None for limit in (about.above, about.below))
+    return Annotated[float, Meta(gt=above, lt=below, description=f"a number {said}".strip())], float(value)
+
+
+def _plain(value: object) -> typing.TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _bounds(name: str, about: Any) -> GainBounds:
+    usual = about.usual
+    if usual is None:
+        raise ValueError(f"the gain {name} has no bounds; allowed is ptsmc_jax.gain(.., usual=(lower, upper))")
+    given: Callable = usual if callable(usual) else lambda t_f, period: usual
+
+    def interval(choice: Choice) -> tuple[float, float]:
+        try:
+            low, high = (float(v) for v in given(choice.t_f, choice.scenario.loop.period))
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            raise ScenarioError(f"the usual bounds of controller.{name} fail: {said}") from None
+        if not (about.above <= low < high <= about.below and math.isfinite(high)):
+            between = f"between {about.above:g} and {about.below:g}"
+            raise ScenarioError(
+                f"the usual bounds of controller.{name} are [{low:g}, {high:g}], but must be two numbers {between}, "
+                "the lower one first"
+            )
+        return low, high
+
+    return GainBounds(interval, lambda _: Allowed(about.above, about.below))

@@ -1,0 +1,103 @@
+"""What parts of one's own do where a run begins: that they fit, in one sentence, before anything is flown."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.scenario import checks, systems
+from ptsmc_jax.scenario.errors import ScenarioError, brief
+from ptsmc_jax.scenario.own import Own
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.rollout import Parts
+
+
+def check(parts: Parts, scenario: Scenario) -> None:
+    """Raise ScenarioError where a part of one's own fails at t = 0, or returns what a run cannot go on with."""
+    tables = {"reference": scenario.reference, "observer": scenario.observer, "controller": scenario.controller}
+    terms = checks.terms(scenario)
+    signals = (parts.disturbance,) if len(terms) == 1 else getattr(parts.disturbance, "terms", ())
+    acting = iter(signals)
+    for k, term in enumerate(terms):
+        if isinstance(term, Own):
+            name = "disturbance" if len(terms) == 1 else f"disturbance.terms[{k}]"
+            _disturbance(parts, next(one for one in acting if isinstance(one, term.made)), _Asked(name, term))
+    for name, table in tables.items():
+        if isinstance(table, Own):
+            {"reference": _reference, "observer": _observer, "controller": _law}[name](parts, _Asked(name, table))
+
+
+class _Asked:
+    """Calls what a table's code names, and says what is wrong with it."""
+
+    def __init__(self, name: str, table: Any):
+        shown = brief(table.code) if isinstance(table.code, str) else table.made.__name__
+        self._said, self._made = f"{name}.code is {shown}, but its", table.made
+
+    def __call__(self, method: str, function: Callable, *args: Any) -> Any:
+        try:
+            return jax.tree.map(jnp.asarray, function(*args))
+        except Exception as error:
+            file = inspect.getsourcefile(self._made) or ""
+            raise ScenarioError(f"{self._said} {method} fails: {systems.failure(error, file)}") from None
+
+    def refused(self, method: str, returns: str, must: str) -> ScenarioError:
+        """The error for what a method returns."""
+        return ScenarioError(f"{self._said} {method} returns {returns} at t = 0, but must return {must}")
+
+    def check(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> None:
+        """Raise ScenarioError where this is not finite, or of another shape."""
+        got = np.asarray(value)
+        if got.shape != shape:
+            raise self.refused(method, f"{what} of shape {got.shape}", f"one of shape {shape}")
+        if not np.all(np.isfinite(got)):
+            raise self.refused(method, f"{what} {got.tolist()}", "finite numbers")
+
+    def same_memory(self, method: str, before: Any, after: Any) -> None:
+        """Raise ScenarioError where a memory changes its shapes or types."""
+        said = [jax.tree.map(lambda v: f"{v.dtype.name}{v.shape}", tree) for tree in (before, after)]
+        if said[0] != said[1]:
+            raise self.refused(method, f"a memory {said[1]}", f"one as begin does, {said[0]}")
+
+
+def _disturbance(parts: Parts, signal: Any, ask: _Asked) -> None:
+    d = ask("__call__", signal, jnp.zeros_like(parts.t_end), parts.initial)
+    ask.check("__call__", "a disturbance", d, (parts.plant.inputs,))
+
+
+def _reference(parts: Parts, ask: _Asked) -> None:
+    q = ask("attitude", parts.reference.attitude, jnp.zeros_like(parts.t_end))
+    ask.check("attitude", "an attitude", q, (4,))
+    if abs(float(jnp.sum(q * q)) - 1.0) > 1e-9:
+        raise ask.refused("attitude", f"the quaternion {np.asarray(q).tolist()}", "one of length 1")
+    target = ask("attitude", parts.reference, jnp.zeros_like(parts.t_end))
+    ask.check("attitude", "an attitude whose second derivative is", target.w_dot, (3,))
+
+
+def _observer(parts: Parts, ask: _Asked) -> None:
+    observer, m = parts.observer, parts.plant.inputs
+    memory = ask("begin", observer.begin)
+    period = jnp.asarray(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    kept = ask("step", observer.step, memory, jnp.zeros(m), period, period)
+    ask.same_memory("step", memory, kept)
+    ask.check("estimate", "an estimate", ask("estimate", observer.estimate, kept), (m,))
+    ask.check("error_bound", "a bound", ask("error_bound", observer.error_bound().__call__, period), ())
+
+
+def _law(parts: Parts, ask: _Asked) -> None:
+    law: Any = parts.controller
+    zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
+    target = parts.reference(zero)
+    x = law.align(parts.initial, target)
+    method = next((name for name in ("command", "step") if name in vars(type(law).__mro__[1])), "acceleration")
+    memory = ask("begin", law.begin)
+    now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    k2 = parts.observer.error_bound()(zero)
+    u, s, kept = ask(method, law.command, memory, now, x, target, jnp.zeros(m), k2)
+    ask.check(method, "a command", u, (m,))
+    ask.check(method, "a sliding variable", s, (m,))
+    ask.same_memory(method, memory, kept)

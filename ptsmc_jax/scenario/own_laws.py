@@ -1,0 +1,71 @@
+"""Laws of one's own in a scenario file."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from ptsmc_jax.scenario import gain_bounds
+from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.own import Code, Own
+from ptsmc_jax.scenario.values import Positive
+
+
+class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
+    """A law of one's own, a class derived from ptsmc_jax.AccelerationLaw; its further fields are further keys.
+
+    Attributes:
+        code: the class, "FILE.py:NAME" or "package.module:NAME"
+        delta: hand-over so long before t_f, if it has one; default: one control period [s]
+    """
+
+    kind: Literal["own"] = "own"
+    code: Code
+    delta: Positive | None = None
+    gains: ClassVar[Mapping[str, GainBounds]] = {"delta": gain_bounds.DELTA, "t_f": gain_bounds.T_F}
+
+    @classmethod
+    def base(cls) -> type:
+        """`laws.acceleration.AccelerationLaw`."""
+        from ptsmc_jax.laws.acceleration import AccelerationLaw
+
+        return AccelerationLaw
+
+    @classmethod
+    def needs(cls) -> tuple[str, ...]:
+        """One of these."""
+        return "acceleration", "step", "command"
+
+    def law(self) -> Any:
+        """The class that the code names, with what tuning may move."""
+        return self.made
+
+    def physics(self, plant: str) -> Any:
+        """On the error of this kind of plant, with what tuning may move."""
+        made = super().physics(plant)
+        made.tunable = tuple(self.gains)
+        return made
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """Nothing is known: twice as fast as half a turn takes on average."""
+        return "controller.t_f", 2.0 * 3.1416 / t_f
+
+
+class OwnAttitudeLaw(OwnLaw, frozen=True):
+    """A law of one's own, a class derived from ptsmc_jax.AccelerationLaw; its further fields are further keys.
+
+    Attributes:
+        error: what it drives to zero: the vector part of q_f* q, or the paper's q_1 - q_1f
+    """
+
+    error: Literal["multiplicative", "additive"] = "multiplicative"
+
+    def physics(self, plant: str) -> Any:
+        """On the error that it asks for."""
+        from ptsmc_jax.laws.acceleration import on
+        from ptsmc_jax.laws.error_motions import ErrorVector
+
+        if self.error == "multiplicative":
+            return super().physics(plant)
+        made: Any = on(ErrorVector, self.law())
+        made.tunable = tuple(self.gains)
+        return made

@@ -1,0 +1,61 @@
+"""Parts of one's own for own_parts.toml: a law, an observer, a disturbance and a reference; see docs/own_parts.md."""
+
+import jax.numpy as jnp
+
+import ptsmc_jax as ptsmc
+
+
+class Scaling(ptsmc.AccelerationLaw):
+    """Prescribed time by scaling (Song, Wang, Holloway, Krstic, Automatica 83, 2017)."""
+
+    delta: float = ptsmc.gain(2.0, (0.2, 5.0), unit="s", meaning="gains are held from so long before t_f on")
+    m: float = ptsmc.gain(1.0, (1.0, 4.0), above=0.0, meaning="excess of the power of the scaling")
+    k1: float = ptsmc.gain(1.0, lambda t_f, h: (0.3 / t_f, 0.5 / h), unit="1/s", meaning="rate of the scaled error")
+    k: float = ptsmc.gain(1e-3, lambda t_f, h: (1e-5 / t_f, 1.0 / t_f), unit="1/s", meaning="rate of its surface")
+
+    def acceleration(self, now, error, error_rate, bound):
+        """The error's second derivative that it wants, and its sliding variable, (3,) each."""
+        p, left = 2.0 + self.m, jnp.where(now.hold, self.delta, self.t_f - now.t)
+        s = error_rate + (p / left + self.k1) * error
+        a = -2.0 * p / left * error_rate - p * (p + 1.0) / left**2 * error
+        a = a - self.k1 * (error_rate + p / left * error)
+        return a - self.k * (self.t_f / left) ** p * s, s
+
+
+class LowPass(ptsmc.SampledObserver):
+    """The disturbance that the motion shows, through a low pass of first order."""
+
+    rate: float = ptsmc.gain(1.0, lambda t_f, h: (1.0 / t_f, 1.0 / h), unit="1/s", meaning="bandwidth")
+
+    def step(self, memory, seen, t, dt):
+        """The estimate (3,) [N m] at the end of a period."""
+        return seen + jnp.exp(-self.rate * dt) * (memory - seen)
+
+
+class SolarPressure(ptsmc.Disturbance):
+    """Radiation pressure on a panel: a torque about one body axis, by the angle between panel and sun."""
+
+    torque: float = 0.01
+    sun: tuple = (1.0, 0.0, 0.0)  # in inertial axes
+
+    def __call__(self, t, x):
+        """Torque (3,) [N m] in the state x: attitude x.q (scalar last), rate x.w."""
+        v, s = x.q[:3], x.q[3]
+        sun = self.sun + 2.0 * jnp.cross(jnp.cross(self.sun, v) + s * self.sun, v)  # in body axes
+        return self.torque * sun[0] * jnp.abs(sun[0]) * jnp.asarray([0.0, 1.0, 0.0])
+
+
+class Nodding(ptsmc.Reference):
+    """Nods about the x axis of the attitude that [reference] gives."""
+
+    angle: float = 0.05  # rad
+    frequency: float = 0.2  # rad/s
+
+    def attitude(self, t):
+        """Unit quaternion (4,), scalar last."""
+        half = 0.5 * self.angle * jnp.sin(self.frequency * t)
+        return jnp.stack([jnp.sin(half), 0.0 * half, 0.0 * half, jnp.cos(half)])
+
+    def fastest(self):
+        """How fast it changes [rad/s]."""
+        return float(self.frequency)
