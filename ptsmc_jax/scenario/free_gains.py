@@ -65,7 +65,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
             )
     if "observer_gain" in free and "observer_gain" not in scenario.observer.gains:
         raise ScenarioError(
-            f"{said} observer.kind = {errors.show(scenario.observer.kind)} has none; "
+            f"{said} observer.kind = {errors.show(scenario.observer.kind)} has no gain of that name; "
             "allowed is observer_gain with an observer of another kind"
         )
     if "filter_bandwidth" in free and not _has_bandwidth(scenario):

@@ -127,7 +127,10 @@ def _with_keys(table: Any, found: Any) -> Any:
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs()):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs())}")
     if "__dataclass_fields__" not in found.__dict__:
-        dataclasses.dataclass(frozen=True)(found)
+        try:
+            dataclasses.dataclass(frozen=True)(found)
+        except TypeError as error:  # such as a field without a default
+            raise ValueError(f"the class {found.__name__} cannot have such fields: {error}") from None
     common = {field.name: field for field in dataclasses.fields(base)}
     keys, gains, meanings = [], {}, []
     for field in dataclasses.fields(found):
@@ -179,7 +182,7 @@ def _key(field: dataclasses.Field, about: Any) -> tuple[Any, Any]:
         return Annotated[tuple[float, ...], Meta(min_length=count, max_length=count, description=said)], numbers
     if not _plain(value):
         shown = "none" if value is missing else show(value)
-        allowed = "a number, or a tuple of numbers" if about is None else "a number, the first argument of gain"
+        allowed = "a number, or several in parentheses" if about is None else "a number, the first argument of gain"
         raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
     if about is None:
         return Annotated[float, Meta(description="a number")], float(value)

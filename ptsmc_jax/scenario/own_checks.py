@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.scenario import checks, systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
@@ -40,7 +41,8 @@ class _Asked:
 
     def __call__(self, method: str, function: Callable, *args: Any) -> Any:
         try:
-            return jax.tree.map(jnp.asarray, function(*args))
+            returned = function(*args)
+            return jax.tree.map(jnp.asarray, returned)
         except Exception as error:
             file = inspect.getsourcefile(self._made) or ""
             raise ScenarioError(f"{self._said} {method} fails: {systems.failure(error, file)}") from None
@@ -59,9 +61,14 @@ class _Asked:
 
     def same_memory(self, method: str, before: Any, after: Any) -> None:
         """Raise ScenarioError where a memory changes its shapes or types."""
-        said = [jax.tree.map(lambda v: f"{v.dtype.name}{v.shape}", tree) for tree in (before, after)]
-        if said[0] != said[1]:
-            raise self.refused(method, f"a memory {said[1]}", f"one as begin does, {said[0]}")
+        was, now = (jax.tree.map(_kind, tree) for tree in (before, after))
+        if was != now:
+            raise self.refused(method, f"a memory {now}", f"one as begin does, {was}")
+
+
+def _kind(value: Any) -> str:
+    """Type and shape of an array: f64(3,)."""
+    return f"{value.dtype.name.replace('float', 'f')}{value.shape}"
 
 
 def _disturbance(parts: Parts, signal: Any, ask: _Asked) -> None:
@@ -93,11 +100,22 @@ def _law(parts: Parts, ask: _Asked) -> None:
     zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
     target = parts.reference(zero)
     x = law.align(parts.initial, target)
-    method = next((name for name in ("command", "step") if name in vars(type(law).__mro__[1])), "acceleration")
-    memory = ask("begin", law.begin)
     now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
-    k2 = parts.observer.error_bound()(zero)
-    u, s, kept = ask(method, law.command, memory, now, x, target, jnp.zeros(m), k2)
-    ask.check(method, "a command", u, (m,))
-    ask.check(method, "a sliding variable", s, (m,))
-    ask.same_memory(method, memory, kept)
+    k2, memory = parts.observer.error_bound()(zero), ask("begin", law.begin)
+    methods = {
+        "command": (law.command, (memory, now, x, target, jnp.zeros(m), k2)),
+        "step": (law.step, (memory, now, *law.errors(x, target), k2)),
+        "acceleration": (law.acceleration, (now, *law.errors(x, target), k2)),
+    }
+    own = type(law).__mro__[1]  # the class that the code names
+    method = next(name for name in methods if getattr(own, name) is not getattr(AccelerationLaw, name))
+    function, given = methods[method]
+    returned = ask(method, function, *given)
+    wanted = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
+    wanted = wanted[: 2 if method == "acceleration" else 3]
+    if not isinstance(returned, tuple) or len(returned) != len(wanted):
+        raise ask.refused(method, "something else", ", ".join(wanted))
+    ask.check(method, wanted[0], returned[0], (m,))
+    ask.check(method, wanted[1], returned[1], (m,))
+    if method != "acceleration":
+        ask.same_memory(method, memory, returned[2])

@@ -202,7 +202,7 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: b
     kind = raw.get("kind", next(iter(kinds)))
     if not isinstance(kind, str) or kind not in kinds:
         known = list(map(show, kinds))
-        raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 7 else f"one of {', '.join(known)}")
+        raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 8 else f"one of {', '.join(known)}")
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
         return _sum(name, raw, kinds, run)

@@ -83,7 +83,8 @@ def item(where: str, allowed: str) -> object:
 def failure(error: BaseException, place: str) -> str:
     """What went wrong in code of one's own, in one line: the error, and the last line of that file that led to it."""
     said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-    lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == place]
+    walked = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    lines = [line for file, line in walked if os.path.realpath(file) == os.path.realpath(place)]
     return f"{said} (line {lines[-1]} of {Path(place).name})" if lines else said
 
 

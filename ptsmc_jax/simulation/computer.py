@@ -24,7 +24,7 @@ class Computer(NamedTuple):
 
     sensing: Any  # memory of the sensors
     seen: Any  # state as the law saw it at the last sample
-    memory: Array  # of the observer
+    memory: Any  # of the observer
     law: Any  # memory of the law; None where it has none
     # what the observer is told of the last period: mean torque [N m], and momentum of the wheels in it [N m s]
     told: tuple[Array, Array | None] | None  # None: kept elsewhere

@@ -278,7 +278,7 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torq
     return after._replace(status=status, bad_time=bad_time)
 
 
-def _finish(parts: Parts, course, first, state: _State, memory: Array, k2, rows, world: _World | None) -> Result:
+def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, world: _World | None) -> Result:
     judged = course.judged
     log, angle_at_t_f = None, state.running.late.angle_at_t_f
     acting = None if world is None else world.acting

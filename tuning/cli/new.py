@@ -10,6 +10,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.observer_tables import PrescribedTimeObserver
+from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Kind, Table
 from ptsmc_jax.simulation import catalogues
@@ -19,6 +20,11 @@ COLUMN, WIDTH = 36, 120
 # Values shown for keys that are off and have none of their own; a system's own name is what a user puts there.
 EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",
+    "controller.code": "my_parts.py:MyLaw",
+    "controller.delta": 0.5,
+    "observer.code": "my_parts.py:MyObserver",
+    "disturbance.code": "my_parts.py:MyDisturbance",
+    "reference.code": "my_parts.py:MyReference",
     "spacecraft.true_inertia": [10.5, 12.6, 14.7],
     "initial.quat_xyzw": [0.0, 0.0, 0.0, 1.0],
     "initial.quat_wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -62,7 +68,9 @@ class _File:
         self.resolved, self.plant = resolved, resolved.plant.kind
         self.live = parsing.dump(said)
         self.values = parsing.dump(resolved)
-        self.values.setdefault("tune", parsing.plain(free_gains.resolve(resolved, Tune())))
+        # with the gains that are known without running code of one's own
+        default = parsing.plain(free_gains.resolve(resolved, Tune()))
+        self.values["tune"] = {**default, **self.values.get("tune", {})}
 
     def lines(self) -> Iterator[str]:
         """All of them."""
@@ -90,6 +98,10 @@ class _File:
             if not (off and key.name in borrowed):
                 value = values[key.name] if key.name in values else self.example(name, kind, key)
                 yield from _line(off, key.name, value, _meaning(key))
+        known = struct.__struct_fields__
+        if issubclass(struct, Own):
+            for key in dict(live or {}).keys() - {"kind", *known}:
+                yield from _line(False, key, values[key], "of one's own")
         if issubclass(struct, Attitude) and borrowed:
             yield from _prose("its attitude by any one of the keys that [initial] has")
         for other, alternative in kinds.items():
@@ -132,7 +144,8 @@ class _File:
 
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """What the keys of a table of this kind are where they are absent, as far as they are anything."""
-        table: Any = struct()
+        needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
+        table: Any = struct(**needed)
         if isinstance(table, Kind):
             table = table.filled(self.resolved, checks.inputs(self.resolved))
         if isinstance(table, PrescribedTimeObserver):
@@ -142,7 +155,7 @@ class _File:
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
         """A value for a key that is off, or drawn: its default, or what it might be."""
-        if key.default not in (None, ()):
+        if key.default not in (None, (), msgspec.NODEFAULT):
             return key.default
         value = EXAMPLES[f"{table}.{key.name}"]
         if key.allowed.endswith("for each state"):

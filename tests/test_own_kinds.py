@@ -1,0 +1,365 @@
+"""Laws, observers, disturbances and references of one's own: keys and gains of their classes, flown like the others."""
+
+import dataclasses
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.scenario import own, parsing, reading, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from tests.helpers import ROOT, SHORT, small_search
+from tests.test_scenario import check_sentence
+from tuning.search import gains
+
+HEAD = "import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\n\n"
+LAW = """
+class Mine(ptsmc.AccelerationLaw):
+    '''The paper's law.'''
+
+    eta: float = ptsmc.gain(3.0, (2.1, 6.0), above=2.0)
+    delta: float = ptsmc.gain(0.5, (0.1, 2.0), unit="s")
+    k1: float = ptsmc.gain(1.0, lambda t_f, h: (1.0 / t_f, 0.5 / h), unit="1/s", meaning="rate of s")
+    width: float = 1e-3
+
+    def acceleration(self, now, error, error_rate, bound):
+        left = jnp.where(now.hold, 1.0, self.t_f - now.t)
+        s = left * error_rate + jnp.where(now.hold, 1.0, self.eta) * error
+        a = jnp.where(now.hold, 2.0, 2.0 * (self.eta - 1.0) / left)
+        b = jnp.where(now.hold, self.k1, 2.0 * self.eta / left**2)
+        wanted = -2.0 * bound * jnp.tanh(s * (1.0 / self.width)) - a * error_rate - b * s
+        return 0.5 * wanted, s
+"""
+SAMPLED = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
+CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]}, "loop": SAMPLED}
+MINE = {"kind": "own", "code": "mine.py:Mine", "t_f": 5.0}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """An empty folder with the law in mine.py, and a process that has run nothing yet."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(systems, "_ran", {})
+    (tmp_path / "mine.py").write_text(HEAD + LAW)
+    return tmp_path
+
+
+def made(file, name):
+    """What stands in a file of ours."""
+    return systems.item(f"{file}:{name}", systems.WHERE)
+
+
+def flown(tables, record=True):
+    return rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts, record=record)
+
+
+def test_the_papers_law_as_ones_own_flies_like_the_built_in():
+    tables = tomllib.loads(SHORT) | {"tune": {}}
+    del tables["tune"]
+    both = []
+    for law in (MINE | {"error": "additive"}, {"kind": "prescribed_time", "t_f": 5.0}):
+        both.append(flown({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5, "k1": 1.5}}))
+    # bit for bit with the command's own settings; here two programs may fuse differently, which the gains amplify
+    for mine, builtin in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
+
+
+def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
+    (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
+    tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
+    loaded = scenario.from_tables(tables)
+    assert own.waits(loaded)
+    assert parsing.dump(loaded)["controller"]["k1"] == 2
+    with pytest.raises(ScenarioError, match=r"controller\.code is .* running mine\.py fails: RuntimeError"):
+        reading.complete(loaded)
+    (systems.Path("mine.py")).write_text(HEAD + LAW)
+    whole = reading.complete(loaded)
+    assert not own.waits(whole)
+    assert reading.complete(whole) is whole
+    assert whole.controller.k1 == 2.0
+    assert whole.controller.eta == 3.0
+    assert whole.tune is not None
+    assert whole.tune.free == ("delta", "eta", "k1")
+    assert dict(whole.tune.bounds) == {"eta": (2.1, 6.0), "delta": (0.1, 2.0), "k1": (0.2, 5.0)}
+    assert gains.units_of(whole)["k1"] == "1/s"
+    again = scenario.replace(whole, controller__eta=4.0)  # stays complete
+    assert again.controller.eta == 4.0
+    assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
+
+
+def test_gains_of_ones_own_are_set_in_parts_and_in_the_scenario():
+    file = ROOT / "scenarios" / "own_parts.py"
+    tables = {
+        **CHAIN,
+        "controller": {"kind": "own", "code": f"{file}:Scaling", "t_f": 5.0, "delta": 0.5},
+        "observer": {"kind": "own", "code": f"{file}:LowPass"},
+        "tune": {"trials": 8},
+    }
+    whole = reading.complete(scenario.from_tables(tables))
+    assert whole.tune is not None
+    assert whole.tune.free == ("delta", "m", "k1", "k", "observer_rate")
+    parts = scenario.study(whole).parts
+    moved = gains.with_gains(parts, {"k1": 0.25, "observer_rate": 3.5})
+    assert (moved.controller.k1, moved.observer.rate) == (0.25, 3.5)
+    assert gains.gains_of(moved) == {
+        "delta": 0.5, "m": 1.0, "k1": 0.25, "k": 1e-3, "observer_rate": 3.5, "t_f": 5.0,
+    }  # fmt: skip
+    assert gains.own(moved, gains.named(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
+    written = gains.in_scenario(whole, {"m": 2.0, "observer_rate": 4.0})
+    assert (written.controller.m, written.observer.rate) == (2.0, 4.0)
+    assert gains.units_of(whole)["observer_rate"] == "1/s"
+
+
+def test_a_class_from_python_needs_no_file():
+    law = made("mine.py", "Mine")
+    base = scenario.from_tables({**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}})
+    whole = scenario.replace(base, controller={"kind": "own", "code": law, "t_f": 5.0, "eta": 2.5})
+    assert whole.controller.eta == 2.5
+    np.testing.assert_array_equal(scenario.study(whole).parts.controller.eta, flown_with_file().controller.eta)
+
+
+def flown_with_file():
+    return scenario.study(scenario.from_tables({**CHAIN, "controller": {**MINE, "eta": 2.5}})).parts
+
+
+OTHER = """
+class Filtered(ptsmc.SampledObserver):
+    '''The mean of the last two periods.'''
+
+    share: float = ptsmc.gain(0.5, (0.1, 0.9), below=1.0)
+
+    def begin(self):
+        return {"last": jnp.zeros(1), "estimate": jnp.zeros(1)}
+
+    def step(self, memory, seen, t, dt):
+        return {"last": seen, "estimate": self.share * seen + (1.0 - self.share) * memory["last"]}
+
+    def estimate(self, memory):
+        return memory["estimate"]
+
+
+class Wave(ptsmc.Disturbance):
+    '''A sinusoid.'''
+
+    size: float = 0.02
+    rates: tuple = (0.5, 1.5)
+
+    def __call__(self, t, x):
+        return self.size * (jnp.sin(self.rates[0] * t) + jnp.sin(self.rates[1] * t)) * jnp.ones(1)
+
+    def fastest(self):
+        return float(self.rates[1])
+
+
+class Turning(ptsmc.Reference):
+    '''Turns about z.'''
+
+    rate: float = 0.03
+
+    def attitude(self, t):
+        half = 0.5 * self.rate * t
+        return jnp.stack([0.0 * half, 0.0 * half, jnp.sin(half), jnp.cos(half)])
+"""
+
+
+def test_a_disturbance_and_an_observer_do_what_they_say(here):
+    """The built-in sum of two sinusoids flies alike; the observer's memory is what a loop by hand makes of the log."""
+    (here / "other.py").write_text(HEAD + OTHER)
+    law = {"kind": "pd", "k_p": 2.0, "k_d": 2.0, "t_f": 5.0}
+    own_one = {**CHAIN, "controller": law, "disturbance": {"kind": "own", "code": "other.py:Wave", "size": 0.03}}
+    waves = [{"kind": "sinusoid", "amplitude": [0.03], "frequency": [w], "phase": [0.0]} for w in (0.5, 1.5)]
+    known = {**CHAIN, "controller": law, "disturbance": {"kind": "sum", "terms": waves}}
+    one, other = (flown(tables) for tables in (own_one, known))
+    np.testing.assert_allclose(one.log.x, other.log.x, rtol=0, atol=1e-14)
+    steps = [scenario.study(scenario.from_tables(tables)).parts.substeps for tables in (own_one, known)]
+    assert steps[0] == steps[1]  # `fastest` sets the pace as the keys of the built-in one do
+
+    watched = flown({**own_one, "observer": {"kind": "own", "code": "other.py:Filtered", "share": 0.7}})
+    kept = np.asarray(watched.log.lasts)
+    t, x, u = (np.asarray(v)[kept] for v in (watched.log.t, watched.log.x, watched.log.u))
+    seen = np.diff(x[:, 1]) / np.diff(t) - u[:-1, 0]  # x_2' = u + d: the mean of d over each period
+    wanted = 0.7 * seen[1:] + 0.3 * seen[:-1]
+    np.testing.assert_allclose(np.asarray(watched.log.d_hat)[kept][2:-1, 0], wanted[:-1], atol=1e-12)
+
+
+def test_a_reference_of_ones_own_has_exact_rates(here):
+    (here / "other.py").write_text(HEAD + OTHER)
+    start = {"rotvec_deg": [10.0, 20.0, -30.0]}
+    tables = {"loop": {**SAMPLED}, "controller": {"kind": "pd", "t_f": 5.0}}
+    turning = {**tables, "reference": {"kind": "own", "code": "other.py:Turning", **start}}
+    spin = {**tables, "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.03], **start}}
+    for t in (0.0, 2.5):
+        one, other = (
+            scenario.study(scenario.from_tables(which)).parts.reference(jnp.asarray(t)) for which in (turning, spin)
+        )
+        for mine, known in zip(one, other, strict=True):
+            np.testing.assert_allclose(mine, known, atol=1e-15)
+
+
+REMEMBERS = LAW.replace(
+    "def acceleration(self, now,", "def begin(self):\n        return jnp.zeros(1)\n\n    def step(self, memory, now,"
+)
+
+
+def changed(old, new):
+    """The law with a mistake in it."""
+    assert old in LAW
+    return LAW.replace(old, new)
+
+
+# fmt: off
+BAD = [
+    (changed("return 0.5 * wanted, s", "return jnp.zeros(2), s"), {}, "acceleration", "shape"),
+    (
+        changed("return 0.5 * wanted, s", "return 0.5 * wanted"), {},
+        "acceleration returns something", "an acceleration, a sliding variable",
+    ),
+    (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or step"),
+    (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
+    (
+        changed("return 0.5 * wanted", "return jnp.log(-1.0) * wanted"), {},
+        "returns an acceleration [nan]", "finite numbers",
+    ),
+    (changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {}, "the gain eta has no bounds", "usual=(lower, upper)"),
+    (
+        changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},
+        "the usual bounds of controller.eta are [6, 2.1]", "lower one first",
+    ),
+    (
+        changed("lambda t_f, h: (1.0 / t_f, 0.5 / h)", "lambda t_f: 1.0"), {"tune": {}},
+        "bounds of controller.k1 fail", "TypeError",
+    ),
+    (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number above 2"),
+    (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "a number"),
+    (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
+    ("Mine = 3", {}, "a int, which is not derived from", "ptsmc_jax.AccelerationLaw"),
+    ("class Mine:\n    pass", {}, "a class Mine, which is not derived from", "ptsmc_jax.AccelerationLaw"),
+    ("Other = 3", {}, "mine.py has no such name", "FILE.py:NAME"),
+    ("x = = 1", {}, "running mine.py fails: SyntaxError", "mine.py"),
+    (LAW, {"etta": 3.0}, "controller.etta is not a known key", "controller.eta"),
+    (LAW, {"eta": 1.5}, "controller.eta is 1.5", "above 2"),
+    (LAW, {"code": "gone.py:Mine"}, "the file gone.py is not there", "gone.py"),
+    (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
+    (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
+    (REMEMBERS, {}, "step returns something", "a sliding variable, its memory"),
+    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "step returns a memory f64(2,)", "f64(1,)"),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(
+    ("law", "keys", "of_what", "allowed"), BAD, ids=[f"{k} {row[2][:40]}" for k, row in enumerate(BAD)]
+)
+def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_what, allowed):
+    (here / "mine.py").write_text(HEAD + law)
+    controller = {key: value for key, value in {**MINE, **keys}.items() if value is not None and key != "tune"}
+    tables = {**CHAIN, "controller": controller, **({"tune": {}} if "tune" in keys else {})}
+    with pytest.raises(ScenarioError) as caught:
+        scenario.study(scenario.from_tables(tables))
+    check_sentence(str(caught.value).replace("Error", ""), of_what.replace("Error", ""), allowed.replace("Error", ""))
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "of_what"),
+    [
+        ("observer", 'return {"last": seen,', 'return {"last": jnp.zeros(3),', "observer.code is"),
+        ("observer", "def step", "def stop", "has no method step"),
+        ("observer", "share: float", "gain: float", "another name than gain"),
+        ("disturbance", "* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
+        ("disturbance", "jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
+        ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
+    ],
+)
+def test_what_is_wrong_with_other_parts_is_one_sentence(here, name, old, new, of_what):
+    assert old in OTHER
+    (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
+    kind = {"observer": "Filtered", "disturbance": "Wave"}[name]
+    tables = {**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}, name: {"kind": "own", "code": f"other.py:{kind}"}}
+    with pytest.raises(ScenarioError) as caught:
+        scenario.study(scenario.from_tables(tables))
+    assert of_what in str(caught.value) or "disturbance is too fast" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [("jnp.cos(half)", "2.0 * jnp.cos(half)", "one of length 1"), ("jnp.stack([0.0 * half, ", "jnp.stack([", "(4,)")],
+)
+def test_a_reference_that_is_no_attitude_is_refused(here, old, new, said):
+    (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
+    tables = {"loop": SAMPLED, "controller": {"kind": "pd", "t_f": 5.0},
+              "reference": {"kind": "own", "code": "other.py:Turning"}}  # fmt: skip
+    with pytest.raises(ScenarioError, match=r"reference\.code") as caught:
+        scenario.study(scenario.from_tables(tables))
+    assert said in str(caught.value)
+
+
+def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
+    text = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
+    (here / "s.toml").write_text(text)
+    assert command("simulate", "s.toml", "--no-figures", "--quiet")[0] == 0
+    left = here / "out/simulate-s/scenario.toml"
+    found = tomllib.loads(left.read_text())
+    assert found["controller"]["code"] == f"{here}/mine.py:Mine"
+    assert found["controller"]["eta"] == 3.0
+    assert store.made(left.parent)["controller_sha256"] == systems.digest(f"{here}/mine.py:Mine")
+    again = "simulate", "out/simulate-s/scenario.toml", "--no-figures", "--quiet", "--out", "new"
+    code, _, error = command(*again)
+    assert (code, "(controller.code), which this command would run" in error) == (2, True)
+    (here / "mine.py").write_text(HEAD + LAW + "\n# another\n")
+    code, _, error = command(*again, "--trust")
+    assert (code, "was made with another controller.code" in error) == (2, True)
+    (here / "mine.py").write_text(HEAD + LAW)
+    code, _, error = command(*again, "--trust")
+    assert (code, error) == (
+        0,
+        f"ptsmc: runs {here}/mine.py, which controller.code of out/simulate-s/scenario.toml names\n",
+    )
+
+
+@pytest.mark.long
+def test_the_command_tunes_it(command, here, monkeypatch):
+    small_search(monkeypatch)
+    text = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
+    (here / "s.toml").write_text(text)
+    assert command("tune", "s.toml", "--no-figures")[0] in (0, 1)
+    found = tomllib.loads((here / "out/tune-s/tuned.toml").read_text())["controller"]
+    assert 2.1 <= found["eta"] <= 6.0
+    assert found["eta"] != 3.0
+
+
+def test_a_law_flies_what_its_step_remembers():
+    """An integrator of the error by `step` against the same sum by hand."""
+
+    class Integral(ptsmc.AccelerationLaw):
+        k: float = ptsmc.gain(0.3, (0.01, 1.0))
+
+        def begin(self):
+            return jnp.zeros(self.model.inputs)
+
+        def step(self, memory, now, error, error_rate, bound):
+            memory = memory + now.dt * error
+            return -2.0 * error - 2.0 * error_rate - self.k * memory, error, memory
+
+    tables = {**CHAIN, "controller": {"kind": "own", "code": Integral, "t_f": 5.0}}
+    log = flown(tables).log
+    kept = np.asarray(log.lasts)
+    t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
+    total = np.cumsum(np.diff(t) * x[:-1, 0])
+    np.testing.assert_allclose(u[:-1, 0], -2.0 * x[:-1, 0] - 2.0 * x[:-1, 1] - 0.3 * total, atol=1e-13)
+    assert dataclasses.is_dataclass(Integral)
+
+
+def test_a_commented_scenario_keeps_keys_of_ones_own(command, here):
+    (here / "s.toml").write_text(f"{(ROOT / 'scenarios' / 'own_parts.toml').read_text()}")
+    for name in ("own_parts.py",):
+        (here / name).write_text((ROOT / "scenarios" / name).read_text())
+    assert command("new", "commented.toml", "--like", "s.toml", "--quiet")[0] == 0
+    first, second = (reading.complete(scenario.read(path)) for path in ("s.toml", "commented.toml"))
+    assert first == second
