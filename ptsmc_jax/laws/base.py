@@ -1,6 +1,6 @@
 """What the paper's prescribed-time laws share: gains, phases, and the law of every second-order error motion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -94,7 +94,28 @@ class Prescribed(Law):
     k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
     sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
     surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
+    # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
+    implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
+
+    def landing(self, now: Sample, s: Vector, power: Scalar, pull: Scalar, reach: Scalar) -> Vector:
+        """Where s is to be at the end of the period that begins, implicit (backward Euler) sampling; (m,).
+
+        Where the law in continuous time would bring it, r^power s before the hand-over and e^(-pull h) s after it, and
+        from there toward zero by what the switching term can do in the period, `reach`: s+ = target - reach sign(s+),
+        whose solution is sign(target) max(|target| - reach, 0). Acary, Brogliato, Orlov, Chattering-free digital
+        sliding-mode control with state observer and disturbance rejection, IEEE Trans. Automatic Control 57(5), 2012.
+        There is no boundary layer to choose, and no border for delta.
+        """
+        left = jnp.where(now.hold, 1.0, self.t_f - now.t)
+        kept = (self.remaining(now) / left) ** power
+        target = jnp.where(now.hold, jnp.exp(-pull * now.dt), kept) * s
+        # slope 1 where there is nothing to switch against, at rest too
+        return jnp.where(jnp.abs(target) < reach, 0.0, target - reach * jnp.sign(target))
+
+    def remaining(self, now: Sample) -> Scalar:
+        """What is left to t_f at the end of the period that begins [s]; 1 after the hand-over. Never quite nothing."""
+        return jnp.where(now.hold, 1.0, jnp.maximum(self.t_f - now.t - now.dt, 1e-9 * now.dt))
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
@@ -175,3 +196,18 @@ class SecondOrder(Prescribed):
         switching = self.influence(x, target) * k2 * guards.smooth_sign(s, self.sign_width)
         wanted = -switching - gains.a * error_rate - gains.b * s
         return self.invert(x, target, wanted, d_hat), s
+
+    def command(
+        self, memory: Any, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector, Any]:
+        """`torque`, or with implicit sampling the input that lands s where `landing` says: s+ = s_0 + g eps''."""
+        if not self.implicit:
+            return super().command(memory, now, x, target, d_hat, k2)
+        gains, h, c = self.gains(now.t, now.hold), now.dt, self.remaining(now)
+        error, error_rate = self.errors(x, target)
+        s = gains.c * error_rate + gains.e * error
+        s_0 = c * error_rate + gains.e * (error + h * error_rate)
+        g = h * c + gains.e * h**2 / 2.0
+        reach = g * 0.5 * self.influence(x, target) * k2
+        landed = self.landing(now, s, self.eta, 0.5 * self.pull(), reach)
+        return self.invert(x, target, 2.0 * (landed - s_0) / g, d_hat), s, memory

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax.laws.base import Motion, Prescribed, SecondOrder
+from ptsmc_jax.laws.base import Motion, Prescribed, Sample, SecondOrder
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
 from ptsmc_jax.numerics import attitude, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
@@ -176,6 +176,27 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         wanted = -known - k2 * guards.smooth_sign(s, self.sign_width)
         u = (wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, jnp.reshape(s, 1)
+
+    def command(
+        self, memory: Any, now: Sample, x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector, Any]:
+        """`torque`, or with implicit sampling the input (1,) that lands s where `landing` says: s+ = s_0 + g x_n'."""
+        if not self.implicit:
+            return super().command(memory, now, x, target, d_hat, k2)
+        n, h, c = self.order, now.dt, expansion(self.eta, self.order)
+        ends = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
+        pushed = jnp.stack([h ** (n - i) / math.factorial(n - i) for i in range(n)])
+        held, left = [*self.surface(), 1.0], jnp.where(now.hold, 1.0, self.t_f - now.t)
+
+        def weights(tau: Scalar) -> Float[Array, " n"]:
+            return jnp.stack([jnp.where(now.hold, held[i], c[i] * tau**i) for i in range(n)])
+
+        after = weights(self.remaining(now))
+        s, s_0 = (jnp.reshape(v, 1) for v in (jnp.dot(weights(left), x), jnp.dot(after, jnp.stack(ends))))
+        g = jnp.dot(after, pushed)
+        landed = self.landing(now, s, self.eta + n - 2, self.k1, g * k2)
+        u = ((landed - s_0) / g - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+        return u, s, memory
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """K2."""

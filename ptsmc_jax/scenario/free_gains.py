@@ -31,9 +31,9 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     free = tune.free
     if free is None:
         law = scenario.controller
-        rest = law.free_if_sampled if scenario.loop.mode == "sampled" else ()
+        first, rest = law.free(sampled=scenario.loop.mode == "sampled")
         filtered = ("filter_bandwidth",) if _has_bandwidth(scenario) else ()
-        free = (*law.free_by_default, *scenario.observer.gains, *rest, *filtered)
+        free = (*first, *scenario.observer.gains, *rest, *filtered)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)

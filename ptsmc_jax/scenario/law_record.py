@@ -23,6 +23,10 @@ class LawTable(Table, frozen=True):
         """What flies on this kind of plant: a class of `laws`, its fields named as the keys."""
         raise NotImplementedError
 
+    def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Its gains that are free where a scenario does not say, those before and those after the observer's."""
+        return self.free_by_default, self.free_if_sampled if sampled else ()
+
     def turning(self, t_f: float) -> tuple[str, float]:
         """How fast it turns the body [rad/s], at most, and the key that says so."""
         raise NotImplementedError
@@ -35,6 +39,6 @@ class LawTable(Table, frozen=True):
         from ptsmc_jax.numerics.pytrees import vector
 
         made = self.physics(scenario.plant.kind)
-        names = [field.name for field in dataclasses.fields(made) if field.name != "model"]
+        names = [f.name for f in dataclasses.fields(made) if f.name != "model" and not f.metadata.get("static")]
         own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
         return made(model, **{name: vector(value) for name, value in own.items()})

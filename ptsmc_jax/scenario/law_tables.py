@@ -3,6 +3,7 @@
 A law is its physics in a file of `laws`, a table, and a row: here, or among those to compare with.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -11,7 +12,7 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_tables import BASELINES
-from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
@@ -39,6 +40,26 @@ class PrescribedTable(LawTable, frozen=True):
     free_by_default: ClassVar[tuple[str, ...]] = ("eta", "delta")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("k1", "sign_width")
 
+    @property
+    def implicit(self) -> bool:
+        """Whether the held input is chosen for the end of its period."""
+        return self.sampling == "implicit"  # pyright: ignore[reportAttributeAccessIssue]
+
+    def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """With implicit sampling there is no boundary layer."""
+        first, rest = super().free(sampled=sampled)
+        return first, tuple(name for name in rest if not (self.implicit and name == "sign_width"))
+
+    def check(self, scenario: Any) -> None:
+        """Implicit sampling needs samples."""
+        if self.implicit and scenario.loop.mode != "sampled":
+            mode = scenario.loop.mode
+            raise ScenarioError(f'controller.sampling = "implicit" needs the sampled loop, but loop.mode is "{mode}"')
+
+    def build(self, scenario: Any, model: Any) -> Any:
+        """The law of a plant's model."""
+        return dataclasses.replace(super().build(scenario, model), implicit=self.implicit)
+
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at the start."""
         return "controller.eta", 2.0 * self.eta / t_f  # pyright: ignore[reportAttributeAccessIssue]
@@ -55,6 +76,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
         k1: K1, rate of s from the hand-over on, halved by (60) [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
+        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
         disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
@@ -68,6 +90,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
     surface_rate: Positive = 1.0
+    sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative = 1e-3
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
@@ -89,6 +112,7 @@ class SystemController(PrescribedTable, frozen=True):
         k1: K1, rate of s from the hand-over on [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
+        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, bound on each component of d' [unit of d/s]
         disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [unit of d]
         initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
@@ -101,6 +125,7 @@ class SystemController(PrescribedTable, frozen=True):
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
     surface_rate: Positive = 1.0
+    sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative = 0.01
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
@@ -138,6 +163,7 @@ class ChainController(SystemController, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """Theorems 1 and 3, and a surface (39) that is stable."""
+        super().check(scenario)
         n = scenario.plant.order
         if not self.eta > n:
             theorem = "Theorem 1" if n == 2 else "Theorem 3"

@@ -42,11 +42,14 @@ def largest_k1(scenario: Any) -> float:
     """K1 [1/s] at which the sampled loop after the hand-over ends to be stable, with this delay and `surface_rate`.
 
     `borders.largest_reaching` = K1 h / 2 for a spacecraft (60), K1 h for what has the K1 of (10), (29); without delay
-    it is 2 - c h. Of an order above 2 that of the slowest pole of its surface: an estimate. 0: there is none.
+    it is 2 - c h, and with implicit sampling, which has no border then, where `LEFT` of s is left after a period. Of an
+    order above 2 that of the slowest pole of its surface: an estimate. 0: there is none.
     """
     h = scenario.loop.period
     late = float(getattr(scenario.hardware, "delay", None) or 0)
-    reaching = borders.largest_reaching(scenario.controller.surface_rate * h, late) / h
+    implicit = scenario.controller.implicit
+    border = borders.largest_reaching(scenario.controller.surface_rate * h, late, implicit=implicit)
+    reaching = min(border, math.log(1.0 / LEFT)) / h
     return 2.0 * reaching if scenario.spacecraft is not None else reaching
 
 

@@ -71,34 +71,55 @@ def _last(stable, low: float, high: float) -> float:
     return low
 
 
-def largest_index(eta: float, late: float = 0.0) -> float:
-    """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay."""
+def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
+    """Gains kp, kd before the hand-over with implicit sampling and no switching term; tau: time to go in periods.
+
+    From (1 - 1/tau)^eta s = s_0 + g a, see `laws.base.Prescribed.landing`: eta (1 - share) / g and
+    (tau - 1 + eta - share tau) / g, g = tau - 1 + eta/2. On s = 0 the error falls by
+    (1 - eta/(2 tau)) / (1 + eta/(2 (tau - 1))) in a period, below 1 in size for every tau >= 1.
+    """
+    share, g = (1.0 - 1.0 / tau) ** eta, tau - 1.0 + eta / 2
+    return eta * (1.0 - share) / g, (tau - 1.0 + eta - share * tau) / g
+
+
+def largest_index(eta: float, late: float = 0.0, *, implicit: bool = False) -> float:
+    """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay.
+
+    implicit: with implicit sampling; infinite where it is stable down to a period before t_f.
+    """
 
     def stable(index: float) -> bool:
         tau = (2 * eta - 1) / index
-        return radius((eta / tau) ** 2, (2 * eta - 1) / tau, 1.0, late) < 1.0
+        kp, kd = implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
+        return radius(kp, kd, 1.0, late) < 1.0
 
-    return _last(stable, 1e-6, 4.0)
+    return _last(stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
 
 
-def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True) -> float:
+def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
     """Smallest delta [s] for which the last sample before the hand-over is stable.
 
     On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
-    may lie at the hand-over itself: (eta - 1/2) h.
+    may lie at the hand-over itself: (eta - 1/2) h. With implicit sampling and without delay there is no border: 0.
     """
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, late) - float(anchored)) * h)
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, late, implicit=implicit) - float(anchored)) * h)
 
 
-def largest_reaching(surface: float, late: float = 0.0) -> float:
+def largest_reaching(surface: float, late: float = 0.0, *, implicit: bool = False) -> float:
     """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
 
     2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. late: delay in periods.
     The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
     a period whatever the loop does, as long as it knows the torque that acts.
+
+    implicit: with implicit sampling, in which e^(-k h) of s is left after a period: infinite without delay.
     """
 
     def stable(reaching: float) -> bool:
-        return radius(surface * reaching, surface + reaching, 1.0, late) < 1.0
+        kp, kd = surface * reaching, surface + reaching
+        if implicit:
+            moved = -np.expm1(-reaching)
+            kp, kd = surface * moved / (1 + surface / 2), (surface + moved) / (1 + surface / 2)
+        return radius(kp, kd, 1.0, late) < 1.0
 
-    return _last(stable, 1e-6, 4.0) if stable(1e-6) else 0.0
+    return _last(stable, 1e-6, 40.0 if implicit else 4.0) if stable(1e-6) else 0.0

@@ -180,18 +180,21 @@ def _factor(found: margins.Margins) -> float:
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
     second_order = getattr(scenario.plant, "order", 2) == 2
-    papers = hasattr(scenario.controller, "eta")
+    papers = scenario.controller.prescribed
     if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order or not papers:
         return {}
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
     labels = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
+    if scenario.controller.implicit:  # without delay it has no border
+        labels = {"with a period of delay": 1.0}
     if delay > 1:
         labels[f"with {delay} periods of delay"] = float(delay)
     found = {}
     for label, late in labels.items():
-        delta = np.array([borders.smallest_delta(eta, float(period), late, anchored=anchored) for period in h])
+        how = {"anchored": anchored, "implicit": scenario.controller.implicit}
+        delta = np.array([borders.smallest_delta(eta, float(period), late, **how) for period in h])
         found[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return found
 

@@ -1,0 +1,178 @@
+"""Implicit sampling of the paper's law: s lands where it is told to, whatever delta; no border, no boundary layer."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, expansion
+from ptsmc_jax.numerics import integrators
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.signals import references
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import borders
+from tests.helpers import FULL_INERTIA, vector
+from tuning.search.gains import with_gains
+
+H, T_F = 0.1, 5.0
+X0 = {2: [1.0, 0.3], 3: [1.0, 0.3, -0.2]}
+
+
+def study(order=2, bound=0.0, disturbance=0.0, x0=None, **controller):
+    """A sampled chain, d known to be within `bound`."""
+    law = {
+        "t_f": T_F,
+        "eta": order + 0.7,
+        "delta": 0.4,
+        "sampling": "implicit",
+        "disturbance_bound": bound,
+        **controller,
+    }
+    tables = {
+        "plant": {"kind": "chain", "order": order, "x0": x0 or X0[order]},
+        "controller": law,
+        "disturbance": {"kind": "constant", "amplitude": [disturbance]},
+        "loop": {"mode": "sampled", "period": H, "t_end": 7.0, "clock": "anchored"},
+    }
+    return scenario.study(scenario.from_tables(tables)).parts
+
+
+def flown(parts):
+    """Times, states and s at the samples."""
+    log = rollout.simulate_jit(parts, record=True).log
+    kept = np.asarray(log.lasts)
+    return tuple(np.asarray(v)[kept][:-1] for v in (log.t, log.x, log.s[:, 0], log.u[:, 0]))
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_s_lands_on_the_continuous_law_at_every_sample(order):
+    """s = s(0) (1 - t/t_f)^(eta + n - 2) before the hand-over and e^(-K1 t) after it, exactly; RK4 is exact here."""
+    t, x, s, _ = flown(study(order, k1=1.3))
+    left, power = T_F - t, 2 * order - 1.3
+    before, hold = t < T_F - 0.4 - 1e-9, t > T_F - 0.4 - 1e-9
+    np.testing.assert_allclose(s[before], s[0] * (left[before] / T_F) ** power, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(s[hold], s[hold][0] * np.exp(-1.3 * (t[hold] - t[hold][0])), rtol=1e-10, atol=1e-15)
+    c = np.array([float(v) for v in expansion(vector(order + 0.7), order)])
+    np.testing.assert_allclose(s[0], c @ (T_F ** np.arange(order) * x[0]), rtol=1e-14)
+
+
+def test_on_the_surface_the_error_falls_by_a_closed_form():
+    """(1 - eta h/(2 r)) / (1 + eta h/(2 (r - h))) a period, r the time to go; at r = h all of it."""
+    t, x, s, _ = flown(study(x0=[1.0, -2.7 / T_F]))
+    assert np.abs(s[t < 4.6]).max() < 1e-14
+    r = (T_F - t)[t < 4.6 - H - 1e-9]
+    factor = (1 - 2.7 * H / (2 * r)) / (1 + 2.7 * H / (2 * (r - H)))
+    ratio = x[1 : r.size + 1, 0] / x[: r.size, 0]
+    np.testing.assert_allclose(ratio, factor, rtol=1e-9)
+
+
+def test_a_disturbance_leaves_of_s_what_it_does_in_a_period():
+    """With |d| <= K the sign is solved for: s+ = g d, g what a unit of input adds to s in a period; no chattering."""
+    t, _, s, u = flown(study(bound=0.2, disturbance=0.15, k1=2.0))
+    hold = t > 5.0  # the dead zone is reached
+    np.testing.assert_allclose(s[hold], 0.15 * (H + H**2 / 2), rtol=1e-9)
+    np.testing.assert_allclose(u[hold], -0.15, atol=0.15 * H)  # the surface's own decay besides
+
+
+def test_noise_free_chattering_is_gone_where_the_exact_sign_has_it():
+    """The exact sign switches by 2 K every period or two; the implicit one settles: 50 times less is asked for."""
+    values = {}
+    for sampling in ("explicit", "implicit"):
+        run = rollout.simulate_jit(study(bound=0.2, disturbance=0.15, sampling=sampling, sign_width=0.0))
+        values[sampling] = float(run.metrics.chattering), float(run.metrics.hold_error)
+    assert values["implicit"][0] < values["explicit"][0] / 50.0
+    assert values["implicit"][1] < values["explicit"][1]
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("gain", ["eta", "delta", "k1", "t_f"])
+def test_slopes_agree_with_differences(order, gain):
+    """Central differences of step 1e-6 (1e-12 of curvature, 1e-10 of rounding of a metric near 1e-3)."""
+    parts = replace_noise(study(order, bound=0.01, disturbance=0.005))
+    at = {"eta": order + 0.7, "delta": 0.43, "k1": 1.3, "t_f": T_F}
+
+    def error(value):
+        return _window_error(with_gains(parts, {**at, gain: value}))
+
+    slope = float(jax.jvp(error, (vector(at[gain]),), (vector(1.0),))[1])
+    step = 1e-6
+    difference = float(error(vector(at[gain] + step)) - error(vector(at[gain] - step))) / (2 * step)
+    np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-9)
+
+
+_window_error = jax.jit(lambda parts: rollout.simulate(parts).metrics.window_error)
+
+
+def replace_noise(parts):
+    """With room on its clock for other gains."""
+    return replace(parts, clock=replace(parts.clock, before=parts.clock.before + 2, after=parts.clock.after + 4))
+
+
+@pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
+def test_frozen_gains_are_those_of_the_law_and_have_no_border(eta):
+    parts = study(eta=eta)
+    law = parts.controller
+    for tau in (2.0, 3.5, 20.0):
+        now = Sample(vector(T_F - tau * H), jnp.asarray(False), vector(H))
+        by = jax.jacfwd(lambda x, now=now: law.command(None, now, x, None, jnp.zeros(1), vector(0.0))[0])(jnp.zeros(2))
+        kp, kd = borders.implicit_gains(eta, tau)
+        np.testing.assert_allclose(by, [[-kp / H**2, -kd / H]], rtol=1e-12)
+        assert borders.radius(kp, kd, 1.0) < 1.0
+    assert borders.smallest_delta(eta, H, implicit=True) == 0.0
+    late = [borders.smallest_delta(eta, H, 1.0, implicit=implicit) for implicit in (True, False)]
+    assert 0.0 < late[0] < late[1]
+
+
+def test_after_the_hand_over_no_k1_is_too_large():
+    assert borders.largest_reaching(0.05, implicit=True) == np.inf
+    late = [borders.largest_reaching(0.05, 1.0, implicit=implicit) for implicit in (True, False)]
+    assert late[0] > late[1]
+
+
+def test_a_delta_of_one_period_that_explicit_sampling_cannot_fly():
+    """eta = 4: explicit sampling is unstable below (eta - 3/2) h = 2.5 periods, and takes what is left up again."""
+    found = {}
+    for sampling in ("explicit", "implicit"):
+        run = rollout.simulate_jit(study(eta=4.0, delta=H, sampling=sampling, sign_width=1e-3))
+        found[sampling] = float(run.metrics.window_error), float(run.metrics.peak_torque)
+    assert found["implicit"][0] < found["explicit"][0]
+    assert found["implicit"][1] <= found["explicit"][1]
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_a_spacecrafts_s_lands_but_for_what_turns_within_the_period(hold):
+    """The torque that lands s for a constant eps'' is held while T(q) turns: off by O(h^2), a quarter for half of h."""
+    body = rigid_body.spacecraft(FULL_INERTIA)
+    law = PrescribedTimeMultiplicative(
+        body, vector(30.0), vector(3.0), vector(2.0), vector(1.5), vector(1e-3), vector(1.2), implicit=True
+    )
+    q = np.array([0.3, -0.2, 0.4, 0.0])
+    x = rigid_body.AttitudeState(vector(np.append(q[:3], np.sqrt(1 - q @ q))), vector([0.05, -0.02, 0.04]))
+    target = references.Fixed(vector([0.0, 0.0, 0.0, 1.0]))(vector(0.0))
+    t = vector(29.0 if hold else 12.0)
+    off = []
+    for h in (0.04, 0.02, 0.01):
+        u, s, _ = law.command(None, Sample(t, jnp.asarray(hold), vector(h)), x, target, jnp.zeros(3), vector(0.0))
+        end = x
+        for k in range(8):
+            end = integrators.rk4(lambda t, y, u=u: body.rate(t, y, u, jnp.zeros(3)), t + k * h / 8, end, vector(h / 8))
+        e, rate = law.errors(end, target)
+        after = rate + 1.2 * e if hold else (18.0 - h) * rate + 3.0 * e
+        wanted = np.exp(-0.5 * 1.5 * h) * s if hold else ((18.0 - h) / 18.0) ** 3 * s
+        off.append(float(jnp.abs(after - wanted).max()))
+    ratios = np.array(off[:-1]) / np.array(off[1:])
+    assert np.all(np.abs(ratios - 4.0) < 0.5), (off, ratios)
+
+
+def test_it_needs_samples_and_leaves_the_boundary_layer_out_of_the_search():
+    with pytest.raises(ScenarioError, match='sampling = "implicit" needs the sampled loop'):
+        scenario.from_tables({"controller": {"sampling": "implicit"}})
+    tables = {"controller": {"sampling": "implicit"}, "loop": {"mode": "sampled"}, "tune": {}}
+    tune = scenario.from_tables(tables).tune
+    assert tune is not None
+    assert tune.free == ("eta", "delta", "observer_gain", "k1")
