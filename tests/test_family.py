@@ -511,6 +511,15 @@ def test_predefined_time_settles_in_time_and_long_before(start, d):
         assert abs((reached + sliding) / T_F - MEASURED.get(start, (reached + sliding) / T_F)) < 1e-3
 
 
+def test_predefined_time_switches_at_zero_error_as_beside_it():
+    """At q1 = 1/2 the switching gain is (pi / (2 q1 T_1))^2 (1 - q1) at zero, at others 0."""
+    still, rate = vector([0.0]), vector([0.2])
+    for q1, turning in ((0.5, 0.5 * (np.pi / (0.6 * T_F)) ** 2), (0.4, 0.0)):
+        law = made("predefined_time", q1=q1, sign_width=0.0)
+        a, s, _ = stepped(law, None, NOW, still, rate, vector(0.3))
+        np.testing.assert_allclose(a, -phi(np.array(s), 0.4, 0.4 * T_F) - 0.3 - 2.0 * turning, rtol=1e-12)
+
+
 def test_a_chain_in_predefined_time_is_a_hold_apart_from_the_continuous_loop():
     law, gains = made("predefined_time"), GAINS["predefined_time"]
     exact = solve_ivp(
