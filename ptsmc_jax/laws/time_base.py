@@ -39,8 +39,8 @@ class TimeBase(AccelerationLaw):
     The quintic that begins with the first error and its rate, as they are measured, and is at rest at zero at t_f, in
     coordinates in which straight lines are plain: a spacecraft at rest turns about the eigenaxis. Becerra, Vazquez,
     Arechavaleta, Delfin, Predefined-time convergence control for high-order integrator systems using time base
-    generators, IEEE Trans. Control Systems Technology 26(5), 2018. It asks for 10/sqrt(3) e0/t_f^2 at most, the paper's
-    law at the start for eta^2 e0/t_f^2, bang-bang for 4.
+    generators, IEEE Trans. Control Systems Technology 26(5), 2018. From rest it asks for 10/sqrt(3) e0/t_f^2 at most,
+    the paper's law at the start for eta^2 e0/t_f^2, bang-bang for 4.
     """
 
     def begin(self) -> Start:

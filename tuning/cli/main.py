@@ -262,10 +262,10 @@ def compare(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Tune the paper's law and three others to the same requirements, and judge all on the same fresh trials.
+    """Tune the paper's law and others to the same requirements, and judge all on the same fresh trials.
 
-    The others are quaternion PD, nonsingular terminal and fixed-time sliding mode. Interrupted or killed, the same
-    command goes on from there.
+    The others are quaternion PD, time base generators, scaling, and nonsingular terminal, fixed-time, predefined-time
+    and super-twisting sliding mode. Interrupted or killed, the same command goes on from there.
 
     Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
     interrupted.
