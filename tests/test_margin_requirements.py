@@ -3,11 +3,12 @@
 import dataclasses
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import explore, scenario
+from ptsmc_jax import explore, programs, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, over, verdict_text
@@ -86,6 +87,12 @@ def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
 
 
+@programs.jit
+def one_by_one(parts, dispersion, seed, trials):
+    """Margins of each trial's loop, all of them in full."""
+    return jax.lax.map(lambda trial: margins.judged(dispersion.apply(parts, seed, trial))[0].worst(), trials)
+
+
 @pytest.fixture(scope="module")
 def drawn():
     """A problem whose inertias are drawn, of four loops the two hardest rows."""
@@ -129,14 +136,15 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_
     # its two hardest cases hold the worst of the four
     for row, verdict in zip(c[1:], verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
-    each = margin_verdicts.worst(posed.ready.parts, posed.ready.dispersion, 3, np.arange(4))
+    seed, trials = jnp.uint32(3), jnp.arange(4, dtype=jnp.uint32)
+    each = one_by_one(posed.ready.parts, posed.ready.dispersion, seed, trials)
     assert len(np.unique(each["gain_margin"])) == 4
     # with other gains others are the hardest, and they take the places
     asked = posed.problem.margins
     assert asked is not None
     other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
-    each = margin_verdicts.worst(parts, asked.dispersion, 3, np.arange(4))
+    each = one_by_one(parts, asked.dispersion, seed, trials)
     harder, near = margin_rows.hardest(asked, other)
     row = np.asarray(margin_rows.rows(harder, jnp.asarray(other)))
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
