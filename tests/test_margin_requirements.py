@@ -182,7 +182,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
     gains = dict(zip(posed.problem.names, posed.own * np.asarray(changes), strict=True))
     parts, dispersion = with_gains(posed.problem.parts, gains), posed.ready.dispersion
     every, rough = all_of(parts, dispersion, 3, count)
-    period = float(parts.clock.period)
+    period = BODY["loop"]["period"]
     for name, off in margin_verdicts.OFF.items():
         some = np.isfinite(every[name])
         np.testing.assert_array_equal(some, np.isfinite(rough[name]))
