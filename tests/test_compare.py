@@ -13,8 +13,10 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, SHORT, short, small_search
 from tests.pages import checked
+from tuning.output import page, sentences
 from tuning.search import gains
 from tuning.studies import compare, tuner
 
@@ -224,3 +226,31 @@ def test_what_a_rival_cannot_fly_is_refused_before_any_search(monkeypatch, eight
     with pytest.raises(ScenarioError, match=r"the law terminal cannot fly this: .*q_e4 = 0"):
         compare.compare(scenario.from_tables(tables), 0, lambda *told: None)
     assert not asked
+
+
+def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
+    """Of every law, in the table, in compare.csv and, where it breaks a limit, in words; one without a limit too."""
+    asked = Requirement("gain_margin", 6.0, "dB", at_least=True), Requirement("delay_margin", 0.1, "s", at_least=True)
+    base = scenario.from_tables({**TABLES, "requirements": {one.metric: one.limit for one in asked}})
+    values = {"paper": ([9.5, 5.04], [np.inf, np.inf]), compare.OURS: ([6.5, np.nan], [0.3, 0.2])}
+    made = {
+        law: contender(eight, verdicts=[
+            one.verdict(np.array(v), ~np.isnan(v)) for one, v in zip(asked, both, strict=True)])
+        for law, both in values.items()
+    }  # fmt: skip
+    found = compare.Comparison(made, 0, False)
+    (tmp_path / "out").mkdir()
+    compare.write(tmp_path / "out", base, found, False, compare.told(base, 0))
+    rows = list(csv.DictReader((tmp_path / "out" / "compare.csv").read_text().splitlines()))
+    assert [row["gain_margin"] for row in rows] == ["5.04", "nan"]
+    assert [row["delay_margin"] for row in rows] == ["inf", "0.2"]
+    for said in (compare.summary(found), json.loads((tmp_path / "out" / "summary.json").read_text())):
+        table = {row[0]: row[1:] for row in sentences.comparison(said).rows}
+        assert table["gain margin"] == ("5.04", "-", "dB")
+        assert table["delay margin"] == ("unlimited", "0.2", "s")
+        assert "phase margin" not in table
+        lines = list(sentences.comparison_lines(said))
+        assert "  gain_margin at least 6 dB: worst 5.04: NOT met in 1 of 2 trials" in lines
+        assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 trials" in lines
+        assert not [line for line in lines if "delay_margin" in line]
+    assert "no law meets every requirement" in page.build(tmp_path / "out")

@@ -21,12 +21,13 @@ CASES = {
     "filter, slow star tracker, lag": {**FILTER, "hardware__torque_lag": 0.1, "hardware__star_tracker_every": 4},
     "filter, bias": {**FILTER, "hardware__rate_bias": 1e-5, "hardware__rate_bias_walk": 1e-6},
     "wheels, lag": {"hardware__torque_lag": 0.1, "wheels": {"momentum": [0.5, 0.2, -0.1, 0.3]}},
+    "delay, random walk": {"hardware__delay": 2, "disturbance": {"kind": "random_walk", "density": [3e-4] * 3}},
     "random walk": {"disturbance": {"kind": "random_walk", "density": [1e-3] * 3}},
 }  # fmt: skip
 NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rate_bias_walk": 1e-16}
 
 
-SHORT = ("filter, slow star tracker, lag", "wheels, lag")
+SHORT = ("filter, slow star tracker, lag", "wheels, lag", "delay, random walk")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ HOUSE = {
         "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
         "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
         "dispersions": "base | attitudes inertias numbers | variation",
-        "theory": "borders error_floor linear rules solutions | covariance envelopes margins | hold",
+        "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """
             errors systems values
             attitude_keys device_tables dispersion_tables keys plant_tables

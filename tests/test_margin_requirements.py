@@ -3,16 +3,17 @@
 import dataclasses
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import explore, scenario
+from ptsmc_jax import explore, programs, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, over, verdict_text
 from ptsmc_jax.theory import margins
-from tests.helpers import SHORT
+from tests.helpers import SHORT, short
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
 from tuning.studies import stability, tuner
@@ -86,6 +87,32 @@ def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
 
 
+@programs.jit
+def one_by_one(parts, dispersion, seed, trials):
+    """Margins of each trial's loops, all of them in full, and what they roughly are."""
+
+    def one(trial):
+        loops, _ = margins.judged_loops(dispersion.apply(parts, seed, trial))
+        return margins.of_each(loops).each(), jax.vmap(margins.roughly)(loops)
+
+    return jax.lax.map(one, trials)
+
+
+def all_of(parts, dispersion, seed, count):
+    """Each margin of each of the first 24 trials' loops in full and roughly, (count, times); one program for all."""
+    found = one_by_one(parts, dispersion, jnp.uint32(seed), jnp.arange(24, dtype=jnp.uint32))
+    return [{name: farthest(name, v[:count], 2) for name, v in one.items()} for one in found]
+
+
+def worst_of(each):
+    """Of each trial, over its times."""
+    return {name: farthest(name, v, 1) for name, v in each.items()}
+
+
+def farthest(name, values, axis):
+    return (np.max if name == "modulus_margin" else np.min)(np.asarray(values), axis=axis)
+
+
 @pytest.fixture(scope="module")
 def drawn():
     """A problem whose inertias are drawn, of four loops the two hardest rows."""
@@ -129,17 +156,64 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_
     # its two hardest cases hold the worst of the four
     for row, verdict in zip(c[1:], verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
-    each = margin_verdicts.worst(posed.ready.parts, posed.ready.dispersion, 3, np.arange(4))
+    each = worst_of(all_of(posed.ready.parts, posed.ready.dispersion, 3, 4)[0])
     assert len(np.unique(each["gain_margin"])) == 4
     # with other gains others are the hardest, and they take the places
     asked = posed.problem.margins
     assert asked is not None
     other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
-    each = margin_verdicts.worst(parts, asked.dispersion, 3, np.arange(4))
+    each = worst_of(all_of(parts, asked.dispersion, 3, 4)[0])
     harder, near = margin_rows.hardest(asked, other)
     row = np.asarray(margin_rows.rows(harder, jnp.asarray(other)))
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
     limits = posed.ready.margins
     shares = [over(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
     np.testing.assert_allclose(near, np.max(shares), rtol=1e-12)
+
+
+FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains
+
+
+@pytest.mark.parametrize("changes", short(FACTORS, FACTORS[::2]))
+def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, changes, monkeypatch):
+    """As by judging all of them; the nominal loop is not the worst. Lines are off by less than half of `OFF`."""
+    posed, count = drawn, 24
+    gains = dict(zip(posed.problem.names, posed.own * np.asarray(changes), strict=True))
+    parts, dispersion = with_gains(posed.problem.parts, gains), posed.ready.dispersion
+    every, rough = all_of(parts, dispersion, 3, count)
+    period = BODY["loop"]["period"]
+    for name, off in margin_verdicts.OFF.items():
+        some = np.isfinite(every[name])
+        np.testing.assert_array_equal(some, np.isfinite(rough[name]))
+        apart = np.abs(every[name] - rough[name])[some] / (period if name == "delay_margin" else 1.0)
+        assert apart.max(initial=0.0) < off / 2, name
+    each = worst_of(every)
+    nominal = {name: float(v) for name, v in margins.judged_jit(parts)[0].worst().items()}
+    judged = []
+
+    def counted(loops, **how):
+        judged.append(len(loops.a))
+        return of_each(loops, **how)
+
+    of_each = margins.of_each
+    monkeypatch.setattr(margins, "of_each", counted)
+    monkeypatch.setattr(margin_verdicts, "JUDGED", 4)
+    # limits in the midst of the trials: on which side each of them is hangs on digits
+    limits = {name: float(abs(np.median(v))) for name, v in each.items()}
+    for known in (margin_verdicts.OFF, dict.fromkeys(margin_verdicts.OFF, 1e-9)):  # too small a one mends itself
+        monkeypatch.setattr(margin_verdicts, "OFF", known)
+        for names in (list(limits), ["phase_margin", "delay_margin"], ["phase_margin"]):
+            asked = {name: limits[name] for name in names}
+            found = margin_verdicts.worst(parts, dispersion, 3, np.arange(count), asked, places=2)
+            near = [np.max([margin_verdicts.nearness(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
+            first = [np.argsort(-v, kind="stable")[:2] for v in near]
+            np.testing.assert_array_equal(first[0], first[1])
+            np.testing.assert_allclose(near[1][first[0]], near[0][first[0]], rtol=1e-9)
+            for name in names:
+                way = -1.0 if catalogues.MARGINS[name][2] else 1.0
+                np.testing.assert_allclose((way * found[name]).max(), (way * each[name]).max(), rtol=1e-9)
+                assert (way * each[name]).max() > way * nominal[name]
+                beyond = way * np.stack([found[name], each[name]]) > way * limits[name]
+                np.testing.assert_array_equal(*beyond)
+    assert sum(judged) < 6 * every["phase_margin"].size / 2

@@ -226,3 +226,40 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
             assert (growth > 0.0) == (share > 1), ("delay", share, growth)
             checked += 1
     assert checked >= 10
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherever_it_is_opened(delay):
+    """Of three integrators, which less gain makes unstable too; by poles, where one may be 1e-6 outside of the circle.
+
+    A margin's border moves by about that over the slope of the pole's modulus, of the order 0.1 here: 1e-5 of it.
+    """
+    plant = {"kind": "chain", "order": 3}
+    parts = scenario.study(
+        scenario.replace(
+            scenario.from_tables({**CHAIN, "plant": plant}), hardware={"delay": delay, "state_noise": [1e-6] * 3}
+        )
+    ).parts
+    loop = opened(parts)
+    found, at_once = of(loop), margins.together(loop)
+    for name in ("gain_up", "gain_down", "phase", "delay"):
+        assert 0.0 < at_once[name] < np.inf
+        np.testing.assert_allclose(at_once[name], getattr(found, name)[0], rtol=1e-4)
+    np.testing.assert_allclose(at_once["modulus"], found.modulus[0], atol=1e-3)  # on the grid
+    elsewhere, here = linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+    np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
+
+
+def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
+    """The loop between its samples is another one than at them."""
+    every, hardware = 4, {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_every": 4}
+    law = {"t_f": 10.0, "delta": 0.5}
+    tables = {**BODY, "controller": law, "hardware": hardware, "filter": {"kind": "steady_state", "bandwidth": 1.0}}
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    run = linear.nominal_jit(parts)
+    last = int(linear.whole_periods(parts, run, hold=True)[-1])
+    each = linear.opened_in(parts, run, np.arange(last - every + 1, last + 1)).loop
+    means = linear.loops_in(parts, run, np.array([last]))
+    for mean, several in zip(jax.tree.leaves(means), jax.tree.leaves(each), strict=True):
+        np.testing.assert_allclose(mean[0], np.mean(several, axis=0), rtol=1e-12, atol=1e-15)
+    assert np.ptp(each.a, axis=0).max() > 1e-6

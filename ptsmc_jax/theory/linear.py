@@ -320,15 +320,9 @@ class Opening(NamedTuple):
         """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
         return self.a + self.b @ (gain * self.c if jnp.ndim(gain) == 0 else gain @ self.c)
 
-    def response(self, z: Array, *, triangular: bool = False) -> Complex[Array, "m m"]:
-        """L(z) [-], (m, m), what comes back by what acts; triangular: A is, see `in_triangles`."""
-        system, b = z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j
-        return -self.c @ (jax.scipy.linalg.solve_triangular(system, b) if triangular else jnp.linalg.solve(system, b))
-
-    def in_triangles(self) -> "Opening":
-        """The same L [-] with a triangular A (n, n), by Schur's decomposition: many of its values cost little."""
-        a, turned = jax.scipy.linalg.schur(self.a, output="complex")
-        return Opening(a, jnp.conj(turned.T) @ self.b, self.c @ turned)
+    def response(self, z: Array) -> Complex[Array, "m m"]:
+        """L(z) [-], (m, m), what comes back by what acts."""
+        return -self.c @ jnp.linalg.solve(z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j)
 
 
 def at_input(loop: Loop, late: float = 0.0) -> Opening:

@@ -13,19 +13,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.theory import linear
+from ptsmc_jax.theory import crossings, linear
+from ptsmc_jax.theory.crossings import MOST, SPLIT, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
 Scalar = Float[Array, ""]
 
-MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
-LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that it begins at, and its size without poles
-AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
-NEAREST = 3  # crossings of a kind that are closed in on
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 SLOWEST = 10  # periods to go: from one to the next the gains before the hand-over change by a tenth
 TIMES, SHARE = 4, 0.25  # to go at which margins are judged, and the longest as a share of t_f
@@ -59,99 +56,124 @@ class Margins(NamedTuple):
 FIELDS = Margins._fields[:5]  # that are margins
 
 
-def grid(loop: Loop, opening: Opening) -> Float[Array, " points"]:
-    """Frequencies [rad/s], graded toward 0 and toward the Nyquist frequency, and around every pole.
-
-    Of the closed loop, at which the sensitivity may have a peak, and of those with one axis open, at which its L may.
-    """
-    low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
-    high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
-    base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
-    m = opening.c.shape[0]
-    closed = np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0)  # all of them, and all but one
-    poles = jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), jnp.asarray(closed))
-    upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # of pairs one; real ones need no more
-    poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
-    damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
-    near = jnp.abs(jnp.angle(poles))[None] / jnp.pi + AROUND[:, None] * damping[None]
-    both = jnp.append(jnp.asarray(base), jnp.clip(jnp.nan_to_num(near), LOWEST, 1.0))
-    return jnp.sort(both) * jnp.pi / loop.period
+@programs.jit(static_argnames=("sensors", "late"))
+def of_each(loops: Loop, sensors: bool = False, late: bool = True) -> Margins:
+    """Margins of several loops, arrays over them first; see `of`."""
+    return jax.lax.map(partial(of, sensors=sensors, late=late), loops)
 
 
-def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
-    """L of one axis with the others closed: 1 + L is det(I + L) over that of the others, a Schur complement."""
-    m = response.shape[0]
-    others = jnp.arange(m) != axis
-    back = jnp.where(others[:, None] & others[None, :], response, 0.0) + jnp.eye(m)
-    column, row = jnp.where(others, response[:, axis], 0.0), jnp.where(others, response[axis], 0.0)
-    return response[axis, axis] - row @ jnp.linalg.solve(back, column)
+class _Seen(NamedTuple):
+    """An opened loop, looked at from 0 to the Nyquist frequency."""
+
+    finite: Array  # bool; of one that is not, numbers mean nothing
+    loop: Loop
+    opening: Opening
+    quick: Triangles  # the same
+    stable: Array  # bool
+    w: Array  # (points,) [rad/s]
+    each: Array  # (m, points) L of each axis, without slopes
+
+    def at(self, w: Array, *, sloped: bool) -> tuple[Array, Array]:
+        """L of each axis at frequencies of its own (m, places) [rad/s], their derivatives by w; sloped: by the loop."""
+        m, places = w.shape
+        z = jnp.exp(1j * w.reshape(-1) * jax.lax.stop_gradient(self.loop.period))
+        by_w = 1j * jax.lax.stop_gradient(self.loop.period) * z
+        L, by_z = crossings.response(self.opening, self.quick, z) if sloped else self.quick.response(z)
+
+        def own(axis: Array, L: Array, by: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda L: crossings.one_axis(L, axis), (L,), (by,))
+
+        own_L, slope = jax.vmap(own)(jnp.repeat(jnp.arange(m), places), L, by_w[:, None, None] * by_z)
+        return own_L.reshape(m, places), slope.reshape(m, places)
 
 
-@programs.jit(static_argnames="sensors")
-def of_each(loops: Loop, sensors: bool = False) -> Margins:
-    """Margins of several loops, arrays over them first; sensors: opened there, and not at the plant's input."""
-    return jax.lax.map(partial(of, sensors=sensors), loops)
-
-
-def of(loop: Loop, sensors: bool = False) -> Margins:
-    """Margins of each axis of an opened loop; at the sensors of each coordinate that they see, not of delay.
-
-    NaN where the loop has a number that is not finite.
-    """
+def _look(loop: Loop, sensors: bool) -> _Seen:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(loop)]))
     loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
     opening = linear.at_sensors(loop) if sensors else linear.at_input(loop)
     fixed, h = jax.lax.stop_gradient((opening, loop.period))
-    w, quick = jax.lax.stop_gradient((grid(loop, fixed), fixed.in_triangles()))
-    responses = jax.vmap(lambda w: quick.response(jnp.exp(1j * w * h), triangular=True))(w)
+    quick, w = crossings.in_triangles(opening), crossings.grid(fixed, h)
+    each = crossings.each_axis(quick.response(jnp.exp(1j * w * h))[0])
     stable = finite & (jnp.max(jnp.abs(jnp.linalg.eigvals(fixed.closed()))) < 1.0 + NEUTRAL)
-
-    def one(axis: Array) -> Margins:
-        seen = jax.vmap(lambda L: one_axis(L, axis))(responses)
-
-        def at(opening: Opening, w: Scalar, *, triangular: bool = False) -> tuple[Array, Array]:
-            """L and its derivative by w."""
-            z = jnp.exp(1j * w * h)
-            by = 1j * h * z
-            return jax.jvp(lambda z: one_axis(opening.response(z, triangular=triangular), axis), (z,), (by,))
-
-        found = _axis(jax.vmap(partial(at, opening)), jax.vmap(partial(at, quick, triangular=True)), w, seen, stable)
-        delay = jnp.nan if sensors else _delay(loop, w, seen, axis)
-        found = found._replace(delay=jnp.where(stable, delay, 0.0))
-        return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(finite, v, jnp.nan), found)
-
-    return jax.lax.map(one, jnp.arange(opening.c.shape[0]))
+    return _Seen(finite, loop, opening, quick, stable, w, each.T)
 
 
-def _axis(at: Callable, quick: Callable, w: Array, seen: Array, stable: Array) -> Margins:
-    """Margins of one axis, whose L at frequencies w is `seen`; at, quick: L and its slope, with its gradient or not."""
-    begin, there, elsewhere = jax.lax.stop_gradient(_brackets(w, seen))
+def of(loop: Loop, sensors: bool = False, late: bool = True) -> Margins:
+    """Margins of each axis of an opened loop; sensors: opened there, of each coordinate that they see, not of delay.
 
-    def crossed(L: Array) -> Array:
-        """What is zero at crossings: of the real axis, of the size 1."""
-        return jnp.append(L[: _SPLIT[0]].imag, jnp.log(jnp.abs(L[_SPLIT[0] : _SPLIT[1]])))
+    NaN where the loop has a number that is not finite; late: of delay too, else it is NaN.
+    """
+    seen = _look(loop, sensors)
+    begin, there, elsewhere = jax.vmap(partial(crossings.brackets, seen.w))(seen.each)
+    root = jax.lax.stop_gradient(_closed_in(seen, begin, there))
+    L, slope = seen.at(jnp.append(root, elsewhere, axis=1), sloped=True)
+    found = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, there, seen.stable)
+    axes = jnp.arange(root.shape[0])
+    delay = jnp.full(axes.size, jnp.nan)
+    if late and not sensors:
+        delay = jax.vmap(partial(_delay, seen.loop, seen.w))(seen.each, axes)
+    found = found._replace(delay=jnp.where(seen.stable, delay, 0.0))
+    return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(seen.finite, v, jnp.nan), found)
 
-    def closer(_: Any, ends: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        """Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), for all at once."""
-        a, b, f_a, f_b = ends
+
+def _crossed(L: Array) -> Array:
+    """What is zero at crossings: of the real axis, of the size 1."""
+    return jnp.append(L[..., : SPLIT[0]].imag, jnp.log(jnp.abs(L[..., SPLIT[0] : SPLIT[1]])), axis=-1)
+
+
+def _closed_in(seen: _Seen, begin: tuple[Array, Array, Array, Array], there: Array) -> Array:
+    """Frequencies (m, places) [rad/s] of all crossings of all axes, from `crossings.brackets`.
+
+    By Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), until none moves by more than the step of Newton's
+    that follows makes good.
+    """
+
+    def closer(state: tuple[Array, tuple, Array]) -> tuple[Array, tuple, Array]:
+        k, (a, b, f_a, f_b), _ = state
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
         c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
-        L, slope = quick(c)
-        f_c = jnp.append(crossed(L), (jnp.conj(1.0 + L) * slope).real[_SPLIT[1] :])
+        L, slope = seen.at(c, sloped=False)
+        f_c = jnp.append(_crossed(L), (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :], axis=1)
         between = f_c * f_b < 0.0
-        return jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c
+        moves = jnp.any(there & (jnp.abs(c - b) > 1e-9 * b))
+        return k + 1, (jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c), moves
 
-    _, root, _, _ = jax.lax.stop_gradient(jax.lax.fori_loop(0, 10, closer, begin))
-    root = jnp.where(jnp.isfinite(root), root, begin[1])
-    L, slope = at(jnp.append(root, elsewhere))
-    crosses = _SPLIT[1]
+    def goes_on(state: tuple[Array, tuple, Array]) -> Array:
+        return (state[0] < 10) & state[2]
+
+    first = (jnp.zeros((), int), begin, jnp.ones((), bool))
+    root = jax.lax.while_loop(goes_on, closer, jax.lax.stop_gradient(first))[1][1]
+    return jnp.where(jnp.isfinite(root), root, begin[1])
+
+
+def roughly(loop: Loop) -> dict[str, Array]:
+    """Each of `catalogues.MARGINS` of each axis by straight lines between the points of the grid, (m,); no slopes.
+
+    A tenth of the work of `of`.
+    """
+    found = _look(loop, sensors=False)
+    gain, phase, modulus = jax.vmap(crossings.straight)(found.each)
+    late = jnp.min(jax.vmap(partial(crossings.late_at, found.w))(found.each)[0], axis=1)
+    sign = jnp.where(found.stable, 1.0, -1.0)
+    each = {
+        "gain_margin": jnp.where(found.stable & (gain >= MOST), jnp.inf, sign * jnp.minimum(gain, MOST)),
+        "phase_margin": sign * phase,
+        "delay_margin": jnp.where(found.stable, late, 0.0),
+        "modulus_margin": jnp.where(found.stable, modulus, MOST),
+    }
+    return {name: jnp.where(found.finite, v, jnp.nan) for name, v in each.items()}
+
+
+def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> Margins:
+    """Margins of one axis, from its L and slopes by w at the crossings and at what `brackets` looks at besides."""
+    crosses = SPLIT[1]
     slope = slope[:crosses]
-    fall = jnp.append(slope[: _SPLIT[0]].imag, (slope / L[:crosses]).real[_SPLIT[0] :])
+    fall = jnp.append(slope[: SPLIT[0]].imag, (slope / L[:crosses]).real[SPLIT[0] :])
     # one step of Newton's, with slopes that stay: through it the crossing has its derivative
     rate = jax.lax.stop_gradient(slope / jnp.where(fall == 0.0, 1.0, fall))
-    real, even = jnp.split(L[:crosses] - rate * crossed(L), _SPLIT[:1])
+    real, even = jnp.split(L[:crosses] - rate * _crossed(L), SPLIT[:1])
     ends = L[-2:]  # where a pole comes to 1, and to -1
-    on = jnp.append(there[: real.size], jnp.abs(ends.imag) < 1e-2 * jnp.abs(ends.real))
+    on = jnp.append(there[: real.size], crossings.ends_at(ends))
     real = jnp.append(real.real, ends.real)
     factor = -20.0 * jnp.log10(jnp.where(on & (real < 0.0), -real, 1.0))
     up, down = (jnp.min(jnp.where(side * factor > 0.0, side * factor, MOST)) for side in (1.0, -1.0))
@@ -168,63 +190,31 @@ def _axis(at: Callable, quick: Callable, w: Array, seen: Array, stable: Array) -
     )
 
 
-_SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
-
-
-def _brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
-    """Between which points L is real and may be -1 with more gain, or with less, has the size 1, is nearest to -1.
-
-    `NEAREST` each: (low, high) and what is zero there at both; which of them are there; frequencies to look at besides.
-    """
-    real, imag, size = seen.real, seen.imag, jnp.log(jnp.abs(seen))
-    share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
-    crossing = real[:-1] + share * (real[1:] - real[:-1])
-    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < 0.0)
-    factor = -jnp.log(jnp.where(there, -crossing, 1.0))
-    # one that lies a little to the other side may turn out to lie on this one
-    far = [jnp.where(there & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0)]
-    even, left = _crossings(seen)
-    far.append(jnp.where(even, jnp.abs(left), jnp.inf))
-    near = jnp.abs(1.0 + seen) ** 2
-    least = jnp.append(jnp.inf, jnp.where((near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:]), near[1:-1], jnp.inf))
-    values, places = zip(*(jax.lax.top_k(-v, NEAREST) for v in (*far, least)), strict=True)
-    j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
-    slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
-    zero = [jnp.append(imag[j + e][: _SPLIT[0]], size[j + e][_SPLIT[0] :]) for e in (0, 1)]
-    begin = jnp.append(w[j], w[k - 1]), jnp.append(w[j + 1], w[k + 1])
-    off = jnp.append(zero[0], slope[k - 1]), jnp.append(zero[1], slope[k])
-    return (*begin, *off), jnp.isfinite(jnp.concatenate(values)), w[jnp.stack([jnp.argmin(near), 0, -1])]
-
-
-def _crossings(seen: Array) -> tuple[Array, Array]:
-    """Between which points |L| is 1, bool, and the phase to -1 there (-pi, pi]."""
-    size = jnp.log(jnp.abs(seen))
-    share = size[:-1] / jnp.where(size[:-1] == size[1:], 1.0, size[:-1] - size[1:])
-    turned = jnp.angle(seen[1:] / seen[:-1])
-    return size[:-1] * size[1:] < 0.0, jnp.angle(-seen[:-1] * jnp.exp(1j * share * turned))
-
-
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    there, left = _crossings(seen)
-    positive = jnp.where(left < 0.0, left + 2.0 * jnp.pi, left)
-    sizes = jnp.where(there, positive / w[1:], jnp.inf)
+    sizes, crossed = crossings.late_at(w, seen)
     j = jnp.argmin(sizes)
     known = jnp.isfinite(sizes[j])
-    start = jnp.stack([jnp.log(w[j + 1]), sizes[j] / loop.period])
+    start = jnp.stack([jnp.log(crossed[j]), sizes[j] / loop.period])
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
-        value = -one_axis(linear.one_late(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
+        value = -crossings.one_axis(linear.one_late(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
-    def newton(_: Any, x: Array) -> Array:
-        step = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(off)(x)), off(x))
-        return x - jnp.clip(step, -0.5 - 0.1 * jnp.abs(x), 0.5 + 0.1 * jnp.abs(x))
+    def step(x: Array) -> Array:
+        by = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(off)(x)), off(x))
+        return jnp.clip(by, -0.5 - 0.1 * jnp.abs(x), 0.5 + 0.1 * jnp.abs(x))
 
-    start = jax.lax.stop_gradient(jnp.where(known, start, 1.0))
-    root = jax.lax.stop_gradient(jax.lax.fori_loop(0, 12, newton, start))
-    return jnp.where(known, newton(0, root)[1] * loop.period, jnp.inf)
+    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        k, x, _ = state
+        by = step(x)
+        return k + 1, x - by, jnp.any(jnp.abs(by) > 1e-9 * jnp.abs(x))  # the last one, below, is of its square
+
+    first = (jnp.zeros((), int), jnp.where(known, start, 1.0), known)
+    _, root, _ = jax.lax.while_loop(lambda at: (at[0] < 12) & at[2], newton, jax.lax.stop_gradient(first))
+    root = jax.lax.stop_gradient(root)
+    return jnp.where(known, (root - step(root))[1] * loop.period, jnp.inf)
 
 
 class Course(NamedTuple):
@@ -305,11 +295,17 @@ def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None 
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
-def judged(parts: Parts) -> tuple[Margins, Array]:
-    """Margins where they are judged and in hold, (times + 1, m), and which are in hold; for any transformation."""
+def judged_loops(parts: Parts) -> tuple[Loop, Array]:
+    """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s]."""
     run = linear.nominal(parts)
     indices = moments(parts, run, judged_times(parts))
-    return of_each(linear.loops_at(parts, run, indices)), run.period.now.hold[indices]
+    return linear.loops_at(parts, run, indices), run.period.now.hold[indices]
+
+
+def judged(parts: Parts) -> tuple[Margins, Array]:
+    """Margins of `judged_loops`, (times + 1, m), and which are in hold; for any transformation."""
+    loops, hold = judged_loops(parts)
+    return of_each(loops), hold
 
 
 judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
@@ -384,10 +380,9 @@ def together(loop: Loop) -> dict[str, float]:
 def _responses(loop: Loop) -> tuple[Array, Array, Array]:
     """Frequencies, L (points, m, m) and that of each axis with the others closed (points, m)."""
     opening = linear.at_input(loop)
-    w, quick = grid(loop, opening), opening.in_triangles()
-    seen = jax.vmap(lambda w: quick.response(jnp.exp(1j * w * loop.period), triangular=True))(w)
-    axes = jnp.arange(seen.shape[1])
-    return w, seen, jax.vmap(lambda L: jnp.stack([one_axis(L, k) for k in range(axes.size)]))(seen)
+    w = crossings.grid(opening, loop.period)
+    seen, _ = crossings.in_triangles(opening).response(jnp.exp(1j * w * loop.period))
+    return w, seen, crossings.each_axis(seen)
 
 
 def responses(loop: Loop) -> tuple[np.ndarray, np.ndarray]:

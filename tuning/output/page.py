@@ -266,9 +266,13 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    lines = [f"each law tuned alike, all of its gains free, judged on {summary['trials']} fresh trials, flight clock"]
+    judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
+    lines = [f"each law tuned alike, all of its gains free, judged on {judged}"]
     best = min(summary["laws"], key=lambda law: _error(summary["laws"][law]))
-    lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
+    if np.isfinite(_error(summary["laws"][best])):
+        lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
+    else:
+        lines.append("no law meets every requirement")
     meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}
     mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
     headline = meets.get(summary["status"], "Interrupted: the best so far")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import margin_sentences
 from tuning.output.cells import Summary, Table
 
@@ -246,12 +247,23 @@ def comparison(summary: Summary) -> Table:
     row("  nearest fifth", "s", lambda found: (found["settling_near_far"] or [None])[0], ".1f")
     row("  farthest fifth", "s", lambda found: (found["settling_near_far"] or [None])[-1], ".1f")
     row("  never", "", lambda found: found["unsettled"], "d")
+    for name, (unit, _, _) in MARGINS.items():
+        found = [{v["metric"]: v for v in law["verdicts"]}.get(name) for law in laws.values()]
+        if any(found):
+            rows.append((name.replace("_", " "), *("-" if one is None else _margin(one) for one in found), unit))
     rows.append(("all limits met", *("yes" if found["met"] else "no" for found in laws.values()), ""))
     return Table(("", *(law.replace("_", " ") for law in laws), "unit"), rows)
 
 
+def _margin(told: Summary) -> str:
+    """Of a verdict on a margin its worst value."""
+    if told["failures"] == 0 and told["worst"] in (None, math.inf):  # JSON has no number for it
+        return "unlimited"
+    return _digits(told["worst"], ".3g")
+
+
 def comparison_lines(summary: Summary) -> Iterator[str]:
-    """The gains of each law, and trials that went wrong."""
+    """The gains of each law, trials that went wrong, and limits that it breaks."""
     yield from paper_refused(summary)
     for law, found in summary["laws"].items():
         gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
@@ -260,6 +272,7 @@ def comparison_lines(summary: Summary) -> Iterator[str]:
         missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
         if missed:
             yield f"  of {summary['trials']} trials {', '.join(missed)}"
+        yield from (f"  {verdict(told)}" for told in found["verdicts"] if not told["met"])
     yield f"settles: from when the angle stays below {summary['settling_angle']:g} rad"
 
 

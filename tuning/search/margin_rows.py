@@ -72,15 +72,13 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     if not margin_verdicts.differ(asked.dispersion):
         return asked, 0.0
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
-    each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS))
-    shares = [
-        over(each[name], wanted, at_least=MARGINS[name][2])
-        for name, wanted in zip(asked.metrics, np.asarray(asked.wanted), strict=True)
-    ]
-    near = np.max(np.nan_to_num(shares, nan=WITHOUT), axis=0)
+    limits = dict(zip(asked.metrics, np.asarray(asked.wanted).tolist(), strict=True))
+    each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
+    shares = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
+    near = np.max(np.nan_to_num(shares, nan=WITHOUT, neginf=-1e9), axis=0)
     trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
     coordinates = jax.vmap(lambda trial: asked.dispersion.coordinates(asked.seed, trial))(trials)
-    return replace(asked, coordinates=coordinates), float(near.max())
+    return replace(asked, coordinates=coordinates), max(float(near.max()), 0.0)
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:
@@ -90,20 +88,18 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     """
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
 
-    def near(parts: Parts) -> Array:
-        found = margins.judged(parts)[0].each()
-        each = []
-        for name, wanted in zip(asked.metrics, asked.wanted, strict=True):
-            share = over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
-            each.append(jnp.where(jnp.isnan(share), WITHOUT, share))
-        return jnp.stack(each)
-
     if asked.coordinates:
-        cases = jax.lax.map(lambda c: near(asked.dispersion.at(parts, c)), asked.coordinates)
-        found = jnp.concatenate(list(cases), axis=1)
+        each = jax.vmap(lambda c: margins.judged_loops(asked.dispersion.at(parts, c))[0])(asked.coordinates)
+        loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     else:
-        found = near(parts)
-    return found / asked.limits[:, None] - 1.0
+        loops, _ = margins.judged_loops(parts)
+    found = margins.of_each(loops, late="delay_margin" in asked.metrics).each()
+    shares = [
+        over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
+        for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
+    ]
+    near = jnp.stack([jnp.where(jnp.isnan(share), WITHOUT, share) for share in shares])
+    return near / asked.limits[:, None] - 1.0
 
 
 @programs.jit(static_argnames="bounds")

@@ -211,11 +211,13 @@ def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, kno
         store.write_toml(folder / "scenarios" / f"{law}.toml", parsing.dump(one.flown))
     columns = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
                "settling_by_angle")  # fmt: skip
+    asked = [name for name in catalogues.MARGINS if name in scenario.requirements]
     rows = [[law, *(found[name] for name in columns), *((found["settling_time"] or {}).get(q) for q in _SHARES),
+             *({v["metric"]: v["worst"] for v in found["verdicts"]}.get(name) for name in asked),
              "; ".join(f"{name} = {value:.6g}" for name, value in found["gains"].items())]
             for law, found in said["laws"].items()]  # fmt: skip
     settling = [f"settling_time_{100 * float(q):g}" for q in _SHARES]
-    store.write_csv(folder / "compare.csv", ["law", *columns, *settling, "gains"], rows)
+    store.write_csv(folder / "compare.csv", ["law", *columns, *settling, *asked, "gains"], rows)
     if figures:
         style.save(dict(_figures(made)), folder / "figures")
 

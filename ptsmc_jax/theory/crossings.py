@@ -1,0 +1,193 @@
+"""The frequency response of an opened loop on a grid, and between which of its points it crosses what margins are of.
+
+All points at once: A comes in triangles, and what is solved with it goes row after row.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ptsmc_jax.theory.linear import Opening
+
+LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that it begins at, and its size without poles
+AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
+NEAREST = 3  # crossings of a kind that are closed in on
+SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
+MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
+
+
+def grid(opening: Opening, h: Any) -> Float[Array, " points"]:
+    """Frequencies [rad/s] for a period h [s], graded toward 0 and toward the Nyquist frequency, and around every pole.
+
+    Of the closed loop, at which the sensitivity may have a peak, and of those with one axis open, at which its L may.
+    """
+    low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
+    high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
+    base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
+    m = opening.c.shape[0]
+    closed = np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0)  # all of them, and all but one
+    poles = jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), jnp.asarray(closed))
+    upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # of pairs one; real ones need no more
+    poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
+    damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
+    near = jnp.abs(jnp.angle(poles))[None] / jnp.pi + AROUND[:, None] * damping[None]
+    both = jnp.append(jnp.asarray(base), jnp.clip(jnp.nan_to_num(near), LOWEST, 1.0))
+    return jnp.sort(both) * jnp.pi / h
+
+
+class Triangles(NamedTuple):
+    """An opened loop by Schur's decomposition: many of its values cost little. It has no slopes."""
+
+    opening: Opening  # with a triangular A
+    axes: Array  # (n, n) unitary: of its states in columns
+
+    def halves(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+        """X = (z I - A)^-1 B and, turned, Y = C (z I - A)^-1, (n, m, points) each, by its own states."""
+        a, n = self.opening.a, self.opening.a.shape[0]
+
+        def solved(rest: Array, b: Array, *, up: bool) -> Array:
+            """Row after row, for all points at once; rest: A without its diagonal."""
+
+            def row(k: Array, x: Array) -> Array:
+                i = n - 1 - k if up else k
+                known = (rest[i] @ x.reshape(n, -1)).reshape(x.shape[1:])
+                return x.at[i].set((b[i][:, None] + known) / (z - a[i, i])[None])
+
+            return jax.lax.fori_loop(0, n, row, jnp.zeros((*b.shape, z.size), complex))
+
+        rest = jnp.triu(a, 1)
+        return solved(rest, self.opening.b, up=True), solved(rest.T, self.opening.c.T, up=False)
+
+    def response(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+        """L [-] at many z and its derivative by z, (points, m, m) each."""
+        x, y = self.halves(z)
+        return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
+
+
+def in_triangles(opening: Opening) -> Triangles:
+    """The same L [-]."""
+    fixed = jax.lax.stop_gradient(opening)
+    a, axes = jax.scipy.linalg.schur(fixed.a, output="complex")
+    return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
+
+
+def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+    """L [-] at many z with its slopes by the loop, and its derivative by z, (points, m, m) each.
+
+    L = Y (z X - A X - B) - C X: what X and Y are off by, Schur's rounding, counts in the second order only, and so does
+    what they change with the loop.
+    """
+    x, y = quick.halves(z)
+    x = jnp.einsum("ij,jmp->imp", quick.axes, x)
+    y = jnp.einsum("ij,jmp->imp", jnp.conj(quick.axes), y)
+    off = z[None, None] * x - jnp.einsum("ij,jmp->imp", opening.a, x) - opening.b[:, :, None]
+    L = jnp.einsum("nkp,nmp->pkm", y, off) - jnp.einsum("kn,nmp->pkm", opening.c, x)
+    return L, jnp.einsum("nkp,nmp->pkm", y, x)
+
+
+def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
+    """L of one axis with the others closed: 1 + L is det(I + L) over that of the others, a Schur complement."""
+    m = response.shape[0]
+    others = jnp.arange(m) != axis
+    back = jnp.where(others[:, None] & others[None, :], response, 0.0) + jnp.eye(m)
+    column, row = jnp.where(others, response[:, axis], 0.0), jnp.where(others, response[axis], 0.0)
+    return response[axis, axis] - row @ jnp.linalg.solve(back, column)
+
+
+def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
+    """The same of all axes and many points, from the sensitivity S = (I + L)^-1: 1 + L_k = 1 / S_kk."""
+    s = jnp.linalg.inv(response + jnp.eye(response.shape[1])[None])
+    return 1.0 / jnp.diagonal(s, axis1=1, axis2=2) - 1.0
+
+
+def brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
+    """Between which points L is real and may be -1 with more gain, or with less, has the size 1, is nearest to -1.
+
+    `NEAREST` each: (low, high) [rad/s] and what is zero there at both; which of them are there; frequencies to look at
+    besides.
+    """
+    imag, size = seen.imag, jnp.log(jnp.abs(seen))
+    there, factor = real_at(seen)
+    # one that lies a little to the other side may turn out to lie on this one
+    far = [jnp.where(there & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0)]
+    even, left = even_at(seen)
+    far.append(jnp.where(even, jnp.abs(left), jnp.inf))
+    near = jnp.abs(1.0 + seen) ** 2
+    least = jnp.append(jnp.inf, jnp.where((near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:]), near[1:-1], jnp.inf))
+    values, places = zip(*(_least(v) for v in (*far, least)), strict=True)
+    j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
+    slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
+    zero = [jnp.append(imag[j + e][: SPLIT[0]], size[j + e][SPLIT[0] :]) for e in (0, 1)]
+    begin = jnp.append(w[j], w[k - 1]), jnp.append(w[j + 1], w[k + 1])
+    off = jnp.append(zero[0], slope[k - 1]), jnp.append(zero[1], slope[k])
+    return (*begin, *off), jnp.isfinite(jnp.concatenate(values)), w[jnp.stack([jnp.argmin(near), 0, -1])]
+
+
+def _least(values: Array) -> tuple[Array, Array]:
+    """The `NEAREST` least of them and their places, in order; several times as fast as to sort them all."""
+    found = []
+    for _ in range(NEAREST):
+        place = jnp.argmin(values)
+        found.append((values[place], place))
+        values = jnp.where(jnp.arange(values.size) == place, jnp.inf, values)  # `at`: scattered under vmap, in vain
+    return jnp.stack([value for value, _ in found]), jnp.stack([place for _, place in found])
+
+
+def real_at(seen: Array) -> tuple[Array, Array]:
+    """Between which points L [-] is real and negative, bool, and ln of the gain with which it is -1 there."""
+    real, imag = seen.real, seen.imag
+    share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
+    crossing = real[:-1] + share * (real[1:] - real[:-1])
+    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < 0.0)
+    return there, -jnp.log(jnp.where(there, -crossing, 1.0))
+
+
+def even_at(seen: Array) -> tuple[Array, Array]:
+    """Between which points |L| is 1, bool, and the phase to -1 there (-pi, pi] [rad]."""
+    there, share = _even(seen)
+    turned = jnp.angle(seen[1:] / seen[:-1])
+    return there, jnp.angle(-seen[:-1] * jnp.exp(1j * share * turned))
+
+
+def _even(seen: Array) -> tuple[Array, Array]:
+    """Between which points |L| is 1, and where, as a share of the way from one to the next, by logarithms."""
+    size = jnp.log(jnp.abs(seen))
+    there = size[:-1] * size[1:] < 0.0
+    return there, size[:-1] / jnp.where(there, size[:-1] - size[1:], 1.0)
+
+
+def late_at(w: Array, seen: Array) -> tuple[Array, Array]:
+    """Delays [s] that turn L to -1 where |L| is 1, and frequencies [rad/s]; infinite where it is not, (points - 1,)."""
+    there, left = even_at(seen)
+    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _even(seen)[1], 0.0)
+    return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
+
+
+def ends_at(ends: Array) -> Array:
+    """At which ends of the grid L [-] is real as well, bool: a pole comes to 1 there, or to -1."""
+    return jnp.abs(ends.imag) < 1e-2 * jnp.abs(ends.real)
+
+
+def straight(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
+    """Nearest gain [dB], infinite without any, phase [deg] and peak of the sensitivity [dB].
+
+    By lines between points, of the logarithm where L crosses something.
+    """
+    there, _ = real_at(seen)
+    size, angle = jnp.log(jnp.abs(seen)), jnp.angle(-seen)
+    apart = angle[:-1] - angle[1:]
+    factor = -size[:-1] + angle[:-1] / jnp.where(there, apart, 1.0) * (size[:-1] - size[1:])
+    ends = seen[jnp.array([0, -1])]
+    real = ends_at(ends) & (ends.real < 0.0)
+    factors = jnp.append(factor, -jnp.log(jnp.where(real, -ends.real, 1.0)))
+    gain = jnp.min(jnp.where(jnp.append(there, real) & (factors != 0.0), jnp.abs(factors), jnp.inf))
+    even, left = even_at(seen)
+    phase = jnp.min(jnp.where(even, jnp.abs(left), jnp.pi))
+    step = seen[1:] - seen[:-1]
+    size = jnp.maximum(jnp.abs(step) ** 2, 1e-300)
+    along = jnp.clip(-(jnp.conj(step) * (1.0 + seen[:-1])).real / size, 0.0, 1.0)
+    near = jnp.min(jnp.abs(1.0 + seen[:-1] + along * step))
+    return 20.0 / np.log(10.0) * gain, jnp.rad2deg(phase), -20.0 * jnp.log10(near)
