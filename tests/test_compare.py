@@ -14,8 +14,9 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import FIRST_FLIGHT, SHORT, short, small_search
+from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
 from tests.pages import checked
+from tuning.errors import UsageError
 from tuning.output import page, sentences
 from tuning.search import gains
 from tuning.studies import compare, tuner
@@ -31,7 +32,10 @@ def tuned(scenario):
 def test_every_law_is_asked_for_the_same(monkeypatch):
     base = scenario.from_tables(TABLES)
     posed = compare.contenders(base)
-    assert list(posed) == ["prescribed_time", "pd", "terminal", "fixed_time"]
+    assert list(posed) == [
+        "prescribed_time", "pd", "terminal", "fixed_time", "time_base_pd", "time_base_sliding", "scaling",
+        "predefined_time", "super_twisting",
+    ]  # fmt: skip
     assert posed["prescribed_time"] is base
     for kind, other in posed.items():
         assert other.controller.kind == kind
@@ -44,6 +48,23 @@ def test_every_law_is_asked_for_the_same(monkeypatch):
     assert free["pd"] == ("k_p", "k_d", "observer_gain")
     assert free["terminal"] == ("p", "b", "k", "observer_gain", "sign_width")
     assert free["fixed_time"] == ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "observer_gain", "sign_width")
+
+
+def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
+    base = scenario.from_tables(TABLES)
+    where = str(ROOT / "scenarios" / "own_parts.py") + ":Scaling"
+    rivals = compare.Rivals(("pd",), (where,))
+    rivals.check()
+    posed = compare.contenders(base, rivals)
+    assert list(posed) == ["prescribed_time", "pd", "Scaling"]
+    assert posed["Scaling"].controller.code == where
+    assert posed["Scaling"].requirements == base.requirements
+    assert tuned(posed["Scaling"]).free == ("delta", "m", "k1", "k", "observer_gain")
+    assert compare.told(base, 3, rivals)["laws"] == ["prescribed_time", "pd", "Scaling"]
+    assert compare.told(base, 3) == {"command": "compare", "seed": 3}
+    for wrong, said in ((compare.Rivals(("lqr",)), "--against is lqr"), (compare.Rivals(None, ("x",)), "--law is x")):
+        with pytest.raises(UsageError, match=said):
+            wrong.check()
 
 
 def test_a_baselines_own_scenario_keeps_its_own_bounds():
@@ -205,7 +226,7 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
     asked = rivals(monkeypatch, eight)
     made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
     assert asked == [("judge", "paper", tuner.seed_of_judge(5)),
-                     *(("tune", law, 5) for law in ("prescribed_time", "pd", "terminal", "fixed_time"))]  # fmt: skip
+                     *(("tune", law, 5) for law in compare.laws())]  # fmt: skip
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
     assert replace(made, contenders=lost).status == "not met"

@@ -45,7 +45,7 @@ class PredefinedTime(AccelerationLaw):
         squares = error_rate * jnp.abs(error_rate) + 2.0 * surface * jnp.abs(surface)
         s = error_rate + guards.signed_root(squares, jnp.zeros_like(bound))
         size = jnp.abs(error)
-        # Phi_1 Phi_1' as a product without a negative power, which at zero would have no value; at q1 = 1/2 one has |x|^0
+        # Phi_1 Phi_1' as a product without a negative power, which at zero would have no value; |x|^0 of q1 = 1/2 is 1
         grown = guards.signed_power(size, 2.0 * self.q1)
         none = (size == 0.0) & (self.q1 >= 0.5)
         rest = size + jnp.where(none, 1.0, guards.signed_power(size, 1.0 - 2.0 * self.q1))

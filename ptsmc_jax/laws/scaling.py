@@ -19,9 +19,9 @@ class Scaling(AccelerationLaw):
     """a = -2 p eps'/r - p (p+1) eps/r^2 - k1 (eps' + p eps/r) - k z, p = 2 + m, r = t_f - t, from r = delta on held.
 
     z = mu (eps' + (p/r + k1) eps) with mu = (t_f/r)^p is xi' + k1 xi of the scaled error xi = mu eps, and the law is
-    z' = mu (-k z + d): |z| stays below the larger of |d|/k and what it began with, while eps falls like r^p. Song, Wang,
-    Holloway, Krstic, Time-varying feedback for regulation of normal-form nonlinear systems in prescribed finite time,
-    Automatica 83, 2017. Its gains grow without bound toward t_f: those of r = delta are held, which makes it a PD.
+    z' = mu (-k z + d): |z| stays below the larger of |d|/k and what it began with, while eps falls like r^p. Song,
+    Wang, Holloway, Krstic, Time-varying feedback for regulation of normal-form nonlinear systems in prescribed finite
+    time, Automatica 83, 2017. Its gains grow without bound toward t_f: those of r = delta are held, which makes a PD.
     """
 
     m: Leaf  # >= 1 [-]

@@ -11,9 +11,11 @@ import ptsmc_jax
 from tuning.cli import campaign_commands, writing_commands
 from tuning.cli.options import (
     INTERRUPTED,
+    Against,
     Device,
     Figures,
     Force,
+    Laws,
     Out,
     Quiet,
     SampledFile,
@@ -256,6 +258,8 @@ def compare(
     *,
     out: Out = None,
     seed: Seed = "0",
+    against: Against = None,
+    law: Laws = (),
     device: Device = "cpu",
     trust: Trust = False,
     force: Force = False,
@@ -264,8 +268,7 @@ def compare(
 ) -> int:
     """Tune the paper's law and others to the same requirements, and judge all on the same fresh trials.
 
-    The others are quaternion PD, time base generators, scaling, and nonsingular terminal, fixed-time, predefined-time
-    and super-twisting sliding mode. Interrupted or killed, the same command goes on from there.
+    Those of --against, and laws of your own. Interrupted or killed, the same command goes on from there.
 
     Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
     interrupted.
@@ -274,12 +277,14 @@ def compare(
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from tuning.studies import compare as comparing
 
+    rivals = comparing.Rivals(against, law)
+    rivals.check()
     comparing.check(loaded)
     loaded = _with_tune(loaded)
-    known_by = comparing.told(loaded, key)
+    known_by = comparing.told(loaded, key, rivals)
     return _search(
         loaded, folder, known_by, force, quiet, "",
-        work=lambda told, journal: comparing.compare(loaded, key, told, journal),
+        work=lambda told, journal: comparing.compare(loaded, key, told, journal, rivals),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
         summary=comparing.summary,
         shown=terminal.comparison,

@@ -22,6 +22,17 @@ Force = Annotated[bool, Parameter(negative="", help="Write into a folder that ho
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
+Against = Annotated[
+    tuple[str, ...] | None,
+    Parameter(
+        negative="",
+        help="Law to compare with, several times: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
+        "predefined_time, super_twisting; none: all of them.",
+    ),
+]
+Laws = Annotated[
+    tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a law of your own beside them, several times.")
+]
 Device = Annotated[str, Parameter(help="What it is flown on: cpu or gpu.")]
 Trust = Annotated[
     bool,

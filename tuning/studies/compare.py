@@ -1,5 +1,6 @@
 """The paper's law beside others, tuned to the same requirements by the same search, judged on the same trials."""
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +14,14 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import errors, parsing, plant_tables, replace, study, tables
+from ptsmc_jax.scenario import errors, own, parsing, plant_tables, replace, study, systems, tables
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
+from tuning.errors import UsageError
 from tuning.search import gains, trust
 from tuning.search.journal import Journal
 from tuning.search.starts import Report
@@ -80,22 +82,59 @@ def laws() -> list[str]:
     return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if not law.prescribed and kind != "own")]
 
 
-def contenders(scenario: Scenario) -> dict[str, Scenario]:
+@dataclass(frozen=True)
+class Rivals:
+    """What the paper's law is compared with."""
+
+    kinds: tuple[str, ...] | None = None  # None: all of them
+    own: tuple[str, ...] = ()  # laws of one's own, "FILE.py:NAME"
+
+    def check(self) -> None:
+        """Raise UsageError where a kind is not known, or a law of one's own is no name."""
+        known = laws()[1:]
+        for kind in self.kinds or ():
+            if kind not in known:
+                raise UsageError(f"--against is {kind}, but must be one of {', '.join(known)}")
+        for where in self.own:
+            try:
+                systems.named(where, systems.WHERE)
+            except ValueError as error:
+                raise UsageError(f"--law is {where}: {error}") from None
+
+    @property
+    def named(self) -> dict[str, dict[str, str]]:
+        """The law of the table [controller] of each, the paper's first, by what it is called."""
+        kinds = laws() if self.kinds is None else [OURS, *self.kinds]
+        found = {kind: {"kind": kind} for kind in kinds}
+        for where in self.own:
+            place, _, name = where.rpartition(":")
+            code = f"{os.path.realpath(place)}:{name}" if place.endswith(".py") else where
+            found[name if name not in found else f"own {name}"] = {"kind": "own", "code": code}
+        return found
+
+    def told(self) -> dict[str, Any]:
+        """By what a comparison with them is known again; nothing where they are all the kinds that there are."""
+        digests = {where: systems.digest(where) for where in self.own}
+        return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
+
+
+def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
     assert scenario.tune is not None
     table, tune = scenario.controller, scenario.tune
     common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     found = {}
-    for kind in laws():
-        if scenario.controller.kind == kind:
+    for kind, law in rivals.named.items():
+        if law["kind"] != "own" and scenario.controller.kind == kind:
             found[kind] = scenario
         elif kind == OURS:
             found[kind] = _posed(gains.papers(scenario), tune, same)
         else:
-            kept = ("sign_width",) if "sign_width" in LAWS["spacecraft"][kind].__struct_fields__ else ()
-            width = {key: getattr(table, key) for key in kept if hasattr(table, key)}
-            other = replace(scenario, tune=None, controller={"kind": kind, **common, **width})
+            fields = LAWS["spacecraft"][law["kind"]].__struct_fields__
+            kept = [key for key in ("sign_width",) if key in fields and hasattr(table, key)]
+            width = {key: getattr(table, key) for key in kept}
+            other = replace(scenario, tune=None, controller={**law, **common, **width})
             found[kind] = _posed(other, tune, same)
     return found
 
@@ -110,10 +149,12 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
     return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
-def compare(scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None) -> Comparison:
+def compare(
+    scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None, against: Rivals = Rivals()
+) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
     fresh_seed = tuner.seed_of_judge(seed)
-    rivals = contenders(scenario)
+    rivals = contenders(scenario, against)
     for law, posed in rivals.items():
         try:
             study(posed)
@@ -240,6 +281,6 @@ def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
     )  # fmt: skip
 
 
-def told(scenario: Scenario, seed: int) -> dict[str, Any]:
+def told(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
     """By what a finished or interrupted comparison is known again."""
-    return {"command": "compare", "seed": seed}
+    return {"command": "compare", "seed": seed, **own.digests(scenario), **against.told()}
