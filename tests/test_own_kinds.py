@@ -238,6 +238,8 @@ BAD = [
     (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number above 2"),
     (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "a number"),
     (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
+    ("Mine = [3]", {}, "a list, which is not derived from", "ptsmc_jax.AccelerationLaw"),
+    (changed("width: float", "code: float"), {}, "a field of the class Mine is called code", "has its meaning"),
     ("Mine = 3", {}, "a int, which is not derived from", "ptsmc_jax.AccelerationLaw"),
     ("class Mine:\n    pass", {}, "a class Mine, which is not derived from", "ptsmc_jax.AccelerationLaw"),
     ("Other = 3", {}, "mine.py has no such name", "FILE.py:NAME"),
@@ -270,7 +272,7 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
     [
         ("observer", 'return {"last": seen,', 'return {"last": jnp.zeros(3),', "observer.code is"),
         ("observer", "def step", "def stop", "has no method step"),
-        ("observer", "share: float", "gain: float", "another name than gain"),
+        ("observer", "share: float", "gain: float", "another than gain"),
         ("disturbance", "* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
         ("disturbance", "jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
         ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
@@ -363,3 +365,12 @@ def test_a_commented_scenario_keeps_keys_of_ones_own(command, here):
     assert command("new", "commented.toml", "--like", "s.toml", "--quiet")[0] == 0
     first, second = (reading.complete(scenario.read(path)) for path in ("s.toml", "commented.toml"))
     assert first == second
+
+
+def test_fields_of_a_class_that_it_is_derived_from_are_keys_too(here):
+    (here / "mine.py").write_text(
+        HEAD + LAW.replace("class Mine", "class First") + "\n\nclass Mine(First):\n    pass\n"
+    )
+    whole = reading.complete(scenario.from_tables({**CHAIN, "controller": {**MINE, "eta": 2.5}}))
+    assert set(whole.controller.gains) == {"eta", "delta", "k1", "t_f"}
+    assert scenario.study(whole).parts.controller.eta == 2.5

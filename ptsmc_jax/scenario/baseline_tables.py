@@ -35,17 +35,22 @@ class BaselineTable(LawTable, frozen=True):
         """The law of eps'' = a + d, a class of `laws` with a field for each gain."""
         raise NotImplementedError
 
-    def physics(self, plant: str) -> Any:
-        """The law on the error of this kind of plant."""
+    def error_motion(self, plant: str) -> Any:
+        """The error that it drives to zero."""
         from ptsmc_jax.laws import error_motions
-        from ptsmc_jax.laws.acceleration import on
 
         errors: dict[str, type[error_motions.ErrorMotion]] = {
             "spacecraft": error_motions.ErrorQuaternion,
             "chain": error_motions.ErrorOfChain,
             "system": error_motions.ErrorOfSystem,
         }
-        return on(errors[plant], self.law())
+        return errors[plant]
+
+    def physics(self, plant: str) -> Any:
+        """The law on the error of this kind of plant."""
+        from ptsmc_jax.laws.acceleration import on
+
+        return on(self.error_motion(plant), self.law())
 
     def check(self, scenario: Any) -> None:
         """They are laws of second order."""

@@ -112,6 +112,10 @@ def read(table: Any, name: str, code: object) -> Any:
     """
     try:
         found = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
+        base = table.base()
+        if not (isinstance(found, type) and issubclass(found, base)):
+            said = f"a class {found.__name__}" if isinstance(found, type) else f"a {type(found).__name__}"
+            raise ValueError(f"it names {said}, which is not derived from ptsmc_jax.{base.__name__}")
         return _with_keys(table, found)
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
@@ -121,29 +125,29 @@ def read(table: Any, name: str, code: object) -> Any:
 @functools.lru_cache(maxsize=256)
 def _with_keys(table: Any, found: Any) -> Any:
     base = table.base()
-    if not (isinstance(found, type) and issubclass(found, base)):
-        said = f"a class {found.__name__}" if isinstance(found, type) else f"a {type(found).__name__}"
-        raise ValueError(f"it names {said}, which is not derived from ptsmc_jax.{base.__name__}")
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs()):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs())}")
-    if "__dataclass_fields__" not in found.__dict__:
-        try:
-            dataclasses.dataclass(frozen=True)(found)
-        except TypeError as error:  # such as a field without a default
-            raise ValueError(f"the class {found.__name__} cannot have such fields: {error}") from None
+    for cls in reversed(found.__mro__):  # classes of one's own that it is derived from have fields too
+        if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
+            try:
+                dataclasses.dataclass(frozen=True)(cls)
+            except TypeError as error:  # such as a field without a default
+                raise ValueError(f"the class {cls.__name__} cannot have such fields: {error}") from None
     common = {field.name: field for field in dataclasses.fields(base)}
     keys, gains, meanings = [], {}, []
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
+        if field.name in table.__struct_fields__ and field.name not in common:
+            raise ValueError(f"a field of the class {found.__name__} is called {field.name}, which has its meaning")
         about = field.metadata.get("gain")
         keys.append((field.name, *_key(field, about)))
-        meaning = "" if about is None else about.meaning
+        meaning = "" if about is None else " ".join(about.meaning.split())
         unit = f" [{about.unit}]" if about is not None and about.unit else ""
         meanings.append(f"    {field.name}: {meaning or 'of one of its own'}{unit}")
         if about is not None:
             if table.prefix + field.name == "observer_gain":
-                raise ValueError("a gain of its must have another name than gain, which has a number for each axis")
+                raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
             gains[table.prefix + field.name] = _bounds(field.name, about)
     first = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
     return msgspec.defstruct(

@@ -1,5 +1,6 @@
 """Laws of one's own in a scenario file."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -47,7 +48,7 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """Nothing is known: twice as fast as half a turn takes on average."""
-        return "controller.t_f", 2.0 * 3.1416 / t_f
+        return "controller.t_f", 2.0 * math.pi / t_f
 
 
 class OwnAttitudeLaw(OwnLaw, frozen=True):
@@ -59,13 +60,8 @@ class OwnAttitudeLaw(OwnLaw, frozen=True):
 
     error: Literal["multiplicative", "additive"] = "multiplicative"
 
-    def physics(self, plant: str) -> Any:
-        """On the error that it asks for."""
-        from ptsmc_jax.laws.acceleration import on
+    def error_motion(self, plant: str) -> Any:
+        """As it asks for."""
         from ptsmc_jax.laws.error_motions import ErrorVector
 
-        if self.error == "multiplicative":
-            return super().physics(plant)
-        made: Any = on(ErrorVector, self.law())
-        made.tunable = tuple(self.gains)
-        return made
+        return ErrorVector if self.error == "additive" else super().error_motion(plant)
