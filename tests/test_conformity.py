@@ -28,6 +28,7 @@ from tuning.search.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
+OWN = str(ROOT / "scenarios" / "own_parts.py")
 SLEW = {"t_f": 6.0, "delta": 0.3, "eta": 2.6}
 SHORT = {"t_end": 7.5, "window": 1.0}
 SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
@@ -119,6 +120,21 @@ ROWS: dict[str, dict] = {
         "disturbance": {"kind": "sinusoid"},
         "loop": SHORT,
         "dispersion": {"x0": {"kind": "normal", "std": [0.1, 0.1, 0.0, 0.1]}},
+    },
+    "parts of one's own": {
+        "controller": {"kind": "own", "code": f"{OWN}:Scaling", "t_f": 6.0, "delta": 1.0},
+        "observer": {"kind": "own", "code": f"{OWN}:LowPass"},
+        "reference": {"kind": "own", "code": f"{OWN}:Nodding"},
+        "disturbance": {"kind": "own", "code": f"{OWN}:SolarPressure"},
+        "loop": SAMPLED,
+        "hardware": NOISE,
+        "dispersion": SPREAD,
+    },
+    "implicit sampling": {
+        "controller": {**SLEW, "error": "multiplicative", "sampling": "implicit"},
+        "loop": SAMPLED,
+        "hardware": NOISE,
+        "dispersion": SPREAD,
     },
     "sampled system with noise": {
         "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},

@@ -9,9 +9,9 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, expansion
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem, expansion
 from ptsmc_jax.numerics import integrators
-from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.plants import rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
@@ -142,6 +142,20 @@ def test_a_delta_of_one_period_that_explicit_sampling_cannot_fly():
         found[sampling] = float(run.metrics.window_error), float(run.metrics.peak_torque)
     assert found["implicit"][0] < found["explicit"][0]
     assert found["implicit"][1] <= found["explicit"][1]
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_a_second_order_systems_s_lands_exactly_where_its_input_is_an_acceleration(hold):
+    plant = system(1, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: 2.0 * jnp.eye(1))
+    gains = (vector(v) for v in (30.0, 3.0, 2.0, 1.5, 1e-3, 1.2))
+    law = PrescribedTimeSystem(plant, *gains, implicit=True)
+    e, rate, h, left = 0.3, -0.04, 0.2, 2.0 if hold else 18.0
+    now = Sample(vector(30.0 - left), jnp.asarray(hold), vector(h))
+    u, s, _ = law.command(None, now, vector([e, rate]), now.t, jnp.zeros(1), vector(0.0))
+    e, rate = e + h * rate + h**2 * float(u[0]), rate + 2.0 * h * float(u[0])
+    after = rate + 1.2 * e if hold else (left - h) * rate + 3.0 * e
+    share = np.exp(-1.5 * h) if hold else ((left - h) / left) ** 3
+    np.testing.assert_allclose(after, share * s[0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("hold", [False, True])
