@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
-from tests.tree import QUICKLY, modules
+from tests.tree import QUICKLY, ROOT, modules
 
 # most programs of tests fly once: what optimising saves is less than what it takes; not so in processes of their own
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}"
@@ -28,13 +28,17 @@ MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compil
 
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
-LONGEST = "cli compare pareto tuning notebooks campaign_processes conformity campaign_commands".split()
-TOGETHER = {"cli", "compare", "pareto"}  # which tune by the same programs, in one worker
+LONGEST = """
+    cli/test_cli studies/test_compare studies/test_pareto search/test_tuning test_notebooks
+    campaigns/test_campaign_processes test_conformity cli/test_campaign_commands
+""".split()
+TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # tune by the same programs, in one worker
+assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
 
 
 def pytest_collection_modifyitems(config, items):
     """Files in the order of `LONGEST`, then the others; a worker for each file, or for those of `TOGETHER`."""
-    names = {item: item.path.stem.removeprefix("test_") for item in items}
+    names = {item: item.path.relative_to(ROOT / "tests").with_suffix("").as_posix() for item in items}
     items.sort(key=lambda item: LONGEST.index(names[item]) if names[item] in LONGEST else len(LONGEST))
     for item in items if config.pluginmanager.hasplugin("xdist") else ():
         item.add_marker(pytest.mark.xdist_group("commands" if names[item] in TOGETHER else names[item]))

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
-from tests.test_schema import COMPLETE
+from tests.scenario.test_schema import COMPLETE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
 
@@ -68,7 +68,7 @@ def test_the_references_name_everything():
 
 
 def test_what_others_rely_on_is_documented():
-    """The commands and keys of the contract, written down by hand: see `tests.test_schema`."""
+    """The commands and keys of the contract, written down by hand: see `tests.scenario.test_schema`."""
     promised = """reproduce simulate map montecarlo summarize worst replay tune pareto compare report new
         convert-attitude""".split()
     assert set(promised) <= set(COMMANDS)

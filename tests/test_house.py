@@ -241,6 +241,14 @@ def test_type_checkers_see_the_same_exports(package):
     assert seen == importlib.import_module(package)._EXPORTS
 
 
+def test_tests_lie_in_the_rooms_of_what_they_test():
+    """Across rooms: in the folder of tests itself."""
+    rooms = {room for package in HOUSE.values() for room in package if room != "."}
+    folders = {path.parent for path in modules("tests").values()} - {ROOT / "tests"}
+    assert {path.name for path in folders} <= rooms
+    assert {path.parent for path in folders} == {ROOT / "tests"}
+
+
 def sources():
     return [*modules().values(), *modules("tests").values()]
 

@@ -15,10 +15,10 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs, store
 from ptsmc_jax.scenario import parsing, timing
 from ptsmc_jax.simulation import catalogues
-from tests.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
-from tests.pages import checked
-from tests.test_scenario import check_sentence
+from tests.output.pages import checked
+from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
+from tests.scenario.bad_scenarios import check_sentence
 from tuning.cli import main
 from tuning.studies import single, stability
 

@@ -5,7 +5,7 @@ import pytest
 
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
-from tests.test_trust import SPREAD
+from tests.search.test_trust import SPREAD
 from tuning.search import objective, refine
 from tuning.search.descent import Best
 from tuning.search.evaluate import Evaluator, Measured

@@ -12,7 +12,7 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
-from tests.pages import checked
+from tests.output.pages import checked
 from tuning.output import sentences, terminal
 from tuning.studies import pareto, tuner
 

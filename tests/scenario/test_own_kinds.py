@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from tests.helpers import ROOT, SHORT, small_search
-from tests.test_scenario import check_sentence
+from tests.scenario.bad_scenarios import check_sentence
 from tuning.search import gains
 
 HEAD = "import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\n\n"

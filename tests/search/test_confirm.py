@@ -9,7 +9,7 @@ from scipy.stats import binom
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement, least_within
 from tests import helpers
-from tests.test_tuning import SPREAD, problem
+from tests.search.test_tuning import SPREAD, problem
 from tuning.search import confirm, gains, objective, optimise, shares
 from tuning.search.evaluate import Evaluator
 

@@ -9,7 +9,7 @@ import pytest
 
 from ptsmc_jax.campaigns import campaign
 from tests.helpers import same, short
-from tests.pages import checked
+from tests.output.pages import checked
 
 FOLDER = "out/montecarlo-s"
 OVERSHOOT = """

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import tree
-from tests.pages import Page, checked
+from tests.output.pages import Page, checked
 from tuning.output import page, page_charts
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

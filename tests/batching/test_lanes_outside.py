@@ -11,7 +11,7 @@ from jax.extend.core import jaxprs_in_params
 
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from tests.test_lanes import (
+from tests.batching.test_lanes import (
     FIXED,
     SYMMETRIC,
     TABLE,

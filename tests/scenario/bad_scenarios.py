@@ -1,5 +1,7 @@
 """Scenario files that must be refused, and what the one sentence must say of each."""
 
+import re
+
 SAMPLED = 'loop.mode = "sampled"\n'
 EULER = "initial = { euler_deg = [1, 2, 3], sequence = %s }"
 UNIT, ONE_KEY = (
@@ -512,3 +514,14 @@ BAD = [
     ("tune.per_axis = 1", "tune.per_axis is 1", "true or false"),
     ("tune.worst_case = 'yes'", 'tune.worst_case is "yes"', "true or false"),
 ]
+
+# what has no place in a sentence for somebody who wrote a scenario file
+JARGON = re.compile(r"\n|Traceback|Error|Errno|could not convert|array element|np\.|tuple|\bNone\b|float64")
+
+
+def check_sentence(said, of_what, allowed):
+    """A sentence for somebody who wrote a scenario file: names the key and its value, and what is allowed."""
+    assert of_what in said
+    assert allowed in said
+    assert not JARGON.search(said)
+    assert len(said) < 400

@@ -15,7 +15,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
-from tests.pages import checked
+from tests.output.pages import checked
 from tuning.errors import UsageError
 from tuning.output import page, sentences
 from tuning.search import gains
