@@ -148,7 +148,7 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
     key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {errors.brief(value)}"
     if isinstance(law, Prescribed):
-        times, _, square = (np.asarray(v) for v in _path(parts))
+        times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # of the others only the start is known
         target = parts.reference(jnp.zeros_like(parts.t_end))
         times, square = np.zeros(1), np.square([float(law.clearance(law.align(parts.initial, target), target))])
@@ -161,9 +161,6 @@ def _check_start(scenario: Scenario, parts: Parts) -> None:
             f"reference meets {singular}, at t = {when:.4g} s; allowed is a start whose path keeps {name} above "
             f"{SINGULAR_CLEARANCE}"
         )
-
-
-_path = programs.jit(solutions.exact_path)
 
 
 def _parts(scenario: Scenario, saves: object, reach: timing.Reach | None) -> Parts:

@@ -26,19 +26,31 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     for the exact sign, which gives the paper's (15), (32) and (43).
     """
     law, n = parts.controller, parts.controller.order
-    if isinstance(parts.plant, Chain):
-        s0 = float(jnp.abs(_surface(law.t_f, law.eta, parts.initial)))
-    else:
-        error, error_rate = _start(parts)
-        s0 = float(jnp.linalg.norm(law.t_f * error_rate + law.eta * error))
     beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
-    return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
+    return float(_outset(parts)), 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
+
+
+@programs.jit
+def _outset(parts: Parts) -> Scalar:
+    """s0, the 2-norm of s at t = 0."""
+    law = parts.controller
+    if isinstance(parts.plant, Chain):
+        return jnp.abs(_surface(law.t_f, law.eta, parts.initial))
+    error, error_rate = _start(parts)
+    return jnp.linalg.norm(law.t_f * error_rate + law.eta * error)
 
 
 def switching_rate(parts: Parts) -> float:
     """Largest factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, along the run."""
+    return float(_switching_rates(parts)[0])
+
+
+@programs.jit
+def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
+    """The largest factor under the largest K2, and under the K2 that is left when the observer has settled."""
+    law, bound = parts.controller, parts.observer.error_bound()
     seen = visited(parts) if isinstance(parts.plant, System) else None
-    return float(parts.controller.switching_rate(parts.observer.error_bound().largest, seen))
+    return law.switching_rate(bound.largest, seen), law.switching_rate(bound(parts.t_end), seen)
 
 
 def narrowest_sign(parts: Parts, period: float) -> float:
@@ -48,9 +60,8 @@ def narrowest_sign(parts: Parts, period: float) -> float:
     inside the boundary layer at width = c h; below c h / 2 it hops from side to side, and slopes grow from hop to hop.
     Of the largest c before the hand-over, at t = 0, under the K2 that is left when the observer has settled.
     """
-    law, seen = parts.controller, visited(parts) if isinstance(parts.plant, System) else None
-    rate = law.switching_rate(parts.observer.error_bound()(parts.t_end), seen)
-    return float(law.t_f) ** (law.order - 1) * float(rate) * period
+    law = parts.controller
+    return float(law.t_f) ** (law.order - 1) * float(_switching_rates(parts)[1]) * period
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:

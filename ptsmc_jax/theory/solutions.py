@@ -203,6 +203,7 @@ def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
+@programs.jit(static_argnames="points")
 def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
     """Times before the hand-over [s], (points,), inputs (points, m) and clearance (points,) along the exact motion.
 
