@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import pytest
 from jaxtyping import Array
 
+import ptsmc_jax
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
 from tests.scenario.test_schema import COMPLETE
@@ -234,3 +235,7 @@ def test_examples_in_docstrings_run():
         assert not failed, module
         tried += attempted
     assert tried > 20
+
+
+def test_who_cites_this_names_its_version():
+    assert f"\nversion: {ptsmc_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()

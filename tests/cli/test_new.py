@@ -1,6 +1,9 @@
 """What `ptsmc new` writes: the scenario asked for, every key of its plant, and what is off is allowed as it stands."""
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from collections.abc import Mapping
 
@@ -170,3 +173,39 @@ def test_what_is_off_has_the_values_it_would_get(tmp_path):
         assert shown == pytest.approx([gain] * 3)
         given = {"controller": {"disturbance_rate_bound": bound}, "observer": {"kind": "finite_time"}}
         assert parsing.dump(from_tables(given))["observer"]["gain"] == shown
+
+
+def test_the_examples_are_copied_and_none_is_written_over(command, tmp_path):
+    code, said, _ = command("examples", "mine")
+    shipped = {path.name: path.read_text() for path in (ROOT / "scenarios").iterdir() if path.is_file()}
+    assert {path.name: path.read_text() for path in (tmp_path / "mine").iterdir()} == shipped
+    assert code == 0
+    assert all(name in said for name in shipped)
+    changed = tmp_path / "mine" / sorted(shipped)[-1]
+    changed.write_text("")
+    assert command("examples", "mine")[0] == 2
+    assert changed.read_text() == ""
+    assert command("examples", "mine", "--force", "--quiet") == (0, "", "")
+    assert changed.read_text() == shipped[changed.name]
+    sentence = f"ptsmc: the folder is {changed}, but that is a file; allowed is a new folder, or one that is there\n"
+    assert command("examples", changed) == (2, "", sentence)
+
+
+@pytest.mark.long
+def test_a_wheel_brings_all_that_flying_takes(tmp_path):
+    """Built, unpacked elsewhere and used from there; what it depends on is this environment's."""
+    pip = sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"
+    away = tmp_path / "away"
+    away.mkdir()
+    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, ROOT], check=True, cwd=away)
+    (wheel,) = tmp_path.glob("*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", tmp_path / "site", wheel], check=True, cwd=away)
+    run = {"check": True, "cwd": away, "env": {**os.environ, "PYTHONPATH": str(tmp_path / "site")}}
+    ptsmc = sys.executable, tmp_path / "site" / "bin" / "ptsmc"
+    subprocess.run([*ptsmc, "examples", "--quiet"], **run)
+    subprocess.run([*ptsmc, "simulate", "scenarios/first_flight.toml", "--out", "flown"], **run)
+    where = subprocess.run(
+        [sys.executable, "-c", "import ptsmc_jax; print(ptsmc_jax.__file__)"], capture_output=True, text=True, **run
+    )
+    assert str(tmp_path / "site") in where.stdout
+    assert (away / "flown" / "summary.json").exists()

@@ -306,6 +306,7 @@ def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fi
 for _command in (
     writing_commands.report,
     writing_commands.new,
+    writing_commands.examples,
     writing_commands.convert_attitude,
     campaign_commands.montecarlo,
     campaign_commands.summarize,

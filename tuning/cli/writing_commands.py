@@ -1,10 +1,11 @@
-"""The commands that fly nothing: a page from results, a new scenario file, an attitude in every form."""
+"""The commands that fly nothing: a page from results, scenario files to begin with, an attitude in every form."""
 
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+import ptsmc_jax
 from tuning.cli.options import Quiet
 from tuning.output import terminal
 
@@ -51,6 +52,41 @@ def new(
     if not quiet:
         terminal.say(f"scenario in {file}")
     return 0
+
+
+def examples(
+    folder: Annotated[Path, Parameter(name="DIR", help="Folder for them.")] = Path("scenarios"),
+    /,
+    *,
+    force: Annotated[bool, Parameter(negative="", help="Write over files that are there already.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Copy the scenarios that come with ptsmc, with the Python files that some of them name, to be flown and changed.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax.campaigns import store
+
+    shipped = sorted(path for path in _examples().iterdir() if path.suffix in (".toml", ".py"))
+    if folder.exists() and not folder.is_dir():
+        raise store.RefusedError(
+            f"the folder is {folder}, but that is a file; allowed is a new folder, or one that is there"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in shipped:
+        store.check_file(folder / path.name, force)
+    for path in shipped:
+        store.write_text(folder / path.name, path.read_text(encoding="utf-8"))
+    if not quiet:
+        terminal.say(f"{len(shipped)} files in {folder}: {', '.join(path.name for path in shipped)}")
+    return 0
+
+
+def _examples() -> Path:
+    """Where the scenarios lie: in the package where it was installed from a wheel, else at the top of the checkout."""
+    package = Path(ptsmc_jax.__file__).parent
+    packed = package / "examples"
+    return packed if packed.is_dir() else package.parent / "scenarios"
 
 
 _Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.")]
