@@ -203,7 +203,7 @@ def test_a_wheel_brings_all_that_flying_takes(tmp_path):
     run = {"check": True, "cwd": away, "env": {**os.environ, "PYTHONPATH": str(tmp_path / "site")}}
     ptsmc = sys.executable, tmp_path / "site" / "bin" / "ptsmc"
     subprocess.run([*ptsmc, "examples", "--quiet"], **run)
-    subprocess.run([*ptsmc, "simulate", "scenarios/first_flight.toml", "--out", "flown"], **run)
+    subprocess.run([*ptsmc, "simulate", "scenarios/two_link_arm.toml", "--out", "flown"], **run)
     where = subprocess.run(
         [sys.executable, "-c", "import ptsmc_jax; print(ptsmc_jax.__file__)"], capture_output=True, text=True, **run
     )
