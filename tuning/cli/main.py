@@ -324,9 +324,9 @@ def main() -> None:
     except CycloptsError as error:
         _fail(" ".join(str(error).split()))
     except ValueError as error:
-        if not _expected(error):
-            raise
-        _fail(str(error))
+        if _expected(error):
+            _fail(str(error))
+        raise
     except KeyboardInterrupt:
         print("ptsmc: interrupted; nothing was written", file=sys.stderr)
         sys.exit(INTERRUPTED)

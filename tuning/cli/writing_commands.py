@@ -1,11 +1,11 @@
 """The commands that fly nothing: a page from results, scenario files to begin with, an attitude in every form."""
 
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-import ptsmc_jax
 from tuning.cli.options import Quiet
 from tuning.output import terminal
 
@@ -84,7 +84,7 @@ def examples(
 
 def _examples() -> Path:
     """Where the scenarios lie: in the package where it was installed from a wheel, else at the top of the checkout."""
-    package = Path(ptsmc_jax.__file__).parent
+    package = Path(str(files("ptsmc_jax")))
     packed = package / "examples"
     return packed if packed.is_dir() else package.parent / "scenarios"
 
