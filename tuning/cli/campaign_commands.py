@@ -230,3 +230,6 @@ def _shard(value: str) -> tuple[int, int]:
     if not 1 <= share[0] <= share[1]:
         raise UsageError(f"--shard is {value}, but must be I/N with I from 1 to N")
     return share
+
+
+COMMANDS = (montecarlo, summarize, worst, replay)

@@ -303,16 +303,7 @@ def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fi
     return 0
 
 
-for _command in (
-    writing_commands.report,
-    writing_commands.new,
-    writing_commands.examples,
-    writing_commands.convert_attitude,
-    campaign_commands.montecarlo,
-    campaign_commands.summarize,
-    campaign_commands.worst,
-    campaign_commands.replay,
-):
+for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS):
     app.command(_command)
 
 

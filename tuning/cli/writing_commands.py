@@ -116,3 +116,6 @@ def convert_attitude(
     }  # fmt: skip
     terminal.say(*convert.lines(convert.quaternion(given), sequence))
     return 0
+
+
+COMMANDS = (report, new, examples, convert_attitude)
