@@ -10,7 +10,7 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign, margin_verdicts, runs
+from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
@@ -126,16 +126,22 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
 
 
 def trials(
-    what: Scenario | str | Path, count: int = 1000, *, seed: int = 0, own: OwnMetrics | None = None
+    what: Scenario | str | Path, count: int | pl.DataFrame = 1000, *, seed: int = 0, own: OwnMetrics | None = None
 ) -> pl.DataFrame:
-    """Rows of the first `count` trials of a scenario, as `ptsmc montecarlo` keeps them.
+    """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
 
     Number, status, reason, bad_time [s], the metrics in the units of `catalogues.CATALOGUE`, what each trial flew with,
-    and metrics of one's own (see `montecarlo.one`).
+    and metrics of one's own (see `montecarlo.one`). count: how many trials, or a plan, a table with a row for each, see
+    `plans`; raises RefusedError, with one sentence, where it cannot be flown.
     """
     _whole("seed", seed)
-    _whole("count", count, 1)
     known = what if isinstance(what, Scenario) else scenario.read(what)
+    if isinstance(count, pl.DataFrame):
+        ready = scenario.study(known)
+        names = campaign.Campaign(ready, seed, own).own_names()
+        asked = plans.checked(count, ready.parts, own=names)
+        return campaign.of_plan(ready, seed, asked, own).fly(range(asked.count))
+    _whole("count", count, 1)
     return campaign.Campaign(scenario.study(known), seed, own).fly(range(count))
 
 

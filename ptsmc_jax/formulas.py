@@ -26,12 +26,21 @@ def check_inertia(inertia: object) -> np.ndarray:
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] <= 1e-12 * scale:
         raise ValueError(f"the tensor must be positive definite (its smallest principal moment is {moments[0]:.6g})")
-    if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
+    if not bodies(tensor[None])[0]:
         raise ValueError(
             "no rigid body has these principal moments: the largest, "
             f"{moments[2]:.6g}, must not exceed the sum of the other two, {moments[0] + moments[1]:.6g}"
         )
     return tensor
+
+
+def bodies(tensors: np.ndarray) -> np.ndarray:
+    """Which symmetric tensors (n, 3, 3) a rigid body may have, (n,) bool.
+
+    Those that are positive definite, no principal moment of theirs above the sum of the other two.
+    """
+    moments, scale = np.linalg.eigvalsh(tensors), np.abs(tensors).max(axis=(1, 2))
+    return (moments[:, 0] > 1e-12 * scale) & (moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-9))
 
 
 def surface_roots(a: Any) -> np.ndarray:

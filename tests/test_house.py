@@ -31,7 +31,7 @@ HOUSE = {
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
         "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
-        "dispersions": "base | attitudes inertias numbers | variation",
+        "dispersions": "base | attitudes inertias numbers quantities | variation | planned",
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """
             errors systems values
@@ -50,7 +50,7 @@ HOUSE = {
             build own_checks reading
             flyable
         """,
-        "campaigns": "margin_verdicts montecarlo rows store | campaign runs | cluster",
+        "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
         "paper": "claims remark_2 | slips",
         "figures": "style | animation campaign_plots margin_plots run_plots study_plots",
         "explore": "",

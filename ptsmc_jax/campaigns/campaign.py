@@ -16,9 +16,14 @@ import polars as pl
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.campaigns import montecarlo, plans
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
+from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
+from ptsmc_jax.devices.sensors import RATE_BIAS
+from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import rollout
@@ -38,16 +43,27 @@ class Campaign:
     ready: Study
     seed: int
     own: OwnMetrics | None = None  # metrics of one's own
+    plan: Plan | None = None  # whose rows are flown, a trial each
+
+    @property
+    def plan_given(self) -> bool:
+        """Whether a plan gives anything that would not be drawn."""
+        return self.plan is not None and bool(self.plan.given)
+
+    def rows(self, trials: np.ndarray) -> np.ndarray | Row:
+        """What is flown as these trials: their numbers, or their rows in the plan."""
+        return trials if self.plan is None else self.plan.rows(trials, self.seed)
 
     def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """Rows of these trials."""
         # never so few that another program flies them: rows are then the same to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
-        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, wanted, own=self.own)
+        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, self.rows(wanted), own=self.own)
         named = [rollout.STATUS[int(code)] for code in flown.status]
         heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
         numbers = {
             "bad_time": flown.bad_time,
+            **({} if self.plan is None else self.plan.told(wanted)),
             **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
             **flown.drawn,
             **flown.own,
@@ -59,8 +75,10 @@ class Campaign:
         """What these trials would fly with."""
         wanted = np.asarray(trials, dtype=np.uint32)
         padded = np.resize(wanted, -(-wanted.size // PART) * PART)
-        drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), padded)
-        return pl.DataFrame({"trial": wanted, **{name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}})
+        drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), self.rows(padded))
+        whose = {} if self.plan is None else self.plan.told(wanted)
+        numbers = {name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}
+        return pl.DataFrame({"trial": wanted, **whose, **numbers})
 
     def own_names(self) -> list[str]:
         """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
@@ -74,16 +92,42 @@ class Campaign:
         for name, value in found.own.items():
             if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
                 raise ValueError(f"its {name} is no single number")
-            if name in {"trial", "status", "reason", "bad_time", *found.metrics._fields, *found.drawn}:
+            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *found.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
         return list(found.own)
 
 
+def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, where: str = "the plan") -> Campaign:
+    """The campaign that flies a plan.
+
+    What it says of a quantity in every row as it is drawn anyway, as `--dry-run` writes it, is left to be drawn: the
+    very program of the campaign that was planned then flies it, to the last digit. Raises RefusedError where initial
+    angles that it says do not follow from the rest; where: what errors call it.
+    """
+    drawn = {*ready.dispersion.kinds, RATE_BIAS}
+    same = []
+    found = None
+    for name, values in plan.given.items():
+        quantity = QUANTITIES[name]
+        if name in drawn:
+            if found is None:
+                found = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
+            columns = quantity.columns(ready.parts)
+            usual = found.select(columns).to_numpy() if set(columns) <= set(found.columns) else np.zeros_like(values)
+        else:
+            usual = np.asarray(quantity.read(ready.parts))[None]
+        if np.array_equal(np.broadcast_to(usual, values.shape), values):
+            same.append(name)
+    made = Campaign(ready, seed, own, plan.without(same))
+    if plan.angle is not None:
+        flown = found if found is not None and not made.plan_given else made.draw(range(plan.count))
+        plans.check_angle(plan, flown[plans.ANGLE].to_numpy(), where)
+    return made
+
+
 @programs.jit
-def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> dict[str, jax.Array]:
-    return lanes.vmap(lambda trial: montecarlo.values(dispersion, dispersion.apply(parts, seed, trial), seed, trial))(
-        trials
-    )
+def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row) -> dict[str, jax.Array]:
+    return lanes.vmap(lambda trial: montecarlo.values(parts, dispersion, seed, trial))(trials)
 
 
 def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
@@ -180,15 +224,17 @@ def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[
 def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
     ready = campaign.ready
-    t, error, lasts = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), jnp.asarray(trials))
+    rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
+    t, error, lasts = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows)
     kept = np.asarray(lasts)[0]
     return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
 
 
 @programs.jit
-def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> tuple:
-    def one(trial: jax.Array) -> tuple:
-        log = rollout.simulate(dispersion.apply(parts, seed, trial), seed, trial, record=True).log
+def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row) -> tuple:
+    def one(trial: jax.Array | Row) -> tuple:
+        about = planned.about(parts, dispersion, seed, trial)
+        log = rollout.simulate(about.drawn, about.seed, about.trial, record=True).log
         assert log is not None
         return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.lasts
 

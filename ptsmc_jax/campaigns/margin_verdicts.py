@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import INERTIA
+from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
@@ -32,12 +34,17 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     return _verdicts(asked, margins.judged_jit(parts)[0].worst())
 
 
-def over_trials(ready: Study, seed: int) -> list[Verdict]:
-    """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops."""
-    if not ready.margins or not differ(ready.dispersion):
+def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
+    """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops.
+
+    rows: those of a plan, in place of the first trials.
+    """
+    given = isinstance(rows, Row) and INERTIA in rows.given
+    if not ready.margins or not (given or differ(ready.dispersion)):
         return of_loop(ready.parts, ready.margins)
     limits = {one.metric: one.limit for one in ready.margins}
-    return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, np.arange(TRIALS), limits))
+    trials = np.arange(TRIALS) if rows is None else rows
+    return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, trials, limits))
 
 
 def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Verdict]:
@@ -57,7 +64,12 @@ def nearness(value: Any, limit: Any, name: str) -> Any:
 
 
 def worst(
-    parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray, limits: Mapping[str, float], places: int = 1
+    parts: Parts,
+    dispersion: Dispersion,
+    seed: int,
+    trials: np.ndarray | Row,
+    limits: Mapping[str, float],
+    places: int = 1,
 ) -> dict[str, np.ndarray]:
     """Margins of each trial, (trials,), those that have a limit; the worst over its axes and times; NaN without slopes.
 
@@ -69,8 +81,10 @@ def worst(
     nearer to a limit, may be one of those that count, or `OFF` to either side may be at a limit. What is judged shows
     how far off lines were; where that is more than half of `OFF`, all others are taken to be off by twice as much.
     """
-    names, count = tuple(limits), trials.size
-    padded = jnp.asarray(np.resize(trials, -(-count // CALL) * CALL), dtype=jnp.uint32)
+    trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
+    names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
+    whole = -(-count // CALL) * CALL
+    padded = jax.tree.map(lambda v: jnp.asarray(np.resize(v, (whole, *v.shape[1:]))), trials)
     seen = _look(parts, dispersion, jnp.uint32(seed), padded)
     loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), seen)
     values = np.stack([rough[name] for name in names])  # (names, loops)
@@ -114,17 +128,22 @@ def _over(name: str, values: Any) -> Any:
 
 
 @programs.jit
-def _look(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> tuple[linear.Loop, dict[str, Array]]:
+def _look(
+    parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row
+) -> tuple[linear.Loop, dict[str, Array]]:
     """Loops of each trial, (trials, times, ..), and what is roughly their margins, the worst over the axes."""
 
     def rough(loop: linear.Loop) -> dict[str, Array]:
         return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
 
-    def some(trials: Array) -> tuple[linear.Loop, dict[str, Array]]:
-        loops = jax.vmap(lambda trial: margins.judged_loops(dispersion.apply(parts, seed, trial))[0])(trials)
+    def one(trial: Array | Row) -> linear.Loop:
+        return margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn)[0]
+
+    def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+        loops = jax.vmap(one)(trials)
         found = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
-        return loops, {name: v.reshape(trials.size, -1) for name, v in found.items()}
+        return loops, {name: v.reshape(CALL, -1) for name, v in found.items()}
 
     # not shared over devices: what LAPACK does on two of a processor's at once never ends
-    found = jax.lax.map(some, trials.reshape(-1, CALL))
+    found = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
     return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), found)

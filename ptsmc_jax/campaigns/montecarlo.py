@@ -11,8 +11,10 @@ from jax.sharding import Mesh, PartitionSpec
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.devices.sensors import Sensors
+from ptsmc_jax.devices.sensors import RATE_BIAS, Sensors
+from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import Coordinates
+from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
@@ -81,23 +83,31 @@ def one(
 ) -> Flown:
     """Fly one trial: pure, for any transformation.
 
-    coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone. own:
-    metrics besides the usual ones, for which the run's history is recorded.
+    trial: its number, or a `Row` of a plan, which brings its own seed. coordinates: of what is drawn, where they are
+    not those of the trial, which then names its noise alone. own: metrics besides the usual ones, for which the run's
+    history is recorded.
     """
+    about = planned.about(parts, dispersion, seed, trial)
     if coordinates is None:
-        coordinates = dispersion.coordinates(seed, trial)
-    drawn = dispersion.at(parts, coordinates)
-    result = rollout.simulate(drawn, seed, trial, record=own is not None)
+        coordinates = about.dispersion.coordinates(about.seed, about.trial)
+    drawn = about.dispersion.at(about.parts, coordinates)
+    result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None)
     more = {} if own is None else own(result, drawn)
-    return Flown(result.metrics, result.status, result.bad_time, values(dispersion, drawn, seed, trial), more)
+    return Flown(result.metrics, result.status, result.bad_time, _values(dispersion, drawn, about), more)
 
 
-def values(dispersion: Dispersion, drawn: Parts, seed, trial) -> dict[str, jax.Array]:
-    """What a trial flies with, by name: read from its parts, and the gyro's bias from its sensors."""
-    found = dispersion.values(drawn)
-    if isinstance(drawn.sensors, Sensors) and drawn.sensors.rate_bias is not None:
-        bias = drawn.sensors.first_bias(seed, trial)
-        found |= {f"rate_bias_{k + 1}": bias[k] for k in range(3)}
+def values(parts: Parts, dispersion: Dispersion, seed, trial) -> dict[str, jax.Array]:
+    """What a trial flies with, by name, without flying it; trial: see `one`."""
+    about = planned.about(parts, dispersion, seed, trial)
+    return _values(dispersion, about.drawn, about)
+
+
+def _values(dispersion: Dispersion, drawn: Parts, about: planned.About) -> dict[str, jax.Array]:
+    """Read from the parts of a trial, and the gyro's bias from its sensors."""
+    found = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
+    if isinstance(drawn.sensors, Sensors) and (drawn.sensors.rate_bias is not None or RATE_BIAS in about.given):
+        bias = drawn.sensors.first_bias(about.seed, about.trial)
+        found |= {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
     return found
 
 
@@ -105,33 +115,38 @@ def run(
     parts: Parts,
     dispersion: Dispersion,
     seed: int,
-    trials: np.ndarray,
+    trials: np.ndarray | Row,
     block: int | None = None,
     own: OwnMetrics | None = None,
     kernel: bool = False,
 ) -> Trials:
-    """Fly these trials (whole numbers below 2^32); results do not depend on the blocks, the devices or the order.
+    """Fly these trials (whole numbers below 2^32), or rows of a plan, whatever the blocks, the devices and the order.
 
     block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
     any number of trials below `FEW`, another any number from there on. own: see `one`. kernel: whole runs in one
     kernel, see `kernel`; on a processor it is interpreted, slowly.
     """
-    trials = np.asarray(trials, dtype=np.uint32)
-    devices = len(jax.local_devices())
-    block = -(-FEW // devices) if trials.size < FEW else abreast() if block is None else block
-    rows = max(1, CAPACITY // (devices * block)) if trials.size >= FEW else 1
+    trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
+    number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
+    count, devices = number.shape[0], len(jax.local_devices())
+    block = -(-FEW // devices) if count < FEW else abreast() if block is None else block
+    rows = max(1, CAPACITY // (devices * block)) if count >= FEW else 1
+    size = devices * rows * block
     calls = []
-    for k in range(0, trials.size, devices * rows * block):
-        part = trials[k : k + devices * rows * block]
-        share = -(-part.size // devices)  # of each device
-        padded = np.zeros((devices, rows * block), dtype=np.uint32)
-        padded[:, :share] = np.resize(part, (devices, share))
+    for k in range(0, count, size):
+        few = min(size, count - k)
+        share = -(-few // devices)  # of each device
+
+        def spaced(v: np.ndarray, k: int = k, few: int = few, share: int = share) -> jax.Array:
+            padded = np.zeros((devices, rows * block, *v.shape[1:]), v.dtype)
+            padded[:, :share] = np.resize(v[k : k + few], (devices, share, *v.shape[1:]))
+            return jnp.asarray(padded.reshape(devices, rows, block, *v.shape[1:]))
+
         needed = jnp.int32(-(-share // block))
-        shape = (devices, rows, block)
-        numbers = jnp.asarray(padded.reshape(shape))
+        numbers = jax.tree.map(spaced, trials)
         found = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel)
-        calls.append(jax.tree.map(lambda v, share=share, n=part.size: _joined(np.asarray(v), share)[:n], found))
-    return Trials(trials, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
+        calls.append(jax.tree.map(lambda v, share=share, n=few: _joined(np.asarray(v), share)[:n], found))
+    return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
 def prepare(parts: Parts, dispersion: Dispersion) -> None:
@@ -152,7 +167,7 @@ def _fly(
     parts: Parts,
     dispersion: Dispersion,
     seed: jax.Array,
-    trials: jax.Array,
+    trials: jax.Array | Row,
     needed: jax.Array,
     devices: int,
     own: OwnMetrics | None,
@@ -160,24 +175,28 @@ def _fly(
 ) -> Flown:
     """Results of (devices, rows, block) trials; rows from `needed` on are left zero, a kernel flies them too."""
 
-    def fly(trial: jax.Array) -> Flown:
+    def fly(trial: jax.Array | Row) -> Flown:
         return one(parts, dispersion, seed, trial, own=own)
 
-    def in_blocks(trials: jax.Array) -> Flown:
-        flown, row = lanes.vmap(fly), trials[0]
+    def in_blocks(trials: jax.Array | Row) -> Flown:
+        flown, row = lanes.vmap(fly), jax.tree.map(lambda v: v[0], trials)
+        shape = jax.tree.leaves(row)[0].shape[:2]
         # of one trial: to trace the lanes a second time takes longer
-        empty = jax.tree.map(lambda v: jnp.zeros((*row.shape, *v.shape), v.dtype), jax.eval_shape(fly, row[0, 0]))
+        first = jax.tree.map(lambda v: v[0, 0], row)
+        empty = jax.tree.map(lambda v: jnp.zeros((*shape, *v.shape), v.dtype), jax.eval_shape(fly, first))
 
         def step(k: jax.Array, found: Flown) -> Flown:
-            return jax.tree.map(lambda into, v: into.at[k].set(v), found, flown(row[k]))
+            each = flown(jax.tree.map(lambda v: v[k], row))
+            return jax.tree.map(lambda into, v: into.at[k].set(v), found, each)
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
 
-    def in_one_kernel(trials: jax.Array) -> Flown:
+    def in_one_kernel(trials: jax.Array | Row) -> Flown:
         from ptsmc_jax.batching.kernel import vmap  # which nothing else needs
 
-        flown = vmap(fly, interpret=jax.default_backend() == "cpu")
-        return jax.tree.map(lambda v: v.reshape(trials.shape), flown(trials.reshape(-1)))
+        flown, shape = vmap(fly, interpret=jax.default_backend() == "cpu"), jax.tree.leaves(trials)[0].shape[:3]
+        found = flown(jax.tree.map(lambda v: v.reshape(-1, *v.shape[3:]), trials))
+        return jax.tree.map(lambda v: v.reshape(shape), found)
 
     return spread(in_one_kernel if kernel else in_blocks, trials, devices)
 
@@ -205,8 +224,8 @@ def blocks(fly: Callable, trials: Any) -> Any:
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 
-def spread(function: Callable, shared: jax.Array, devices: int) -> Any:
-    """function(shared) with the first axis of `shared`, and of the results, shared out over that many devices."""
+def spread(function: Callable, shared: Any, devices: int) -> Any:
+    """function(shared) with the first axes of `shared`, and of the results, shared out over that many devices."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
     axis = PartitionSpec("device")
     return jax.shard_map(function, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)(shared)

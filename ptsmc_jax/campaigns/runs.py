@@ -1,5 +1,6 @@
 """One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import rollout
@@ -67,15 +70,17 @@ def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
-def fly(ready: Study, seed: int = 0, trial: int | None = None) -> Run:
-    """Fly one run: nominal with the noise of trial 0, or a trial with its dispersions and its noise."""
+def fly(ready: Study, seed: int = 0, trial: int | Row | None = None) -> Run:
+    """Fly one run: nominal with the noise of trial 0, or a trial, or a plan's row, with its dispersions and noise."""
     run = _fly(ready, seed, trial)
     return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
 
 
-def _fly(ready: Study, seed: int, trial: int | None) -> Run:
-    key, number = jnp.uint32(seed), jnp.uint32(trial or 0)
-    parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, number)
+def _fly(ready: Study, seed: int, trial: int | Row | None) -> Run:
+    row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
+    key, number = jnp.uint32(row.seed), jnp.uint32(row.trial)
+    about = trial if isinstance(trial, Row) else number
+    parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
     result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
     assert result.log is not None
     lasts = result.log.lasts
@@ -88,16 +93,16 @@ def _fly(ready: Study, seed: int, trial: int | None) -> Run:
 
 
 @programs.jit
-def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array) -> Parts:
-    return dispersion.apply(parts, seed, trial)
+def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
+    return planned.about(parts, dispersion, seed, trial).drawn
 
 
-def floor(ready: Study, seed: int = 0) -> float | None:
+def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:
     """RMS window error that no controller can beat, in its unit, see `error_floor`; 0: nothing is unknown.
 
-    Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials. None: none of these is
-    flown to the end.
+    Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials, of a plan over these
+    rows. None: none of these is flown to the end.
     """
-    trials = range(FLOORS) if ready.dispersion.varies else (None,)
+    trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
     runs = (_fly(ready, seed, trial) for trial in trials)
     return error_floor.pooled(run.floor for run in runs if run.floor is not None)

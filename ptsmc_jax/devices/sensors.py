@@ -79,6 +79,7 @@ class Sensors:
     bias_rate: Leaf | None = None  # 1 sigma of the bias's change per second of a period: walk / sqrt(period) [rad/s^2]
     filter: AttitudeFilter | None = None
     every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
+    given_bias: Leaf | None = None  # (3,) at the first sample, where it is not drawn [rad/s]
 
     def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
         """The same with a filter of another bandwidth [rad/s]; period: of control [s]."""
@@ -108,6 +109,8 @@ class Sensors:
 
     def first_bias(self, seed: Whole, trial: Whole) -> Float[Array, "3"]:
         """Bias of the gyro at the first sample, (3,) [rad/s]."""
+        if self.given_bias is not None:
+            return self.given_bias
         if self.rate_bias is None:
             return jnp.zeros(3)
         return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
@@ -115,7 +118,7 @@ class Sensors:
     def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, now: Ticks) -> Memory:
         """Memory before the first sample of positive length, which is now."""
         keys, bias, estimate = self.keys(seed, trial), None, None
-        if self.rate_bias is not None or self.bias_rate is not None:
+        if any(bias is not None for bias in (self.rate_bias, self.bias_rate, self.given_bias)):
             bias = self.first_bias(seed, trial)
         if self.filter is not None:
             normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)

@@ -1,11 +1,13 @@
 """What varies from trial to trial: parts of a trial = at(coordinates(seed, trial)), a pure function."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.dispersions.attitudes import Attitudes
 from ptsmc_jax.dispersions.base import (
     DISTURBANCE_AMPLITUDE,
@@ -20,6 +22,7 @@ from ptsmc_jax.dispersions.base import (
 )
 from ptsmc_jax.dispersions.inertias import RelativeInertia
 from ptsmc_jax.dispersions.numbers import Factor, Normal, Uniform, UniformPhase
+from ptsmc_jax.dispersions.quantities import LEVELS
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.numerics.pytrees import pytree
@@ -27,12 +30,16 @@ from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
-# of what a trial may have more or less, by one factor: name -> where in the parts it stands
-LEVELS = {
-    "attitude_noise": ("sensors", "attitude_noise"),
-    "rate_noise": ("sensors", "rate_noise"),
-    "state_noise": ("sensors", "sigma"),
-    "torque_limit": ("actuators", "torque_limit"),
+# stream -> what of `Dispersion` it is drawn by
+FIELDS = {
+    INITIAL_ATTITUDE: "attitude",
+    INITIAL_STATE: "state",
+    INITIAL_RATE: "rate",
+    INERTIA: "inertia",
+    DISTURBANCE_PHASE: "phase",
+    DISTURBANCE_AMPLITUDE: "amplitude",
+    DISTURBANCE_BIAS: "bias",
+    REFERENCE: "reference",
 }
 
 
@@ -62,17 +69,8 @@ class Dispersion:
     @property
     def kinds(self) -> dict[str, Any]:
         """What is drawn, by the name of its stream."""
-        kinds = {
-            INITIAL_ATTITUDE: self.attitude,
-            INITIAL_STATE: self.state,
-            INITIAL_RATE: self.rate,
-            INERTIA: self.inertia,
-            DISTURBANCE_PHASE: self.phase,
-            DISTURBANCE_AMPLITUDE: self.amplitude,
-            DISTURBANCE_BIAS: self.bias,
-            REFERENCE: self.reference,
-            **{f"{name}_level": level for name, level in self.levels.items()},
-        }
+        kinds = {name: getattr(self, field) for name, field in FIELDS.items()}
+        kinds |= {quantities.level(name): level for name, level in self.levels.items()}
         return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def coordinates(self, seed: Whole, trial: Whole) -> Coordinates:
@@ -102,13 +100,12 @@ class Dispersion:
             w = self.rate.at(coordinates[INITIAL_RATE], parts.initial.w)
             parts = replace(parts, initial=AttitudeState(parts.initial.q, w))
         if self.inertia is not None:
-            body = Spacecraft(*self.inertia.at(coordinates[INERTIA]))
-            parts = replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
+            parts = quantities.with_body(parts, Spacecraft(*self.inertia.at(coordinates[INERTIA])))
         for name, level in self.levels.items():
             part, key = LEVELS[name]
             device = getattr(parts, part)
             nominal = getattr(device, key)
-            factor = level.at(coordinates[f"{name}_level"], jnp.ones(level.count))
+            factor = level.at(coordinates[quantities.level(name)], jnp.ones(level.count))
             parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
         return replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
 
@@ -121,44 +118,26 @@ class Dispersion:
             factor = self.amplitude.at(coordinates[DISTURBANCE_AMPLITUDE], jnp.ones(self.amplitude.count))
             found = disturbances.with_values(found, "amplitude", disturbances.values(found, "amplitude") * factor)
         if self.bias is not None:
-            bias = disturbances.Constant(self.bias.at(coordinates[DISTURBANCE_BIAS], jnp.zeros(self.bias.count)))
-            found = disturbances.Sum((*(found.terms if isinstance(found, disturbances.Sum) else (found,)), bias))
+            bias = self.bias.at(coordinates[DISTURBANCE_BIAS], jnp.zeros(self.bias.count))
+            found = disturbances.with_bias(found, bias)
         return found
 
     def apply(self, parts: Parts, seed: Whole, trial: Whole) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
         return self.at(parts, self.coordinates(seed, trial))
 
-    def values(self, parts: Parts) -> dict[str, Array]:
-        """What a trial flies, read from its parts: the initial state, and what else is drawn, by name, numbers each.
+    def values(self, parts: Parts, given: Iterable[str] = ()) -> dict[str, Array]:
+        """What a trial flies, read from its parts: the initial state, what else is drawn and what is given.
 
-        Attitudes (q1 to q4) [-], rates [rad/s], inertia [kg m^2], phases [rad], torques [N m], noises [rad, rad/s].
+        By the columns of `quantities`, numbers each: attitudes (q1 to q4) [-], rates [rad/s], inertia [kg m^2], phases
+        [rad], torques [N m], noises [rad, rad/s].
         """
-        initial, reference = parts.initial, parts.reference(jnp.zeros_like(parts.t_end))
-        found: dict[str, Array] = {"initial_angle": parts.controller.angle(initial, reference)}
-        if isinstance(initial, AttitudeState):
-            found |= {f"initial_q{k + 1}": initial.q[k] for k in range(4)}
-            found |= {f"initial_w{k + 1}": initial.w[k] for k in range(3)}
-        else:
-            found |= {f"initial_x{k + 1}": initial[k] for k in range(initial.shape[-1])}
-        if self.reference is not None:
-            found |= {f"reference_q{k + 1}": parts.reference.q[k] for k in range(4)}
-        if self.inertia is not None:
-            found |= {f"inertia_{i + 1}{j + 1}": parts.plant.inertia[i, j] for i in range(3) for j in range(i, 3)}
-        if self.phase is not None:
-            found |= _numbered(DISTURBANCE_PHASE, disturbances.values(parts.disturbance, "phase"), self.phase.count)
-        if self.amplitude is not None:
-            amplitudes = disturbances.values(parts.disturbance, "amplitude")
-            found |= _numbered(DISTURBANCE_AMPLITUDE, amplitudes, self.amplitude.count)
-        if self.bias is not None:
-            found |= _numbered(DISTURBANCE_BIAS, parts.disturbance.terms[-1].value, self.bias.count)
-        for name in self.levels:
-            part, key = LEVELS[name]
-            value = getattr(getattr(parts, part), key)
-            found |= {name: value} if value.ndim == 0 else _numbered(name, value, value.shape[0])
-        return found
+        angle = parts.controller.angle(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+        names = {INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, *self.kinds, *given}
+        return {"initial_angle": angle, **quantities.told(parts, names)}
 
-
-def _numbered(name: str, values: Array, count: int) -> dict[str, Array]:
-    """The first `count` of these numbers, by name and number."""
-    return {f"{name}_{k + 1}": values[k] for k in range(count)}
+    def without(self, names: Iterable[str]) -> "Dispersion":
+        """The same, with nothing drawn from these streams; each of the others draws what it drew."""
+        none = {field: None for name, field in FIELDS.items() if name in names}
+        kept = {name: level for name, level in self.levels.items() if quantities.level(name) not in names}
+        return replace(self, **none, levels=kept)

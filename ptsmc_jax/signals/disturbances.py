@@ -40,6 +40,12 @@ class Constant:
 
 @pytree
 @dataclass(frozen=True)
+class Bias(Constant):
+    """A constant that is added to the disturbance of a scenario, see `with_bias`; its amplitude is none of theirs."""
+
+
+@pytree
+@dataclass(frozen=True)
 class Sinusoid:
     """bias + amplitude sin(frequency t + phase), per axis."""
 
@@ -114,6 +120,18 @@ def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Floa
             used += old.size
         terms.append(term)
     return Sum(tuple(terms)) if isinstance(disturbance, Sum) else terms[0]
+
+
+def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
+    """What is added to a disturbance, (m,) [N m]; zero: nothing is."""
+    last = disturbance.terms[-1] if isinstance(disturbance, Sum) else disturbance
+    return last.value if isinstance(last, Bias) else jnp.zeros(inputs)
+
+
+def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:
+    """The disturbance with this added to it, (m,) [N m], in place of what was added before."""
+    terms = disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
+    return Sum((*(term for term in terms if not isinstance(term, Bias)), Bias(value)))
 
 
 def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:

@@ -82,7 +82,8 @@ def quiet(parts: Parts) -> Parts:
     if isinstance(sensors, Sensors):
         known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)
         none = jnp.zeros_like(jnp.asarray(sensors.attitude_noise))
-        sensors = replace(sensors, attitude_noise=none, rate_noise=none, rate_bias=None, bias_rate=None, filter=known)
+        sensors = replace(sensors, attitude_noise=none, rate_noise=none, filter=known)
+        sensors = replace(sensors, rate_bias=None, bias_rate=None, given_bias=None)
     elif isinstance(sensors, StateSensor):
         sensors = replace(sensors, sigma=0.0 * sensors.sigma)
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))

@@ -33,7 +33,16 @@ def montecarlo(
     scenario: ScenarioFile = None,
     /,
     *,
-    trials: Annotated[str, Parameter(help="Trials, a whole number from 1 to 4294967296.")] = "10000",
+    trials: Annotated[
+        str | None, Parameter(help="Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.")
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        Parameter(
+            help="Fly the rows of a table, .csv or .parquet, or of DIR/plan as --dry-run leaves it: its columns are as "
+            "there, what none says is drawn; `trial` and `seed` say whose draws and noise a row has."
+        ),
+    ] = None,
     seed: Seed = "0",
     out: Out = None,
     until_confident: Annotated[
@@ -66,12 +75,13 @@ def montecarlo(
 ) -> int:
     """Fly a campaign: many trials of a scenario, every one counted, kept and replayable.
 
-    Interrupted or killed, the same command goes on from there; with more trials it adds to what is there.
+    Interrupted or killed, the same command goes on from there; with more trials it adds to what is there. With --plan a
+    row of a table is a trial: results are in out/montecarlo-NAME-PLAN by default.
 
     Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
     input or a full disk, 130 interrupted.
     """
-    count, key = whole("--trials", trials, 1, MOST), whole("--seed", seed)
+    count, key = whole("--trials", "10000" if trials is None else trials, 1, MOST), whole("--seed", seed)
     width = None if until_confident is None else between("--until-confident", until_confident, 0.0, 1.0)
     share = _shard(shard)
     tls = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
@@ -80,6 +90,10 @@ def montecarlo(
         raise UsageError("--tls-ca, --tls-cert and --tls-key go with --cluster only")
     if width is not None and (share != (1, 1) or dry_run):
         raise UsageError("--until-confident looks at all rows, and does not go with --shard or --dry-run")
+    if plan is not None and trials is not None:
+        raise UsageError("--trials does not go with --plan, each row of which is a trial")
+    if plan is not None and width is not None:
+        raise UsageError("--until-confident looks at ever more trials drawn at random, and does not go with --plan")
     if cluster is not None and (share != (1, 1) or dry_run):
         raise UsageError("--cluster does not go with --shard or --dry-run")
     if precision not in ("64", "32"):
@@ -95,6 +109,12 @@ def montecarlo(
     from tuning.studies import campaign_folder
 
     folder = campaign_folder.Folder(path, loaded, key, count, metrics, bits)
+    if plan is not None:
+        from ptsmc_jax.campaigns import plans
+
+        table = plans.read(plan)
+        place = path if out is not None else path.with_name(f"{path.name}-{plan.stem}")
+        folder = replace(folder, path=place, trials=table.height, plan=plan.name, table=table)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
     if cluster is not None:
         from ptsmc_jax.campaigns import cluster as clusters

@@ -61,7 +61,7 @@ def campaign(found: dict[str, Any], folder: Path) -> None:
 def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
     """A share of a campaign, or its plan, is done."""
     if planned:
-        print(f"plan of {folder.trials} trials in {folder.plan.folder}; nothing was flown")
+        print(f"plan of {folder.trials} trials in {folder.dry.folder}; nothing was flown")
         return
     parts, _ = folder.rows.parts()
     there = sum(part.count for part in parts)

@@ -341,7 +341,8 @@ SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
     "reproduce": _reproduce,
 }
 
-OPTIONS = ("x", "y", "trials", "trial", "points", "metrics", "seed", "global_check")  # kept in `versions.json`
+# kept in `versions.json`
+OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "metrics", "seed", "global_check")
 CAPTIONS = {
     "history": "Gains and goal of every start over the steps of the descent.",
     "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",
@@ -385,6 +386,8 @@ def _origin(result: Result) -> Iterator[Section]:
         yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"))])
     command = ["ptsmc", versions["command"], *(["scenario.toml"] if path.exists() else [])]
     for key in OPTIONS:
+        if key == "trials" and versions.get("plan") is not None:
+            continue  # the plan says how many
         if versions["command"] != "reproduce" and versions.get(key) is not None:
             option = f"--{key.replace('_', '-')}"
             command += [option] if versions[key] is True else [option, str(versions[key])]

@@ -348,10 +348,13 @@ def campaign_counts(summary: Summary) -> Iterator[str]:
     if summary["status"] == "unfinished":
         yield f"NOT finished: {summary['flown']} of {summary['trials']} trials are flown"
     counts = ", ".join(f"{count} {status}" for status, count in summary["counts"].items() if count)
-    yield f"{summary['flown']} trials of seed {summary['seed']}: {counts}"
+    of = f"the plan {summary['plan']} and seed" if summary.get("plan") else "seed"
+    yield f"{summary['flown']} trials of {of} {summary['seed']}: {counts}"
     for reason in summary["reasons"]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
+    if summary.get("plan"):
+        yield "shares, quantiles and their intervals are of trials drawn at random: of the plan as far as its rows are"
 
 
 def campaign_error(summary: Summary) -> Iterator[str]:

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
+import polars as pl
 from msgspec import Meta
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
-from ptsmc_jax.campaigns import margin_verdicts, rows, runs, store
+from ptsmc_jax.campaigns import margin_verdicts, plans, rows, runs, store
 from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
+from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import Study, own, parsing, systems
@@ -23,6 +26,8 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import own_parts
 
+TABLE = "plan.parquet"  # the plan that is flown; what `--dry-run` writes is a folder
+PLAN = "plan_sha256"  # by which it is known
 FLOOR = "floor.json"  # what no controller can beat: found when flying, so that a summary needs no plant
 OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
@@ -36,6 +41,7 @@ class Made(msgspec.Struct, frozen=True):
     precision: Literal[32, 64]
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
+    plan: str | None = None  # the name of its file
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,8 @@ class Folder:
     made: Made | None = None  # as its folder says; None: it is yet to be begun
     digests: Mapping[str, str] = field(default_factory=dict)  # of what it was begun with, as its folder says
     trusted: bool = True  # systems and metrics of one's own may be run
+    plan: str | None = None  # of the trials, what its file is called
+    table: pl.DataFrame | None = None  # of that plan
 
     @cached_property
     def programs(self) -> dict[str, str]:
@@ -62,6 +70,8 @@ class Folder:
         """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
         names = {own.digest_name(key): where for key, where in self.programs.items()}
         digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
+        if self.table is not None:
+            digests[PLAN] = self.digests.get(PLAN) if self.made else self.planned.digest
         more = {} if self.own is None else {"metrics": self.own}
         known = {name: found for name, found in digests.items() if found is not None}
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **known}
@@ -70,14 +80,14 @@ class Folder:
     def versions(self) -> dict[str, Any]:
         """What its `versions.json` says."""
         names = None if self.own is None else self.own_names
-        told = {**self.told, "trials": self.trials, "metrics_names": names}
+        told = {**self.told, "trials": self.trials, "metrics_names": names, "plan": self.plan}
         return store.versions(**{name: value for name, value in told.items() if value is not None})
 
     @cached_property
     def own_names(self) -> list[str]:
         """Names of the metrics of one's own."""
         if self.made is None or self.own is None:
-            return [] if self.own is None else self.campaign.own_names()
+            return [] if self.own is None else self._own.own_names()
         if self.made.metrics_names is None:
             raise RefusedError(
                 f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
@@ -90,7 +100,7 @@ class Folder:
         return Rows(self.path / rows.FOLDER, self._key)
 
     @cached_property
-    def plan(self) -> Rows:
+    def dry(self) -> Rows:
         """What its trials fly with, written without flying them."""
         return Rows(self.path / "plan", self._key)
 
@@ -109,8 +119,34 @@ class Folder:
         return scenario.study(self.scenario)
 
     @cached_property
+    def planned(self) -> Plan:
+        """The plan that is flown, looked at; raises RefusedError where it cannot be, or is not what it was."""
+        assert self.table is not None
+        assert self.ready is not None
+        where = f"the plan {self.plan}"
+        found = plans.checked(self.table, self.ready.parts, where, self.own_names)
+        if self.made is not None and found.digest != self.digests.get(PLAN):
+            raise RefusedError(f"{self.path / TABLE} is not the plan that the campaign was begun with")
+        return found
+
+    @cached_property
+    def flights(self) -> Campaign:
+        """What is flown, without metrics of one's own. Raises RefusedError where that would take trust."""
+        if self.ready is None:
+            raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
+        if self.table is None:
+            return Campaign(self.ready, self.seed)
+        return flying.of_plan(self.ready, self.seed, self.planned, where=f"the plan {self.plan}")
+
+    @cached_property
     def campaign(self) -> Campaign:
         """What is flown. Raises ScenarioError where the metrics of one's own are none, RefusedError without trust."""
+        own = self._own.own
+        return replace(self.flights, own=own)
+
+    @cached_property
+    def _own(self) -> Campaign:
+        """A campaign with the metrics of one's own, whatever its trials."""
         if self.ready is None or (self.own is not None and not self.trusted):
             raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
         if self.own is None:
@@ -151,10 +187,11 @@ def begin(wanted: Folder, force: bool) -> None:
     """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
     tables, path = parsing.dump(wanted.scenario), wanted.path
     if force and path.is_dir():
-        for kept in (wanted.rows, wanted.plan):
+        for kept in (wanted.rows, wanted.dry):
             for file in kept.folder.glob("*.parquet"):
                 file.unlink()
-        (path / FLOOR).unlink(missing_ok=True)
+        for name in (FLOOR, TABLE):
+            (path / name).unlink(missing_ok=True)
     else:
         store.check(path, force=True)
         there = path.is_dir() and any(path.iterdir())
@@ -175,6 +212,9 @@ def begin(wanted: Folder, force: bool) -> None:
     def fill(making: Path) -> None:
         store.write_toml(making / "scenario.toml", tables)
         store.write_json(making / "versions.json", wanted.versions)
+        if wanted.table is not None:
+            parts = wanted.campaign.ready.parts
+            (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
 
     store.write(path, fill)
 
@@ -198,7 +238,9 @@ def opened(path: Path) -> Folder:
     except (ValueError, msgspec.ValidationError):
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
     kept = {name: value for name, value in said.items() if name.endswith("_sha256") and isinstance(value, str)}
-    return Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, kept, trusted=False)
+    table = None if made.plan is None else plans.read(path / TABLE)
+    known = Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, kept, trusted=False)
+    return replace(known, plan=made.plan, table=table)
 
 
 def _made(folder: Folder) -> Made:
@@ -251,9 +293,14 @@ def find_floor(folder: Folder) -> None:
     The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
     """
     if not (folder.path / FLOOR).exists():
-        ready = folder.campaign.ready
-        judged = [{**msgspec.to_builtins(v), "met": v.met} for v in margin_verdicts.over_trials(ready, folder.seed)]
-        found = {"window_error": runs.floor(ready, folder.seed), "margins": judged}
+        ready, plan = folder.campaign.ready, folder.campaign.plan
+        first, looked_at = [], None
+        if plan is not None:
+            first = [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
+            looked_at = plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
+        verdicts = margin_verdicts.over_trials(ready, folder.seed, looked_at)
+        judged = [{**msgspec.to_builtins(v), "met": v.met} for v in verdicts]
+        found = {"window_error": runs.floor(ready, folder.seed, first), "margins": judged}
         store.write_json(folder.path / FLOOR, found)
 
 
@@ -276,9 +323,9 @@ def _theory(folder: Folder) -> dict[str, Any]:
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write what each trial flies with, without flying it."""
-    parts, _ = folder.plan.parts()
-    folder.plan.tidy(parts)
-    made = flying.here(folder.campaign.draw, folder.plan, flying.missing(parts, folder.trials))
+    parts, _ = folder.dry.parts()
+    folder.dry.tidy(parts)
+    made = flying.here(folder.campaign.draw, folder.dry, flying.missing(parts, folder.trials))
     flying.follow(made, Tally(sum(part.count for part in parts), folder.trials, 0), report)
 
 

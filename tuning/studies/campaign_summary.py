@@ -11,7 +11,7 @@ import polars as pl
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
-from ptsmc_jax.campaigns import rows, runs, store
+from ptsmc_jax.campaigns import plans, rows, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures import style
@@ -97,6 +97,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "status": "unfinished" if done < folder.trials else "met" if met else "not met",
         "plant": folder.scenario.plant.kind,
         "seed": folder.seed,
+        "plan": folder.plan,
         "trials": folder.trials,
         "flown": done,
         "counts": counts,
@@ -140,7 +141,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     """The rows of the worst trials by a metric, failed ones first."""
     parts = folder.whole_parts()
     names = list(pl.read_parquet_schema(parts[0].path))
-    allowed = [name for name in names if name not in ("trial", "status", "reason", "bad_time")]
+    allowed = [name for name in names if name not in (plans.TRIAL, *plans.HEADING, *plans.OF_ROWS.values())]
     if by not in allowed:
         raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.nearest(by, allowed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
@@ -160,7 +161,9 @@ class Replay:
 
 def replay(folder: Folder, trial: int) -> Replay:
     """A trial's row as the campaign flies it, and its run in full."""
-    run, row = runs.fly(folder.campaign.ready, folder.seed, trial), folder.campaign.fly([trial])
+    made = folder.campaign
+    flown = trial if made.plan is None else made.plan.row(trial, folder.seed)
+    run, row = runs.fly(made.ready, folder.seed, flown), made.fly([trial])
     there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
     kept = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial) if there else None
     again = row.row(0, named=True)
@@ -192,7 +195,7 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     window = frame["window_error"].to_numpy()
     if finished.any():
         if folder.ready is not None:  # its histories are not kept, but flown for it
-            flown = flying.Campaign(folder.ready, folder.seed)
+            flown = folder.flights
             t, error = flying.history(flown, shown.astype(np.uint32))
             hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
             _, course = flying.history(flown, np.asarray([frame["trial"][hardest]], dtype=np.uint32))

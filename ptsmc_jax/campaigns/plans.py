@@ -1,0 +1,190 @@
+"""A plan: trials from a table, one in each row, what it gives flown in place of what is drawn.
+
+A column is one that rows and `--dry-run` have, see `quantities`; numbers of one vector come together. `trial` and
+`seed` say whose draws and noise a row has: those of its own number and of the campaign's seed where they are absent.
+What is neither given nor drawn is nominal. Results (status, metrics) may stand beside, and count for nothing.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import polars as pl
+
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
+from ptsmc_jax.scenario import parsing
+from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.simulation.rollout import Parts
+
+ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
+TRIAL, SEED = "trial", "seed"
+OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where `trial` is the row's own number
+ANGLE = "initial_angle"  # follows from others
+HEADING = ("status", "reason", "bad_time")  # of a row
+RESULTS = {*HEADING, *Metrics._fields}
+MOST = 2**32  # of trials and seeds
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan that was looked at, see `checked`."""
+
+    given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
+    trial: np.ndarray | None  # (rows,) as the table says them
+    seed: np.ndarray | None
+    angle: np.ndarray | None  # (rows,) initial angle that the table says
+    count: int  # rows
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what it says: two tables that fly the same trials have the same one."""
+        found = hashlib.sha256(str(self.count).encode())
+        for name, values in [*sorted(self.given.items()), (TRIAL, self.trial), (SEED, self.seed)]:
+            if values is not None:
+                plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+                found.update(name.encode() + plain.tobytes())
+        return found.hexdigest()
+
+    def rows(self, numbers: np.ndarray, seed: int) -> np.ndarray | Row:
+        """These rows, (rows,) numbers from 0 on; trials' numbers where nothing else is said. seed: the campaign's."""
+        numbers = np.asarray(numbers, dtype=np.uint32)
+        trial = numbers if self.trial is None else self.trial[numbers]
+        if not self.given and self.seed is None:
+            return trial
+        seeds = np.full_like(numbers, seed) if self.seed is None else self.seed[numbers]
+        return Row(seeds, trial, {name: values[numbers] for name, values in self.given.items()})
+
+    def row(self, number: int, seed: int) -> int | Row:
+        """One row."""
+        many = self.rows(np.asarray([number]), seed)
+        return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
+
+    def without(self, same: Iterable[str]) -> "Plan":
+        """The same without quantities that are what would be drawn anyway."""
+        return replace(self, given={name: values for name, values in self.given.items() if name not in same})
+
+    def told(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
+        """Whose draws these rows have, as rows tell it."""
+        known = {TRIAL: self.trial, SEED: self.seed}
+        return {OF_ROWS[name]: values[numbers] for name, values in known.items() if values is not None}
+
+    def frame(self, parts: Parts) -> pl.DataFrame:
+        """The plan as a table, in one form for all that say the same."""
+        columns = {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
+        for name, values in self.given.items():
+            columns |= dict(zip(QUANTITIES[name].columns(parts), values.T, strict=True))
+        return pl.DataFrame(columns or {TRIAL: np.arange(self.count, dtype=np.uint32)})
+
+
+def read(path: Path) -> pl.DataFrame:
+    """The table of a file, or of the files in a folder that `--dry-run` left; raises RefusedError where it is none."""
+    if not path.exists():
+        raise RefusedError(f"--plan is {path}, which is not there; allowed is {ALLOWED}")
+    files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+    kinds = {file.suffix.lower() for file in files}
+    if not kinds or not (kinds == {".parquet"} or kinds == {".csv"}):
+        raise RefusedError(f"--plan is {path}, but must be {ALLOWED}")
+    try:
+        if kinds == {".csv"}:
+            return pl.read_csv(path, infer_schema_length=None)
+        return pl.concat([pl.read_parquet(file) for file in files])
+    except (OSError, pl.exceptions.PolarsError) as error:
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RefusedError(f"--plan is {path}, which cannot be read: {said}") from None
+
+
+def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = ()) -> Plan:
+    """The plan that a table says for these nominal parts; where: what errors call it; own: metrics of one's own.
+
+    Raises RefusedError, in one sentence with column and row (counted from 0, as trials are), where a column is not
+    known or comes without the others of its vector, a cell is empty or no finite number, or a value is none that can be
+    flown.
+    """
+    if table.height == 0:
+        raise RefusedError(f"{where} has no rows, but must have one for each trial")
+    if table.height > MOST:
+        raise RefusedError(f"{where} has {table.height} rows, but at most {MOST} are allowed")
+    there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
+    of = {column: name for name, columns in there.items() for column in columns}
+    whose = [*OF_ROWS, *OF_ROWS.values()]
+    for column in table.columns:
+        if column not in (*of, *whose, ANGLE, *RESULTS, *own):
+            close = parsing.nearest(column, (*of, *OF_ROWS))
+            raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
+    given = {}
+    for name in dict.fromkeys(of[column] for column in table.columns if column in of):
+        absent = [column for column in there[name] if column not in table.columns]
+        if absent:
+            have = next(column for column in table.columns if of.get(column) == name)
+            raise RefusedError(f"{where} has the column {have}, but not {absent[0]}: {_all(there[name])} come together")
+        values = np.stack([_numbers(table, column, where) for column in there[name]], axis=1)
+        given[name] = _checked(values, name, there[name], where)
+    whose_draws = {}
+    for name, other in OF_ROWS.items():  # of rows that are flown again, `trial` is but their number
+        column = other if other in table.columns else name
+        whose_draws[name] = _whole(table, column, where) if column in table.columns else None
+    if whose_draws[TRIAL] is not None and np.array_equal(whose_draws[TRIAL], np.arange(table.height)):
+        whose_draws[TRIAL] = None  # their own numbers
+    angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
+    return Plan(given, whose_draws[TRIAL], whose_draws[SEED], angle, table.height)
+
+
+def check_angle(plan: Plan, flown: np.ndarray, where: str = "the plan") -> None:
+    """Raise RefusedError where the initial angles (rows,) that a plan says are not those that follow from the rest."""
+    if plan.angle is None:
+        return
+    off = np.abs(flown - plan.angle) > 1e-5 * np.maximum(1.0, np.abs(plan.angle))
+    if off.any():
+        k = int(np.argmax(off))
+        raise RefusedError(
+            f"{where} has {ANGLE} {plan.angle[k]:g} in row {k}, but must have {flown[k]:.9g} there, which follows from "
+            "the rest, or no such column"
+        )
+
+
+def _all(columns: list[str]) -> str:
+    return " to ".join((columns[0], columns[-1]))
+
+
+def _refused(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
+    said = "empty" if value is None else value
+    return RefusedError(f"{where} has {column} {said} in row {row}, but must have {allowed}")
+
+
+def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
+    """A column of finite numbers."""
+    values = table[column]
+    if values.dtype.is_numeric() or values.dtype == pl.String:
+        found = values.cast(pl.Float64, strict=False).to_numpy().astype(float)  # what is none, or empty, is NaN
+    else:
+        found = np.full(values.len(), np.nan)
+    bad = ~np.isfinite(found)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise _refused(where, column, row, values[row], "a finite number")
+    return found
+
+
+def _whole(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
+    """A column of whole numbers below 2^32."""
+    values = _numbers(table, column, where)
+    bad = (values != np.floor(values)) | (values < 0) | (values >= MOST)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise _refused(where, column, row, table[column][row], f"a whole number from 0 to {MOST - 1}")
+    return values.astype(np.uint32)
+
+
+def _checked(values: np.ndarray, name: str, columns: list[str], where: str) -> np.ndarray:
+    """The numbers (rows, n) of a quantity as they are flown."""
+    try:
+        return QUANTITIES[name].checked(values)
+    except UnfitError as error:
+        said = ", ".join(f"{v:.9g}" for v in values[error.row])
+        called = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
+        raise _refused(where, called, error.row, said, str(error)) from None

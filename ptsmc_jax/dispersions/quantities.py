@@ -1,0 +1,246 @@
+"""What a trial flies with, by the names of its columns in rows and plans: read from the parts, and set in them.
+
+A quantity is a row of `QUANTITIES`, by the name of the stream that it is drawn from: what is drawn of it is told in
+these columns, and a plan may give it there.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax import formulas
+from ptsmc_jax.devices.sensors import RATE_BIAS, Sensors
+from ptsmc_jax.dispersions.base import (
+    DISTURBANCE_AMPLITUDE,
+    DISTURBANCE_BIAS,
+    DISTURBANCE_PHASE,
+    INERTIA,
+    INITIAL_ATTITUDE,
+    INITIAL_RATE,
+    INITIAL_STATE,
+    REFERENCE,
+)
+from ptsmc_jax.numerics import matrices
+from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation.rollout import Parts
+
+Numbers = Float[Array, " n"]
+NEAR = 1e-6  # of 1, the norm of a unit quaternion
+
+# of what a trial may have more or less, by one factor: name -> where in the parts it stands
+LEVELS = {
+    "attitude_noise": ("sensors", "attitude_noise"),
+    "rate_noise": ("sensors", "rate_noise"),
+    "state_noise": ("sensors", "sigma"),
+    "torque_limit": ("actuators", "torque_limit"),
+}
+
+
+def level(name: str) -> str:
+    """The stream that a factor of `LEVELS` is drawn from."""
+    return f"{name}_level"
+
+
+class UnfitError(ValueError):
+    """Numbers that cannot be flown: in which row, and what is allowed there."""
+
+    def __init__(self, row: int, allowed: str):
+        super().__init__(allowed)
+        self.row = row
+
+    @staticmethod
+    def check(fit: Any, allowed: Callable[[int], str]) -> None:
+        """Raise it of the first row that is not fit, (rows,) bool; allowed: what that row must have, in words."""
+        if not fit.all():
+            row = int(np.argmin(fit))
+            raise UnfitError(row, allowed(row))
+
+
+class Quantity(NamedTuple):
+    """One of `QUANTITIES`. Its numbers (n,) stand in as many columns."""
+
+    columns: Callable[[Parts], list[str]]  # their names; empty where these parts have no such quantity
+    read: Callable[[Parts], Numbers]
+    write: Callable[[Parts, Numbers], Parts]
+    # numbers (rows, n) as a plan gives them -> as they are flown; raises UnfitError
+    checked: Callable[[np.ndarray], np.ndarray] = lambda given: given
+
+
+def numbered(name: str, count: int) -> list[str]:
+    """Names of so many numbers, counted from 1."""
+    return [f"{name}{k + 1}" for k in range(count)]
+
+
+def _unit(q: np.ndarray) -> np.ndarray:
+    """Unit quaternions; those that are unit ones but for rounding stay to the last digit."""
+    norm = np.linalg.norm(q, axis=1)
+    UnfitError.check(np.abs(norm - 1.0) <= NEAR, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
+    rounding = np.abs(norm - 1.0) < 1e-14
+    return np.where(rounding[:, None], q, q / norm[:, None])
+
+
+def _not_negative(given: np.ndarray) -> np.ndarray:
+    UnfitError.check((given >= 0.0).all(axis=1), lambda k: "numbers of at least 0")
+    return given
+
+
+def _positive(given: np.ndarray) -> np.ndarray:
+    UnfitError.check((given > 0.0).all(axis=1), lambda k: "a number greater than 0")
+    return given
+
+
+def _attitude() -> Quantity:
+    return Quantity(
+        lambda parts: numbered("initial_q", 4) if isinstance(parts.initial, AttitudeState) else [],
+        lambda parts: parts.initial.q,
+        lambda parts, q: replace(parts, initial=AttitudeState(q, parts.initial.w)),
+        _unit,
+    )
+
+
+def _rate() -> Quantity:
+    return Quantity(
+        lambda parts: numbered("initial_w", 3) if isinstance(parts.initial, AttitudeState) else [],
+        lambda parts: parts.initial.w,
+        lambda parts, w: replace(parts, initial=AttitudeState(parts.initial.q, w)),
+    )
+
+
+def _state() -> Quantity:
+    return Quantity(
+        lambda parts: [] if isinstance(parts.initial, AttitudeState) else numbered("initial_x", parts.initial.size),
+        lambda parts: parts.initial,
+        lambda parts, x: replace(parts, initial=x),
+    )
+
+
+def _reference() -> Quantity:
+    return Quantity(
+        lambda parts: numbered("reference_q", 4) if hasattr(parts.reference, "q") else [],
+        lambda parts: parts.reference.q,
+        lambda parts, q: replace(parts, reference=replace(parts.reference, q=q)),
+        _unit,
+    )
+
+
+PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle
+
+
+def with_body(parts: Parts, body: Spacecraft) -> Parts:
+    """The parts with another true body, on which the disturbance acts."""
+    return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
+
+
+def _with_inertia(parts: Parts, given: Numbers) -> Parts:
+    entries = {pair: given[k] for k, pair in enumerate(PAIRS)}
+    inertia = jnp.stack([jnp.stack([entries[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
+    return with_body(parts, Spacecraft(inertia, matrices.solve(inertia, jnp.eye(3))))
+
+
+def _inertia_checked(given: np.ndarray) -> np.ndarray:
+    tensors = np.zeros((len(given), 3, 3))
+    for k, (i, j) in enumerate(PAIRS):
+        tensors[:, i, j] = tensors[:, j, i] = given[:, k]
+    UnfitError.check(formulas.bodies(tensors), lambda k: f"a rigid body's inertia ({_why_no_body(tensors[k])})")
+    return given
+
+
+def _why_no_body(tensor: np.ndarray) -> str:
+    try:
+        formulas.check_inertia(tensor)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def _inertia() -> Quantity:
+    return Quantity(
+        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if isinstance(parts.plant, Spacecraft) else [],
+        lambda parts: jnp.stack([parts.plant.inertia[i, j] for i, j in PAIRS]),
+        _with_inertia,
+        _inertia_checked,
+    )
+
+
+def _of_disturbance(name: str, what: Any) -> Quantity:
+    def there(parts: Parts) -> Numbers:
+        return disturbances.values(parts.disturbance, what)
+
+    return Quantity(
+        lambda parts: numbered(f"{name}_", there(parts).size),
+        there,
+        lambda parts, given: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, given)),
+    )
+
+
+def _bias() -> Quantity:
+    return Quantity(
+        lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
+        lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
+        lambda parts, given: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, given)),
+    )
+
+
+def _level(name: str) -> Quantity:
+    part, key = LEVELS[name]
+
+    def there(parts: Parts) -> Any:
+        return getattr(getattr(parts, part), key, None)
+
+    def columns(parts: Parts) -> list[str]:
+        value = there(parts)
+        if value is None:
+            return []
+        return [name] if value.ndim == 0 else numbered(f"{name}_", value.shape[0])
+
+    def write(parts: Parts, given: Numbers) -> Parts:
+        device = getattr(parts, part)
+        return replace(parts, **{part: replace(device, **{key: given.reshape(there(parts).shape)})})
+
+    return Quantity(
+        columns, lambda parts: jnp.ravel(there(parts)), write, _positive if name == "torque_limit" else _not_negative
+    )
+
+
+def _rate_bias() -> Quantity:
+    """The gyro's at the first sample, which a sensor draws for itself: it is read there."""
+
+    def read(parts: Parts) -> Numbers:
+        return jnp.zeros(3) if parts.sensors.given_bias is None else parts.sensors.given_bias
+
+    return Quantity(
+        lambda parts: numbered(f"{RATE_BIAS}_", 3) if isinstance(parts.sensors, Sensors) else [],
+        read,
+        lambda parts, given: replace(parts, sensors=replace(parts.sensors, given_bias=given)),
+    )
+
+
+# in the order of their columns
+QUANTITIES: dict[str, Quantity] = {
+    INITIAL_ATTITUDE: _attitude(),
+    INITIAL_RATE: _rate(),
+    INITIAL_STATE: _state(),
+    REFERENCE: _reference(),
+    INERTIA: _inertia(),
+    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase"),
+    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude"),
+    DISTURBANCE_BIAS: _bias(),
+    **{level(name): _level(name) for name in LEVELS},
+    RATE_BIAS: _rate_bias(),
+}
+
+
+def told(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
+    """The numbers of these quantities by their columns, [rad], [rad/s], [kg m^2] or [N m]: `write` of them = parts."""
+    found = {}
+    for name, quantity in QUANTITIES.items():
+        columns = quantity.columns(parts) if name in names else []
+        if columns:
+            numbers = quantity.read(parts)
+            found |= {column: numbers[k] for k, column in enumerate(columns)}
+    return found

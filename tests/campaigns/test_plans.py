@@ -1,0 +1,248 @@
+"""Trials from a table: what a plan says is flown, the rest as drawn; a plan that was written is the campaign itself."""
+
+import dataclasses
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+from scipy.spatial.transform import Rotation
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign, plans
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.dispersions.quantities import QUANTITIES
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation import rollout
+from tests.helpers import vector
+
+SEED = 3
+EVERYTHING = """
+[controller]
+t_f = 3.0
+delta = 1.0
+[loop]
+mode = "sampled"
+period = 0.25
+t_end = 4.5
+[disturbance]
+kind = "sum"
+terms = [{ kind = "sinusoid" }, { kind = "gravity_gradient" }]
+[hardware]
+attitude_noise = 2e-5
+rate_noise = 1e-6
+rate_bias = 1e-5
+torque_limit = 30.0
+[filter]
+kind = "steady_state"
+[dispersion]
+attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 90.0 }
+rate = { kind = "normal" }
+inertia = { kind = "relative_normal" }
+reference = { kind = "normal" }
+disturbance_phase = { kind = "uniform" }
+disturbance_amplitude = { kind = "relative_normal" }
+disturbance_bias = { kind = "normal" }
+attitude_noise = { kind = "relative_normal" }
+torque_limit = { kind = "relative_uniform" }
+"""
+CHAIN = """
+plant = { kind = "chain", order = 3 }
+controller = { delta = 0.5 }
+loop = { mode = "sampled", period = 0.1 }
+hardware = { state_noise = [1e-4, 1e-4, 1e-4] }
+dispersion = { x0 = { kind = "normal" }, state_noise = { kind = "relative_normal" } }
+"""
+
+
+def ready(text):
+    return scenario.study(scenario.from_tables(tomllib.loads(text)))
+
+
+@pytest.fixture(scope="module")
+def everything():
+    """A campaign in which all is drawn that a spacecraft has, its rows and its plan."""
+    made = campaign.Campaign(ready(EVERYTHING), SEED)
+    return made, made.fly(range(70)), made.draw(range(70))
+
+
+def of_plan(made, table):
+    return campaign.of_plan(made.ready, made.seed, plans.checked(table, made.ready.parts))
+
+
+def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(everything, tmp_path):
+    made, frame, plan = everything
+    plan.write_csv(tmp_path / "plan.csv")
+    plan.write_parquet(tmp_path / "plan.parquet")
+    digests = set()
+    for name in ("plan.csv", "plan.parquet"):
+        again = of_plan(made, plans.read(tmp_path / name))
+        digests.add(plans.checked(plans.read(tmp_path / name), made.ready.parts).digest)
+        assert again.plan is not None
+        assert not again.plan.given  # the campaign's own program flies it
+        assert_frame_equal(again.fly(range(70)), frame, check_exact=True)
+    assert len(digests) == 1
+    # rows of a campaign are a plan, from which results are left out; those of some trials have these trials' noise
+    some = of_plan(made, frame[[40, 7]])
+    flown = some.fly(range(2))
+    assert flown["plan_trial"].to_list() == [40, 7]
+    assert_frame_equal(flown.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
+    assert of_plan(made, flown).fly(range(2)).equals(flown)  # and so are its rows again
+
+
+@pytest.fixture(scope="module")
+def corners(everything):
+    """A table that gives everything otherwise than it is drawn, and its rows."""
+    made, _, plan = everything
+    generator = np.random.default_rng(1)
+    table = plan.head(2).drop("trial", "initial_angle")
+    columns = {name: table[name].to_numpy() * (1.0 + 0.01 * generator.uniform(size=2)) for name in table.columns}
+    for what in ("initial", "reference"):
+        q = Rotation.from_rotvec(generator.normal(size=(2, 3))).as_quat()
+        q[:, 3] += 1.0  # far from 180 degrees
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        columns |= {f"{what}_q{k + 1}": q[:, k] for k in range(4)}
+    table = pl.DataFrame({"trial": [5, 9], "seed": [SEED, 11], **columns})
+    return table, of_plan(made, table).fly(range(2))
+
+
+def test_what_a_row_gives_is_what_is_flown(everything, corners):
+    """Against parts set by hand, from the nominal ones alone."""
+    made, (table, flown) = everything[0], corners
+    assert flown["plan_trial"].to_list() == [5, 9]
+    assert flown["plan_seed"].to_list() == [SEED, 11]
+    for k, row in enumerate(table.iter_rows(named=True)):
+        parts = made.ready.parts
+
+        def numbers(name, row=row):
+            return vector([value for key, value in row.items() if key.startswith(name) and key[len(name) :].isdigit()])
+
+        upper = np.triu(np.ones((3, 3)), 0) > 0
+        inertia = np.zeros((3, 3))
+        inertia[upper] = [row[f"inertia_{i}{j}"] for i in (1, 2, 3) for j in range(i, 4)]
+        inertia = np.where(upper, inertia, inertia.T)
+        sinusoid, gradient = parts.disturbance.terms
+        phases, amplitudes = numbers("disturbance_phase_"), numbers("disturbance_amplitude_")
+        acting = disturbances.Sum((
+            dataclasses.replace(sinusoid, phase=phases[:3], amplitude=amplitudes),
+            dataclasses.replace(gradient, phase=phases[3], inertia=vector(inertia)),
+            disturbances.Constant(numbers("disturbance_bias_")),
+        ))  # fmt: skip
+        by_hand = dataclasses.replace(
+            parts,
+            plant=rigid_body.spacecraft(inertia),
+            disturbance=acting,
+            initial=rigid_body.AttitudeState(numbers("initial_q"), numbers("initial_w")),
+            reference=dataclasses.replace(parts.reference, q=numbers("reference_q")),
+            sensors=dataclasses.replace(
+                parts.sensors, attitude_noise=vector(row["attitude_noise"]), given_bias=numbers("rate_bias_")
+            ),
+            actuators=dataclasses.replace(parts.actuators, torque_limit=vector(row["torque_limit"])),
+        )
+        run = rollout.simulate_jit(by_hand, jnp.uint32(row["seed"]), jnp.uint32(row["trial"]))
+        assert rollout.STATUS[int(run.status)][0] == flown["status"][k]
+        for name in made.ready.catalogue:
+            value = float(getattr(run.metrics, name))
+            assert flown[name][k] == pytest.approx(value, rel=1e-11) or np.isnan(value), name
+        for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
+            assert flown[name][k] == pytest.approx(row[name], rel=1e-12), name
+
+
+def test_what_a_row_does_not_give_is_drawn(everything):
+    made, _, plan = everything
+    rates = pl.DataFrame({f"initial_w{k}": [0.01 * k, -0.01] for k in (1, 2, 3)})
+    drawn = of_plan(made, rates).draw(range(2))
+    given = list(rates.columns)
+    assert_frame_equal(drawn.select(given), rates)
+    others = [name for name in plan.columns if name not in given]
+    assert_frame_equal(drawn.select(others), plan.head(2).select(others), rel_tol=1e-14, abs_tol=1e-18)
+
+
+@pytest.mark.parametrize("text", [EVERYTHING, CHAIN], ids=["spacecraft", "chain"])
+def test_every_quantity_is_read_as_it_was_set(text):
+    parts = ready(text).parts
+    generator = np.random.default_rng(2)
+    there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
+    assert sum(map(len, there.values())) > 4
+    for name, columns in there.items():
+        if not columns:
+            continue
+        quantity = QUANTITIES[name]
+        values = generator.uniform(0.1, 1.0, len(columns))
+        np.testing.assert_array_equal(quantity.read(quantity.write(parts, vector(values))), values, err_msg=name)
+
+
+def test_a_chain_flies_a_plan():
+    flight = scenario.from_tables(tomllib.loads(CHAIN))
+    rows = ptsmc.trials(flight, 3, seed=SEED)
+    states = ["initial_x1", "initial_x2", "initial_x3"]
+    table = rows.select("trial", *states)[[2, 0]]
+    again = ptsmc.trials(flight, table, seed=SEED)
+    # not all of them as drawn in the first rows: another program
+    for name in ("terminal_error", "peak_torque", "state_noise_1", *states):
+        np.testing.assert_allclose(again[name], rows[name].gather([2, 0]), rtol=1e-9)
+    assert again["plan_trial"].to_list() == [2, 0]
+
+
+Q = {f"initial_q{k}": [0.0, 0.0] for k in (1, 2, 3)}
+J = {f"inertia_{i}{j}": {1: 10.0, 2: 12.0, 3: 14.0}[i] * (i == j) for i in (1, 2, 3) for j in range(i, 4)}
+BAD = [
+    ({}, "the plan has no rows, but must have one for each trial"),
+    ({"inital_w1": [0.0]}, "the plan has the column inital_w1, with which no trial of this scenario flies; the nearest "
+     "known one is initial_w1"),
+    ({"initial_x1": [0.0]}, "the column initial_x1, with which no trial of this scenario flies"),
+    ({"initial_w1": [0.0], "initial_w2": [0.0]},
+     "has the column initial_w1, but not initial_w3: initial_w1 to initial_w3 come together"),
+    ({"initial_w1": [0.0, 0.0], "initial_w2": [0.0, np.nan], "initial_w3": [0.0, 0.0]},
+     "has initial_w2 nan in row 1, but must have a finite number"),
+    ({"torque_limit": [1.0, None]}, "has torque_limit empty in row 1, but must have a finite number"),
+    ({"torque_limit": ["1.0", "much"]}, "has torque_limit much in row 1, but must have a finite number"),
+    ({"torque_limit": [True]}, "has torque_limit True in row 0, but must have a finite number"),
+    ({"torque_limit": [1.0, 0.0]}, "has torque_limit 0 in row 1, but must have a number greater than 0"),
+    ({"attitude_noise": [-1e-5]}, "has attitude_noise -1e-05 in row 0, but must have numbers of at least 0"),
+    (Q | {"initial_q4": [1.0, 0.9]}, "has initial_q1 to initial_q4 = 0, 0, 0, 0.9 in row 1, but must have a unit "
+     "quaternion (its norm is 0.9)"),
+    ({name: [value, 30.0 if name == "inertia_33" else value] for name, value in J.items()},
+     "in row 1, but must have a rigid body's inertia (no rigid body has these principal moments: the largest, 30"),
+    ({name: [-value] for name, value in J.items()}, "must be positive definite"),
+    ({"trial": [0, -1]}, "has trial -1 in row 1, but must have a whole number from 0 to 4294967295"),
+    ({"trial": [0.5]}, "has trial 0.5 in row 0, but must have a whole number"),
+    ({"seed": [2**32]}, "has seed 4294967296 in row 0, but must have a whole number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
+def test_what_cannot_be_flown_is_refused_with_row_and_column(everything, columns, said):
+    with pytest.raises(RefusedError) as refused:
+        plans.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_angle_that_does_not_follow_is_refused(everything):
+    made, _, plan = everything
+    wrong = pl.when(pl.col("trial") == 2).then(3.0).otherwise("initial_angle")
+    with pytest.raises(RefusedError, match="has initial_angle 3 in row 2, but must have "):
+        of_plan(made, plan.with_columns(wrong.alias("initial_angle")))
+
+
+def test_files_that_are_no_plan_are_refused(tmp_path):
+    for name, content, said in (
+        ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),
+        ("plan.txt", b"trial\n1\n", "plan.txt, but must be a .csv or .parquet file"),
+        ("cut.parquet", b"PAR1", "cut.parquet, which cannot be read: "),
+        ("empty.csv", b"", "empty.csv, which cannot be read: "),
+        ("folder", None, "folder, but must be a .csv or .parquet"),
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        if name == "folder":
+            (tmp_path / name).mkdir()
+        with pytest.raises(RefusedError) as refused:
+            plans.read(tmp_path / name)
+        assert said in str(refused.value)
+        assert "\n" not in str(refused.value)

@@ -1,0 +1,90 @@
+"""`ptsmc montecarlo --plan`: the rows of a table as a campaign that is resumed, replayed and put on a page."""
+
+import json
+
+import polars as pl
+import pytest
+
+from ptsmc_jax.campaigns import campaign
+from tests.output.pages import checked
+
+CORNERS = "initial_w1,initial_w2,initial_w3\n0.02,0.0,0.0\n0.0,0.02,0.0\n0.0,0.0,-0.02\n"
+
+
+@pytest.fixture(autouse=True)
+def _small_parts(monkeypatch):
+    monkeypatch.setattr(campaign, "PART", 100)
+
+
+def rows_of(folder):
+    return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
+
+
+def test_the_plan_of_a_campaign_flown_is_the_campaign(command, tmp_path):
+    options = ["--seed", 3, "--no-figures", "--quiet"]
+    assert command("montecarlo", "s.toml", "--trials", 150, *options)[0] == 0
+    assert command("montecarlo", "s.toml", "--trials", 150, "--dry-run", *options, "--out", "dry")[0] == 0
+    assert command("montecarlo", "s.toml", "--plan", "dry/plan", *options) == (0, "", "")
+    made = tmp_path / "out" / "montecarlo-s-plan"
+    assert rows_of(made).equals(rows_of(tmp_path / "out" / "montecarlo-s"))
+    told = json.loads((made / "versions.json").read_text())
+    assert (told["plan"], told["trials"]) == ("plan", 150)
+
+
+def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_path):
+    (tmp_path / "corners.csv").write_text(CORNERS)
+    asked = ["montecarlo", "s.toml", "--plan", "corners.csv", "--no-figures"]
+    code, said, _ = command(*asked)
+    folder = tmp_path / "out" / "montecarlo-s-corners"
+    assert code == 0
+    assert "3 trials of the plan corners.csv and seed 0: 3 ok" in said
+    assert "of trials drawn at random: of the plan as far as its rows are" in said
+    rows = rows_of(folder)
+    assert rows["trial"].to_list() == [0, 1, 2]
+    assert rows["initial_w3"].to_list() == [0.0, 0.0, -0.02]
+    assert rows["initial_q1"].n_unique() == 3  # attitudes are drawn as ever
+    read = checked(folder)
+    assert "ptsmc montecarlo scenario.toml --plan corners.csv --seed 0" in read.text
+
+    part = next((folder / "trials").iterdir())
+    part.unlink()
+    assert command(*asked, "--quiet")[0] == 0  # again what is missing
+    assert rows_of(folder).equals(rows)
+    assert command("worst", folder, "--by", "peak_rate", "-n", 1)[0] == 0
+    code, said, _ = command("replay", folder, "--trial", 1, "--no-figures")
+    assert (code, "equal to its row, to the last digit" in said) == (0, True)
+    history = pl.read_csv(folder / "replay" / "1" / "trajectory.csv")
+    assert history["w2"][0] == 0.02
+    assert command("replay", folder, "--trial", 3)[0] == 2
+
+    (tmp_path / "corners.csv").write_text(CORNERS.replace("-0.02", "-0.03"))
+    code, _, error = command(*asked)
+    assert (code, "which holds a run with plan_sha256" in error) == (2, True)
+    pl.read_csv(tmp_path / "corners.csv").write_parquet(folder / "plan.parquet")
+    for again in (["replay", folder, "--trial", 1], ["replay", folder, "--trial", 0]):
+        code, out, error = command(*again)
+        assert (code, out) == (2, "")
+        assert "plan.parquet is not the plan that the campaign was begun with" in error
+    assert command(*asked, "--force", "--quiet")[0] == 0
+    assert rows_of(folder)["initial_w3"][2] == -0.03
+    assert command("montecarlo", "s.toml", "--out", folder, "--force", "--quiet", "--trials", 5, "--no-figures")[0] == 0
+    assert not (folder / "plan.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--plan", "none.csv"], "--plan is none.csv, which is not there"),
+        (["--plan", "s.toml"], "--plan is s.toml, but must be a .csv or .parquet file"),
+        (["--plan", "bad.csv"], "the plan bad.csv has initial_w2 nan in row 1, but must have a finite number"),
+        (["--plan", "bad.csv", "--trials", "5"], "--trials does not go with --plan"),
+        (["--plan", "bad.csv", "--until-confident", "0.1"], "does not go with --plan"),
+    ],
+)
+def test_a_plan_that_cannot_be_flown_is_refused_and_nothing_is_written(command, tmp_path, options, said):
+    (tmp_path / "bad.csv").write_text("initial_w1,initial_w2,initial_w3\n0,0,0\n0,nan,0\n")
+    code, out, error = command("montecarlo", "s.toml", *options)
+    assert (code, out) == (2, "")
+    assert said in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
