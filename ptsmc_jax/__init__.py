@@ -39,6 +39,7 @@ _EXPORTS = {
     "floor": "explore",
     "trials": "explore",
     "verdicts": "explore",
+    "export": "onboard.folder",
     "read": "scenario",
     "replace": "scenario",
     "simulate_jit": "simulation.rollout",
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.observers.none import NoObserver as NoObserver
     from ptsmc_jax.observers.nonlinear import NonlinearObserver as NonlinearObserver
     from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver as PrescribedTimeObserver
+    from ptsmc_jax.onboard.folder import export as export
     from ptsmc_jax.plants.integrator_chain import Chain as Chain
     from ptsmc_jax.plants.integrator_chain import chain as chain
     from ptsmc_jax.plants.rigid_body import AttitudeState as AttitudeState

@@ -21,9 +21,10 @@ jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# not what walks through programs, equation by equation: it took longer to check every call than to compile. Nor folders,
-# whose names would stand for all modules in them
+# not what walks through programs, equation by equation: it took longer to check every call than to compile. Nor
+# folders, whose names would stand for all modules in them
 UNCHECKED = {f"ptsmc_jax.batching.{name}" for name in ("lanes", "components", "kernel")}
+UNCHECKED |= {f"ptsmc_jax.onboard.{name}" for name in ("control", "expressions", "printing", "rules", "translate")}
 checked = [name for name, path in modules().items() if name not in UNCHECKED and path.name != "__init__.py"]
 hook = install_import_hook(checked, "beartype.beartype")
 

@@ -51,6 +51,15 @@ HOUSE = {
             flyable
         """,
         "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
+        "onboard": """
+            expressions
+            control origins rules
+            board fields printing translate
+            generate vectors
+            templates
+            readme
+            folder
+        """,
         "paper": "claims remark_2 | slips",
         "figures": "style | animation campaign_plots margin_plots run_plots study_plots",
         "explore": "",
@@ -75,7 +84,7 @@ HOUSE = {
             compare pareto tune_files
         """,
         "output": "cells page_charts | margin_sentences | sentences | page terminal | campaign_terminal",
-        "cli": "options | campaign_commands convert new | writing_commands | main",
+        "cli": "options | campaign_commands flight_commands convert new | writing_commands | main",
     },
 }
 

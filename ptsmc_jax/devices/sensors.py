@@ -126,23 +126,31 @@ class Sensors:
             estimate = self.filter.begin(x0.q, none, normals, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
-    def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
-        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
+    def sample(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as star tracker and gyro say them, and the memory; dt: see `measure`."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
-        bias, estimate = memory.bias, memory.estimate
+        bias = memory.bias
         if self.bias_rate is not None:
             bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
         w = jnp.add(x.w, shift)
         if bias is not None:
             w = w + bias
         q = attitude.multiply(x.q, attitude.from_rotation_vector(turn))
+        return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
+
+    def star_weight(self, now: Ticks) -> Scalar:
+        """How much a star tracker sample counts at this sample; 0: there is none."""
+        return jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+
+    def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
+        read, kept = self.sample(memory, x, now, dt)
         if self.filter is None:
-            return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
-        weight = jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
-        estimate = self.filter.correct(self.filter.propagate(estimate, memory.rate, w, dt), q, weight)
-        seen = AttitudeState(estimate.q, w - estimate.bias)
-        return seen, Memory(memory.keys, noise_next, bias, estimate, w)
+            return read, kept
+        ahead = self.filter.propagate(memory.estimate, memory.rate, read.w, dt)
+        estimate = self.filter.correct(ahead, read.q, self.star_weight(now))
+        return AttitudeState(estimate.q, read.w - estimate.bias), kept._replace(estimate=estimate, rate=read.w)
 
     def moved(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
         """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, CycloptsError, Parameter
 
 import ptsmc_jax
-from tuning.cli import campaign_commands, writing_commands
+from tuning.cli import campaign_commands, flight_commands, writing_commands
 from tuning.cli.options import (
     INTERRUPTED,
     Against,
@@ -303,7 +303,7 @@ def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fi
     return 0
 
 
-for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS):
+for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS, *flight_commands.COMMANDS):
     app.command(_command)
 
 

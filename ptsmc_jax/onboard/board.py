@@ -1,0 +1,317 @@
+"""What the flight computer of the sampled loop does in a control period, in stages that become functions of C.
+
+A stage calls the very code that the rollout flies, of `devices`, `observers` and `laws`. It reads and writes by name:
+`in.` what comes in at this sample, `before.` what is remembered of the last one, `last.` what went out then, `now.` and
+`out.` what this one makes of it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.batching.lanes import dependence
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState
+from ptsmc_jax.devices.attitude_filter import Estimate
+from ptsmc_jax.laws.base import Law, Sample
+from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE
+
+ROUNDING = 1e-9  # of a period, which must not cost one: as `clock.Flight` has it
+UNIT = 1e-12  # a quaternion whose square is off by less is taken as it is
+KNOWN = 0.25  # |q|^2 of an attitude that has been set
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A function of the flight computer."""
+
+    name: str
+    about: str
+    reads: tuple[str, ...]
+    run: Callable[..., dict[str, Any]]  # of the parameters and of what it reads: what it writes, by name
+    parts: tuple[Any, ...] = ()  # whose docstrings say what it does
+
+
+@dataclass
+class Board:
+    """The flight computer of some parts: shapes by name, and what each is."""
+
+    parameters: dict[str, Any]
+    spacecraft: bool
+    inputs: dict[str, Any] = field(default_factory=dict)
+    state: dict[str, Any] = field(default_factory=dict)
+    outputs: dict[str, Any] = field(default_factory=dict)
+    stages: list[Stage] = field(default_factory=list)
+    about: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """Of inputs and disturbances."""
+        return " [N m]" if self.spacecraft else ""
+
+    @property
+    def seen(self) -> tuple[str, ...]:
+        """What the state consists of that the law sees."""
+        return ("attitude", "rate") if self.spacecraft else ("x",)
+
+    def state_of(self, values: tuple[Any, ...]) -> Any:
+        """That state."""
+        return AttitudeState(*values) if self.spacecraft else values[0]
+
+
+SCALARS = ("t", "dt", "regular", "tracking")  # arguments of C's functions
+
+
+def real(*shape: int) -> jax.ShapeDtypeStruct:
+    """The shape of real numbers."""
+    return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+
+
+def whole() -> jax.ShapeDtypeStruct:
+    """The shape of a yes or no."""
+    return jax.ShapeDtypeStruct((), jnp.int32)
+
+
+def shapes(tree: Any) -> Any:
+    """The shapes of a tree of arrays."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), jnp.asarray(leaf).dtype), tree)
+
+
+def board(parts: Parts) -> Board:
+    """The flight computer of parts whose loop is sampled."""
+    observer, law, device = parts.observer, parts.controller, parts.actuators
+    period = parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    parameters = {
+        "law": law,
+        "reference": parts.reference,
+        "observer": observer,
+        "observer_matrix": observer.update_matrix(period),
+        "bound": observer.error_bound(),
+        "filter": getattr(parts.sensors, "filter", None),
+        "actuators": device,
+        "period": period,
+    }
+    made = Board(parameters, isinstance(observer.model, Spacecraft))
+    made.about["period"] = "of the control loop [s]"
+    made.about["observer_matrix"] = _said(type(observer).update_matrix)
+    if not made.spacecraft:
+        _reading(made, parts)
+    elif parameters["filter"] is None:
+        _tracking(made)
+    else:
+        _filtering(made, parameters["filter"])
+    _observing(made, observer, device)
+    _commanding(made, law, observer)
+    made.stages.append(Stage("begin", "What is remembered before the first sample.", (), _begin))
+    if device is not None:
+        _acting(made, device, observer.model.inputs)
+    return made
+
+
+def _said(function: Any) -> str:
+    return " ".join((function.__doc__ or "").strip().split("\n\n")[0].split()).rstrip(".")
+
+
+def _reading(made: Board, parts: Parts) -> None:
+    """The states of a chain or a system as they are measured."""
+    made.inputs["x"] = made.state["x"] = real(*np.shape(parts.initial))
+    made.about["x"] = "the state as it is measured, in its own units"
+    made.stages.append(Stage("sense", "The state as the law sees it.", ("in.x",), lambda given, x: {"now.x": x}))
+
+
+_MEASURED = {
+    "attitude": "unit quaternion, scalar last, body relative to inertial [-]",
+    "rate": "of the body in body axes [rad/s]",
+}
+
+
+def _unit(q: Any) -> Any:
+    """A measured quaternion of length 1."""
+    square = jnp.dot(q, q)
+    return jnp.where(jnp.abs(square - 1.0) > UNIT, q / jnp.sqrt(square), q)
+
+
+def _signed(law: Law, target: Any, q: Any, w: Any, before: Any, tracking: Any) -> Any:
+    """Of q and -q, one attitude, the one next to the last sample's; at the start the one that the law can take."""
+    going_on = jnp.where(jnp.dot(q, before) < 0.0, -q, q)
+    return jnp.where(tracking != 0, going_on, law.align(AttitudeState(q, w), target).q)
+
+
+def _tracking(made: Board) -> None:
+    """Star tracker and gyro as they are."""
+    made.inputs |= {"attitude": real(4), "rate": real(3)}
+    made.state |= {"attitude": real(4), "rate": real(3)}
+    made.about |= _MEASURED
+
+    def sense(given: Any, measured: Any, rate: Any, before: Any, tracking: Any, t: Any) -> dict[str, Any]:
+        attitude = _signed(given["law"], given["reference"](t), _unit(measured), rate, before, tracking)
+        return {"now.attitude": attitude, "now.rate": rate}
+
+    reads = ("in.attitude", "in.rate", "before.attitude", "tracking", "t")
+    made.stages.append(Stage("sense", "Attitude and rate as the law sees them: as measured.", reads, sense))
+
+
+def _filtering(made: Board, filter_: Any) -> None:
+    """Star tracker and gyro through the attitude filter."""
+    made.inputs |= {"attitude": real(4), "attitude_valid": whole(), "rate": real(3)}
+    made.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
+    made.about |= _MEASURED | {
+        "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
+        "bias": "of the gyro, estimated [rad/s]",
+        "gyro": "rate as the gyro measured it last [rad/s]",
+    }
+
+    def sense(
+        given: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any, tracking: Any,
+        t: Any,
+    ) -> dict[str, Any]:  # fmt: skip
+        measured = _unit(star)
+        start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
+        ahead = given["filter"].propagate(Estimate(start, bias), gyro_before, gyro, dt)
+        found = jax.lax.cond(
+            valid != 0, lambda: given["filter"].correct(ahead, measured, jnp.ones_like(dt)), lambda: ahead
+        )
+        rate = gyro - found.bias
+        attitude = _signed(given["law"], given["reference"](t), found.q, rate, start, tracking)
+        return {"now.attitude": attitude, "now.rate": rate, "now.bias": found.bias, "now.gyro": gyro}
+
+    about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
+    reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
+             "tracking", "t")  # fmt: skip
+    made.stages.append(Stage("sense", about, reads, sense, (filter_,)))
+
+
+def _observing(made: Board, observer: Observer, device: Actuators | None) -> None:
+    """The disturbance by what the last period's motion shows."""
+    m, wheels = observer.model.inputs, None if device is None else device.wheels
+    made.state["observer"] = shapes(observer.begin())
+    made.outputs["d_hat"] = real(m)
+    made.about |= {"observer": "memory of the observer, which begins with the estimate",
+                   "d_hat": f"estimated disturbance{made.unit}"}  # fmt: skip
+    if wheels is not None:
+        made.inputs["wheel_momentum"] = made.state["wheel_momentum"] = real(*np.shape(wheels.initial))
+        made.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
+        acted = ("before.wheel_momentum", "in.wheel_momentum")
+    elif device is not None and device.moves:
+        made.inputs["applied"] = real(m)
+        made.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
+        acted = ("in.applied",)
+    else:
+        acted = ("last.command",) if device is None else ("last.torque",)
+
+    def observe(given: Any, t: Any, dt: Any, regular: Any, memory: Any, *read: Any) -> dict[str, Any]:
+        known, size = given["observer"], len(made.seen)
+        model, before, now = known.model, made.state_of(read[:size]), made.state_of(read[size : 2 * size])
+
+        def updated() -> Any:
+            applied = read[2 * size]
+            if wheels is not None:
+                h_before, h_now = read[2 * size :]
+                axes = given["actuators"].wheels.axes
+                stored = axes @ (0.5 * (h_before + h_now))
+                turning = (model.velocity(before) + model.velocity(now)) / 2
+                applied = axes @ ((h_before - h_now) / dt) - jnp.cross(turning, stored)
+            impulse = model.unexplained_impulse(t, before, now, applied, dt)
+            return known.update(given["observer_matrix"], memory, impulse, t, dt)
+
+        memory = jax.lax.cond(regular != 0, updated, lambda: memory)
+        found = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
+        return found if wheels is None else {**found, "now.wheel_momentum": read[-1]}
+
+    states = [f"{when}.{name}" for when in ("before", "now") for name in made.seen]
+    reads = ("t", "dt", "regular", "before.observer", *states, *acted)
+    about = "The disturbance that explains the motion since the last sample, through the observer."
+    made.stages.append(Stage("observe", about, reads, observe, (observer,)))
+
+
+def _commanding(made: Board, law: Law, observer: Observer) -> None:
+    """The law, before and after its hand-over."""
+    m, memory = observer.model.inputs, law.begin()
+    x = made.state_of(tuple(made.state[name] for name in made.seen))
+    target = jax.eval_shape(made.parameters["reference"], real())
+
+    def once(law: Law, x: Any, target: Any) -> Any:
+        return law.command(memory, Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(())), x, target, jnp.zeros(m),
+                           jnp.zeros(()))[1]  # fmt: skip
+
+    made.state["law"] = shapes(memory)
+    made.outputs |= {"command": real(m), "s": jax.eval_shape(once, law, x, target)}
+    made.about |= {"law": "memory of the law", "command": f"what the law asks for{made.unit}", "s": "sliding variable"}
+    singular = any(_depends(law.clearance, x, target))
+    if singular:
+        made.state |= {"clearance": real(), "clearance_unit": real()}
+        made.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
+                       "clearance_unit": "what that is counted in"}  # fmt: skip
+
+    def command(given: Any, t: Any, tracking: Any, d_hat: Any, kept: Any, *read: Any) -> dict[str, Any]:
+        known, period = given["law"], given["period"]
+        now, reference = made.state_of(read[: len(made.seen)]), given["reference"](t)
+        hold = t >= known.hand_over - ROUNDING * period
+
+        def decided() -> Any:
+            return known.command(kept, Sample(t, hold, period), now, reference, d_hat, given["bound"](t))
+
+        if not singular:
+            u, s, after = decided()
+            return {"out.command": u, "out.s": s, "now.law": after}
+        last_unit, last_u, last_s = read[len(made.seen) :]
+        distance = known.clearance(now, reference)
+        unit = jnp.where(tracking != 0, last_unit, known.whole_clearance(distance))
+        clearance = distance / unit
+        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: (last_u, last_s, kept))
+        return {"out.command": u, "out.s": s, "now.law": after, "now.clearance": clearance, "now.clearance_unit": unit}
+
+    states = tuple(f"now.{name}" for name in made.seen)
+    lasts = ("before.clearance_unit", "last.command", "last.s") if singular else ()
+    reads = ("t", "tracking", "out.d_hat", "before.law", *states, *lasts)
+    about = "The law: the input for the state as it is seen; the last one where the law is singular."
+    made.stages.append(Stage("command", about, reads, command, (law,)))
+
+
+def _begin(given: Any) -> dict[str, Any]:
+    return {"now.observer": given["observer"].begin(), "now.law": given["law"].begin()}
+
+
+def _depends(function: Callable, *args: Any) -> list[bool]:
+    """Which outputs of a function depend on its arguments."""
+    traced = jax.make_jaxpr(function)(*args)
+    return dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))
+
+
+def _acting(made: Board, device: Actuators, m: int) -> None:
+    """What of the command acts on the body: delay, limits, allocation to wheels."""
+    wheels, reads, names = device.wheels, ["out.command"], []
+    if device.delay:
+        made.state["queue"] = real(device.delay, m)
+        made.about["queue"] = "commands on their way, the oldest first [N m]"
+        names.append("before.queue")
+    if device.moves:
+        made.inputs["acting"] = real(m) if wheels is None else real(*np.shape(wheels.initial))
+        made.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
+        names.append("in.acting")
+    made.outputs["torque"] = real(m)
+    made.about["torque"] = "on the body from this sample on, as far as it is known [N m]"
+    if wheels is not None:
+        made.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
+        made.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
+        names += ["in.wheel_momentum", "now.rate"]
+
+    def act(given: Any, u: Any, *read: Any) -> dict[str, Any]:
+        found, known = dict(zip(names, read, strict=True)), given["actuators"]
+        state = ActuatorState(found.get("before.queue"), found.get("in.acting"), found.get("in.wheel_momentum"))
+        drive, queue = known.command(state, u, found.get("now.rate"), given["period"], jnp.ones(()))
+        made = {"limited": drive.limited}
+        if queue is not None:
+            made["now.queue"] = queue
+        if wheels is None:
+            return {**made, "out.torque": drive.c}
+        return {**made, "out.torque": known.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
+
+    made.stages.append(Stage("act", "What of the command acts on the body: limits, delay, wheels.", (*reads, *names),
+                             act, (device,)))  # fmt: skip

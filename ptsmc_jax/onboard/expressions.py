@@ -1,0 +1,208 @@
+"""Scalar expressions: what a trace becomes before it is C. Equal ones are one, constants are folded.
+
+A node is an operation on other nodes. `Pool` makes them: it finds the one that is there already (common
+subexpressions), computes what is known, and leaves out what changes nothing (x + 0, 1 x, 0 x).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+REAL, BOOL = "real", "bool"  # kinds of numbers; the others are C's names of whole ones
+
+
+class Title:
+    """A name that the source gives to a value, of which a node is a component."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+
+class Node:
+    """A scalar: an operation and its operands, a constant, or a place that C reads."""
+
+    __slots__ = ("args", "block", "kind", "op", "part", "section", "serial", "title", "value")
+    made: ClassVar[int] = 0
+
+    def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
+        Node.made += 1
+        self.serial = Node.made  # operands come before what is made of them
+        self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
+        self.title: Title | None = None  # by what name the source knows it
+        self.part = ""  # which component of that it is
+        self.section: Any = None  # the function of the source that it is computed in
+
+
+class Block:
+    """What is computed one after the other: a function's body, one side of a branch, a loop's body."""
+
+    def __init__(self, outer: "Block | None" = None):
+        self.outer, self.nodes = outer, []
+        self.known: dict[Any, Node] = {}
+
+    def find(self, key: Any) -> Node | None:
+        """A node that is computed here, or further out."""
+        block: Block | None = self
+        while block is not None:
+            if key in block.known:
+                return block.known[key]
+            block = block.outer
+        return None
+
+
+class Region:
+    """A branch or a loop: blocks, and the values that come out of it."""
+
+    def __init__(self, kind: str, test: Node | None = None):
+        self.kind, self.test = kind, test  # "branch", "while" or "count"
+        self.blocks: list[Block] = []
+        self.outputs: list[list[Node]] = []  # of each block
+        self.results: list[Node] = []  # what stands for them outside
+        self.carried: list[Node] = []  # of a loop: what stands for its state inside
+        self.initial: list[Node] = []
+        self.length = 0  # of a counted loop
+        self.index: Node | None = None
+        self.tables: list[tuple[Node, list[Node]]] = []  # what a counted loop goes through: name, entries
+        self.rows: list[tuple[Node, int]] = []  # arrays that it fills: name, which output
+
+
+def _round_even(x: float) -> float:
+    return float(np.rint(x))
+
+
+# op: its value for known operands
+FOLDED: dict[str, Callable] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "max": lambda a, b: a if a >= b else b,
+    "min": lambda a, b: a if a <= b else b,
+    "abs": abs,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b,
+    "ge": lambda a, b: a >= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "and": lambda a, b: a and b,
+    "or": lambda a, b: a or b,
+    "not": lambda a: not a,
+    "sqrt": lambda a: math.sqrt(a) if a >= 0.0 else math.nan,
+    "floor": lambda a: float(np.floor(a)),
+    "ceil": lambda a: float(np.ceil(a)),
+    "rint": _round_even,
+    "sign": lambda a: float((a > 0) - (a < 0)),
+}
+
+
+def kind_of(dtype: Any) -> str:
+    """The kind of C's number for a type of JAX's; raises KeyError where there is none."""
+    dtype = np.dtype(dtype)
+    if dtype.kind == "b":
+        return BOOL
+    if dtype.kind == "f":
+        return REAL
+    return {"int32": "int32_t", "int64": "int64_t", "uint32": "uint32_t", "int16": "int32_t", "int8": "int32_t",
+            "uint8": "int32_t", "uint16": "int32_t"}[dtype.name]  # fmt: skip
+
+
+class Pool:
+    """Makes nodes, in the block that is being filled."""
+
+    def __init__(self) -> None:
+        self.block = Block()
+        self.section: Any = None
+
+    def constant(self, value: Any, kind: str) -> Node:
+        """A number that is known."""
+        value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
+        # 0.0 and -0.0 are equal, but not the same; nan is not equal to itself
+        key = ("constant", kind, math.copysign(1.0, value) if value == 0 else 0, "nan" if value != value else value)
+        return self.block.find(key) or self._put(key, Node("constant", (), kind, value, self._outermost()))
+
+    def place(self, name: str, kind: str) -> Node:
+        """What C reads by this name."""
+        key = ("place", name)
+        return self.block.find(key) or self._put(key, Node("place", (), kind, name, self._outermost()))
+
+    def fresh(self, kind: str, what: str = "variable") -> Node:
+        """A variable that a loop or a branch sets."""
+        node = Node(what, (), kind, None, self.block)
+        node.section = self.section
+        return node
+
+    def _outermost(self) -> Block:
+        block = self.block
+        while block.outer is not None:
+            block = block.outer
+        return block
+
+    def _put(self, key: Any, node: Node) -> Node:
+        node.block.known[key] = node
+        return node
+
+    def make(self, op: str, *args: Node, kind: str = REAL, value: Any = None) -> Node:
+        """A node of this operation; the same one for the same operands."""
+        simple = self._simplified(op, args, kind)
+        if simple is not None:
+            return simple
+        ordered = tuple(sorted(args, key=id)) if op in ("add", "mul", "and", "or", "eq", "ne") else args
+        key = (op, kind, value, *map(id, ordered))
+        found = self.block.find(key)
+        if found is not None:
+            return found
+        node = Node(op, args, kind, value, self.block)
+        node.section = self.section
+        self.block.nodes.append(node)
+        return self._put(key, node)
+
+    def _simplified(self, op: str, args: Sequence[Node], kind: str) -> Node | None:
+        known = [a.op == "constant" for a in args]
+        if all(known) and op in FOLDED:
+            value = FOLDED[op](*(a.value for a in args))
+            if kind != REAL or math.isfinite(value):
+                return self.constant(value, kind)
+        if op == "select":
+            test, yes, no = args
+            if known[0]:
+                return yes if test.value else no
+            return yes if yes is no else None
+        if not any(known) and not (op == "sub" and args[0] is args[1]):
+            return args[0].args[0] if op in ("neg", "not") and args[0].op == op else None
+        if op in ("add", "sub", "mul", "div") and len(args) == 2:
+            return self._arithmetic(op, args[0], args[1], kind)
+        if op in ("and", "or"):
+            fixed, other = (args[0], args[1]) if known[0] else (args[1], args[0])
+            return other if fixed.value == (op == "and") else fixed
+        return None
+
+    def _arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
+        def holds(node: Node, value: int) -> bool:
+            return node.op == "constant" and node.value == value
+
+        if op == "add" and (holds(a, 0) or holds(b, 0)):
+            return b if holds(a, 0) else a
+        if op == "sub":
+            if holds(b, 0):
+                return a
+            if holds(a, 0):
+                return self.make("neg", b, kind=kind)
+        if op == "mul":
+            half, other = (a, b) if a.op == "constant" else (b, a)
+            if half.value == 0.5 and half.op == "constant" and other.op == "add" and other.args[0] is other.args[1]:
+                return other.args[0]  # exact
+            if holds(a, 0) or holds(b, 0):
+                return self.constant(0, kind)
+            if holds(a, 1) or holds(b, 1):
+                return b if holds(a, 1) else a
+            if holds(a, -1) or holds(b, -1):
+                return self.make("neg", b if holds(a, -1) else a, kind=kind)
+        if op == "div":
+            if holds(b, 1):
+                return a
+            if holds(a, 0) and kind == REAL:
+                return self.constant(0, kind)
+        return None

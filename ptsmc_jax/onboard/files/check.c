@@ -1,0 +1,108 @@
+/* check.c: replays vectors.csv through ptsmc_step and compares every output, state and status.
+ *
+ * A row is trial, sample, status, inputs, outputs, state after the sample; sample -1 is the state before the first one.
+ * A number is compared relative to the largest one of its column in the file. Exit status 0: all agree.
+ */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "ptsmc_@name@_flat.h"
+
+enum {
+    HEAD = 3,
+    CHECKED = PTSMC_OUT_SIZE + PTSMC_STATE_SIZE,
+    COLUMNS = HEAD + PTSMC_IN_SIZE + CHECKED,
+    LINE = 32 * COLUMNS + 2
+};
+
+static const char *const names[CHECKED] = {
+@listed@
+};
+
+/* A row of numbers; 0 at the end of the file, -1 where it is no row. */
+static int row(FILE *file, double *v)
+{
+    static char line[LINE];
+    char *at = line;
+
+    if (fgets(line, LINE, file) == NULL) {
+        return 0;
+    }
+    for (int k = 0; k < COLUMNS; k++) {
+        char *end = at;
+        v[k] = strtod(at, &end);
+        if (end == at || (*end != ',' && k + 1 < COLUMNS)) {
+            return -1;
+        }
+        at = end + 1;
+    }
+    return 1;
+}
+
+static int skip_heading(FILE *file)
+{
+    int c = 0;
+    do {
+        c = fgetc(file);
+    } while (c != '\n' && c != EOF);
+    return c == EOF;
+}
+
+int main(int count, char **given)
+{
+    const int single = sizeof(ptsmc_real) == 4;
+    const double tolerance = count > 2 ? strtod(given[2], NULL) : (single ? 1e-3 : 1e-12);
+    static double v[COLUMNS], largest[CHECKED], off[CHECKED], found[CHECKED];
+    FILE *const file = fopen(count > 1 ? given[1] : "vectors.csv", "r");
+    ptsmc_state state;
+    ptsmc_in in;
+    ptsmc_out out;
+    long rows = 0, statuses = 0;
+    int worst = 0, read = 0;
+
+    if (file == NULL || skip_heading(file)) {
+        fprintf(stderr, "check: there is no vectors.csv\n");
+        return 2;
+    }
+    while ((read = row(file, v)) == 1) {
+        for (int k = 0; k < CHECKED; k++) {
+            largest[k] = fmax(largest[k], fabs(v[HEAD + PTSMC_IN_SIZE + k]));
+        }
+    }
+    rewind(file);
+    ptsmc_init(&ptsmc_parameters, &state);
+    if (read < 0 || skip_heading(file)) {
+        fprintf(stderr, "check: vectors.csv has other columns\n");
+        fclose(file);
+        return 2;
+    }
+    while (row(file, v) == 1) {
+        int status = 0;
+        if (v[1] < 0.0) {
+            ptsmc_init(&ptsmc_parameters, &state);
+            state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
+            continue;
+        }
+        in_from(v + HEAD, &in);
+        status = ptsmc_step(&ptsmc_parameters, &state, &in, &out);
+        out_to(&out, found);
+        state_to(&state, found + PTSMC_OUT_SIZE);
+        statuses += status != (int)v[2];
+        for (int k = 0; k < CHECKED; k++) {
+            const double error = fabs(found[k] - v[HEAD + PTSMC_IN_SIZE + k]) / (largest[k] > 0.0 ? largest[k] : 1.0);
+            if (!(error <= off[k])) {
+                off[k] = error;
+            }
+        }
+        rows++;
+    }
+    fclose(file);
+    for (int k = 1; k < CHECKED; k++) {
+        worst = off[k] > off[worst] || off[k] != off[k] ? k : worst;
+    }
+    printf("%ld samples; other status: %ld; largest difference %.2e of %s, allowed %.0e\n", rows, statuses, off[worst],
+           names[worst], tolerance);
+    return rows > 0 && statuses == 0 && off[worst] <= tolerance ? 0 : 1;
+}

@@ -1,0 +1,130 @@
+"""A controller's folder: C, vectors, what checks them, and what it all is."""
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.onboard import templates, vectors
+from ptsmc_jax.onboard.board import Board, board
+from ptsmc_jax.onboard.generate import Code, generate
+from ptsmc_jax.onboard.readme import readme
+from ptsmc_jax.onboard.templates import About
+from ptsmc_jax.onboard.translate import NoRuleError
+from ptsmc_jax.scenario import own, parsing
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.flyable import Study
+from ptsmc_jax.scenario.tables import Scenario
+
+MOST_TRIALS = 100  # in vectors.csv
+
+
+class Controller:
+    """The flight computer of a scenario, in C."""
+
+    def __init__(self, scenario: Scenario, name: str, source: str):
+        """Traces and writes it; raises ScenarioError where it cannot be."""
+        self.scenario = flown(scenario)
+        self.ready: Study = scenarios.study(self.scenario)
+        self.board: Board = board(self.ready.parts)
+        try:
+            self.code: Code = generate(self.board)
+        except NoRuleError as error:
+            raise ScenarioError(str(error)) from None
+        law, device = self.ready.parts.controller, self.ready.parts.actuators
+        self.about = About(
+            name, source, digest(self.scenario), type(law).__name__, self.board.parameters["filter"] is not None,
+            self.board.spacecraft, device is not None and device.wheels is not None,
+            0 if device is None else device.delay,
+        )  # fmt: skip
+
+
+def flown(scenario: Scenario) -> Scenario:
+    """The scenario as a flight computer has it, on the flight clock; raises ScenarioError of a continuous loop."""
+    if scenario.loop.mode != "sampled":
+        raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
+    return scenarios.replace(scenario, loop__clock="flight")
+
+
+def digest(scenario: Scenario) -> str:
+    """SHA-256 of a scenario's tables, every default filled in, and of the files that it names."""
+    said = json.dumps([parsing.dump(scenario), own.digests(scenario)], sort_keys=True, default=str)
+    return hashlib.sha256(said.encode()).hexdigest()
+
+
+def identifier(text: str) -> str:
+    """A name that C takes."""
+    plain = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_").lower()
+    return plain if plain and not plain[0].isdigit() else f"c_{plain}".rstrip("_")
+
+
+def table(made: Controller, seed: int, trials: int) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of vectors.csv: of so many usable trials."""
+    lists = templates.columns(made.code)
+    header = ["trial", "sample", "status", *(f"{kind}.{name}" for kind, names in lists.items() for name in names)]
+    dispersion = vectors.known_alike(made.ready.dispersion)
+    rows: list[list[Any]] = []
+    numbers = np.arange(trials, dtype=np.uint32)
+    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
+    for k in numbers:
+        samples = vectors.one(flown, int(k))
+        if not vectors.usable(samples):
+            continue
+        given, out, state = vectors.rows(made.board, samples)
+        nothing = [0.0] * (given.shape[1] + out.shape[1])
+        rows.append([int(k), -1, 0, *nothing, *vectors.first_state(made.board, samples).tolist()])
+        together = np.column_stack([given, out, state]).tolist()
+        rows += [
+            [int(k), n, int(cut), *row] for n, (cut, row) in enumerate(zip(samples.limited, together, strict=True))
+        ]
+    if not rows:
+        raise ScenarioError(
+            f"none of the first {trials} trials keeps away from the law's singularity: nothing to check by"
+        )
+    return header, rows
+
+
+def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
+    """Fills a folder that is there."""
+    code, about = made.code, made.about
+    header, rows = table(made, seed, trials)
+    texts = {
+        f"ptsmc_{about.name}.h": templates.header(code, about),
+        f"ptsmc_{about.name}.c": templates.source(code, about),
+        f"ptsmc_{about.name}_parameters.c": templates.values(code, about),
+        f"ptsmc_{about.name}_flat.h": templates.flat(code, about),
+        "check.c": templates.check(code, about),
+        "Makefile": templates.makefile(about),
+        "README.md": readme(code, about),
+    }
+    for name, text in texts.items():
+        store.write_text(folder / name, text)
+    store.write_csv(folder / "vectors.csv", header, rows)
+    store.write_toml(folder / "scenario.toml", parsing.dump(made.scenario))
+    store.write_json(folder / "versions.json", store.versions("export", seed, **own.digests(made.scenario)))
+    layout = {"name": about.name, "digest": about.digest, "columns": templates.columns(code)}
+    store.write_json(folder / "controller.json", layout)
+
+
+def export(
+    what: Scenario | str | Path, folder: str | Path, *, name: str | None = None, trials: int = 3, seed: int = 0,
+    force: bool = False,
+) -> Path:  # fmt: skip
+    """Writes a scenario's flight computer as C99 into a folder, with vectors of so many trials that check it.
+
+    name: of its files, by default the scenario's file. Raises ScenarioError where it cannot be written in C, or its
+    loop is continuous; RefusedError where the folder holds something and force is not said.
+    """
+    path = Path(folder)
+    store.check(path, force)
+    known = what if isinstance(what, Scenario) else scenarios.read(what)
+    source = "a scenario" if isinstance(what, Scenario) else Path(what).name
+    made = Controller(known, identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem)), source)
+    store.write(path, lambda making: write(making, made, seed, trials))
+    return path

@@ -1,0 +1,202 @@
+"""The C functions and structs of a flight computer."""
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.laws.base import Law
+from ptsmc_jax.laws.error_motions import ErrorMotion
+from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.onboard import fields, origins, printing
+from ptsmc_jax.onboard.board import SCALARS, Board, Stage
+from ptsmc_jax.onboard.expressions import Node, Pool, Title
+from ptsmc_jax.onboard.fields import Field, Struct
+from ptsmc_jax.onboard.translate import Translator
+
+POINTERS = {"p": "const ptsmc_params *p", "in": "const ptsmc_in *in", "before": "const ptsmc_state *before",
+            "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
+ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
+COMMON = (object, Law, ErrorMotion, Observer)  # what of a part's classes says nothing about it
+
+
+@dataclass
+class Code:
+    """The C of a flight computer."""
+
+    parameters: list[Field]
+    values: dict[str, np.ndarray]  # of the parameters
+    inputs: list[Field]
+    state: list[Field]
+    outputs: list[Field]
+    functions: list[str] = field(default_factory=list)  # their text
+    calls: dict[str, str] = field(default_factory=dict)  # by stage
+    about: dict[str, str] = field(default_factory=dict)  # what each stage does, of those of a sample
+    counts: dict[str, int] = field(default_factory=dict)  # operations of a step at most
+    variables: int = 0  # at most, of all functions together
+
+
+def generate(board: Board) -> Code:
+    """The C of a flight computer; raises NoRuleError where something in it has no rule."""
+    leaves, names, values = _parameters(board)
+    structs = {"in": Struct("in"), "before": Struct("before"), "out": Struct("out")}
+    trees: dict[str, Any] = {}
+    for prefix, shapes in (("in", board.inputs), ("before", board.state), ("out", board.outputs)):
+        for name, shape in shapes.items():
+            plain = isinstance(shape, jax.ShapeDtypeStruct)
+            trees[f"{prefix}.{name}"] = structs[prefix].add(name, shape, board.about.get(name, "") if plain else "")
+    used: set[str] = {"period"}
+    code = Code([], {}, list(structs["in"].fields.values()), list(structs["before"].fields.values()),
+                list(structs["out"].fields.values()))  # fmt: skip
+    for stage in board.stages:
+        _function(code, board, stage, structs, trees, (leaves, names), used)
+    wanted = [f for f in values if f[0].name in used]
+    code.parameters = [made for made, _ in wanted]
+    code.values = {made.name: value for made, value in wanted}
+    return code
+
+
+def _parameters(board: Board) -> tuple[list[Any], list[Field], list[tuple[Field, np.ndarray]]]:
+    """Leaves of the parameters, for each its field, and the fields with their values; what is shared is one field."""
+    found: dict[int, Field] = {}
+    taken: set[str] = set()
+    leaves, of_leaf, values = [], [], []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(board.parameters)[0]:
+        leaves.append(leaf)
+        if id(leaf) not in found:
+            parts, meaning = fields.spoken(path, board.parameters)
+            short = parts[parts.index("model") + 1 :] if "model" in parts[:-1] else parts
+            name = "_".join(short).lower()
+            name = name if name not in taken else "_".join(parts).lower()
+            while name in taken:
+                name += "_"
+            taken.add(name)
+            array = np.asarray(leaf)
+            made = Field(name, array.shape, fields.kind_of(array.dtype), meaning or board.about.get(parts[0], ""))
+            found[id(leaf)] = made
+            values.append((made, array))
+        of_leaf.append(found[id(leaf)])
+    return leaves, of_leaf, values
+
+
+def _function(
+    code: Code, board: Board, stage: Stage, structs: dict[str, Struct], trees: dict[str, Any],
+    parameters: tuple[list[Any], list[Field]], used: set[str],
+) -> None:  # fmt: skip
+    pool = Pool()
+    leaves, of_leaf = parameters
+    read = [_shape_of(board, name) for name in stage.reads]
+    tree = jax.tree.structure(board.parameters)
+
+    def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
+        return stage.run(jax.tree.unflatten(tree, leaves), *read)
+
+    closed, shape = jax.make_jaxpr(run, return_shape=True)(leaves, read)
+    places: dict[str, str] = {}  # of what C reads: the pointer or argument
+    args = []
+    for made in of_leaf:
+        args.append(_array(pool, "p->", made, places, "p"))
+    for name in stage.reads:
+        prefix, _, key = name.partition(".")
+        if name in SCALARS:
+            kind = "int32_t" if name in ("regular", "tracking") else "real"
+            node = pool.place(name, kind)
+            places[name] = name
+            args.append(np.array(node, dtype=object).reshape(()))
+            continue
+        text = {"in": "in->", "before": "before->", "last": "before->last.", "now": "now->", "out": "out->"}[prefix]
+        struct = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}[prefix]
+        pointer = "before" if prefix == "last" else prefix
+        for leaf in jax.tree.leaves(trees[f"{struct}.{key}"]):
+            args.append(_array(pool, text, structs[struct].fields[leaf], places, pointer))
+    results = Translator(pool).evaluate(closed, args)
+    outputs: list[tuple[str, Node]] = []
+    writes: set[str] = set()
+    returned: Node | None = None
+    for (name, part), result in zip(_named(shape), results, strict=True):
+        prefix, _, key = name.partition(".")
+        if name == "limited":
+            returned = result.item()
+            continue
+        struct = "before" if prefix == "now" else "out"
+        made = structs[struct].fields[jax.tree.leaves(trees[f"{struct}.{key}"])[part]]
+        writes.add(prefix)
+        flat, title = result.reshape(-1), Title(made.name)
+        for index, node in np.ndenumerate(result):
+            if node.op == "variable" and node.title is None:
+                node.title, node.part = title, "".join(str(i + 1) for i in index)
+        outputs += [(f"{prefix}->{element}", node) for element, node in zip(made.elements(), flat, strict=True)]
+    printer = printing.Printer(ARGUMENTS)
+    ends = [*outputs, *([("return", returned)] if returned is not None else [])]
+    body = printer.body(pool.block, ends)
+    needed = {places[node.value] for node in printer.nodes.values() if node.op == "place"} | writes
+    for made in of_leaf:
+        if any(node.op == "place" and node.value.startswith(f"p->{made.name}") and
+               node.value[3 + len(made.name) :][:1] in ("", "[") for node in printer.nodes.values()):  # fmt: skip
+            used.add(made.name)
+    signature = [POINTERS[name] for name in POINTERS if name in needed]
+    signature += [ARGUMENTS[name] for name in ARGUMENTS if name in needed]
+    passed = [{"p": "p", "in": "in", "before": "state", "now": "&now", "out": "&found"}.get(name, name)
+              for name in (*POINTERS, *ARGUMENTS) if name in needed]  # fmt: skip
+    body = [line.replace("return = ", "return ") for line in body]
+    kind = "int" if returned is not None else "void"
+    head = printing.wrapped(f"static {kind} {stage.name}({', '.join(signature)})", "")
+    code.functions.append("\n".join([*_documents(stage), *head, "{", *_shortened(body), "}"]))
+    if stage.name != "begin":
+        code.about[stage.name] = stage.about
+    code.calls[stage.name] = f"{stage.name}({', '.join(passed)})"
+    for op, count in printer.counts.items():
+        code.counts[op] = code.counts.get(op, 0) + count
+    code.variables = max(code.variables, len(printer.names))
+
+
+def _shortened(body: list[str]) -> list[str]:
+    """Lines in which an array of a struct that is read often has a name of its own."""
+    text = "\n".join(body)
+    reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\] =(?!=))", text))
+    found, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
+    for place, count in sorted(reads.items(), key=lambda item: (item[0].startswith("before"), item[0])):
+        name = re.split(r"->|\.", place)[-1]
+        name = f"{name}_before" if place.startswith("before") else name
+        name = f"{name}_now" if name in taken else name
+        if count >= 4 and name not in taken:
+            taken.add(name)
+            found[place] = name
+    for place, name in found.items():
+        body = [re.sub(rf"(?<![\w>]){re.escape(place)}\[(?!\d+\] =(?!=))", f"{name}[", line) for line in body]
+    heads = [f"    const real *const {name} = {place};" for place, name in sorted(found.items())]
+    return [*heads, *body]
+
+
+def _shape_of(board: Board, name: str) -> Any:
+    prefix, _, key = name.partition(".")
+    if name in SCALARS:
+        return jax.ShapeDtypeStruct((), jnp.int32 if name in ("regular", "tracking") else jnp.result_type(float))
+    return {"in": board.inputs, "before": board.state, "now": board.state, "last": board.outputs,
+            "out": board.outputs}[prefix][key]  # fmt: skip
+
+
+def _array(pool: Pool, text: str, made: Field, places: dict[str, str], pointer: str) -> np.ndarray:
+    array = np.empty(made.shape, dtype=object)
+    for index in np.ndindex(*made.shape):
+        place = f"{text}{made.element(index)}"
+        places[place] = pointer
+        array[index] = pool.place(place, made.kind)
+    return array
+
+
+def _named(shape: dict[str, Any]) -> list[tuple[str, int]]:
+    """For each leaf of what a stage gives, in JAX's order: the name of its tree, and which leaf of it it is."""
+    return [(name, k) for name in sorted(shape) for k in range(len(jax.tree.leaves(shape[name])))]
+
+
+def _documents(stage: Stage) -> list[str]:
+    said = [stage.about]
+    for part in stage.parts:
+        for name, text in origins.documents(part, COMMON):
+            said += [" ".join(one.split()) for one in f"{name}: {text}".split("\n\n")]
+    return printing.comment("\n".join(said))

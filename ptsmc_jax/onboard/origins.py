@@ -1,0 +1,176 @@
+"""Where in the source a traced equation stands: the function that it is in, and the name that its value has there."""
+
+import ast
+import functools
+import inspect
+import re
+import textwrap
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+JAX = Path(jax.__file__).parent
+FOREIGN = ("jaxtyping", "beartype", "<")  # between the caller and the called, and none of either
+LIBRARY = Path(__file__).parents[1]
+HELPERS = ("numerics/", "onboard/")  # files whose functions are no sections of their own
+
+
+class Section(NamedTuple):
+    """A function of the source."""
+
+    name: str
+    place: str  # its file, as a reader finds it
+    about: str  # the first sentence of its docstring
+
+
+class Frame(NamedTuple):
+    """A call that is going on."""
+
+    file: str
+    name: str
+    span: tuple[int, int, int, int]  # of the expression: first line and column, last line and column
+
+
+def frames(eqn: Any) -> list[Frame]:
+    """The calls that led to an equation, the innermost first, without JAX's own."""
+    trace = eqn.source_info.traceback
+    codes, at = ((), ()) if trace is None else trace.raw_frames()
+    found = []
+    for code, where in zip(codes, at, strict=True):
+        file = code.co_filename
+        if not Path(file).is_relative_to(JAX) and not any(part in file for part in FOREIGN):
+            found.append(Frame(file, code.co_qualname, _spans(code)[where // 2]))
+    return found
+
+
+@functools.cache
+def _spans(code: Any) -> list[tuple[int, int, int, int]]:
+    return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
+
+
+def line(found: list[Frame]) -> str:
+    """File and line as an error says them, the user's own where they are; empty where nothing is known."""
+    own = [frame for frame in found if not Path(frame.file).is_relative_to(LIBRARY)]
+    inside = own if own and found[0] in own else found  # who calls the library is not who is to blame
+    return f"{inside[0].file}:{inside[0].span[0]}" if inside else ""
+
+
+def section(found: list[Frame]) -> Section | None:
+    """The function that an equation belongs to: the innermost one that is more than a helper."""
+    for frame in found:
+        path = Path(frame.file)
+        inside = path.is_relative_to(LIBRARY)
+        place = path.relative_to(LIBRARY.parent).as_posix() if inside else path.name
+        if inside and path.relative_to(LIBRARY).as_posix().startswith(HELPERS):
+            continue
+        if not _name(frame):
+            continue
+        return Section(_name(frame), place, _about(frame.file, frame.span[0]))
+    return None
+
+
+def title(found: list[Frame]) -> str:
+    """The name that the value of an equation's expression is given in the source; empty where it has none."""
+    which: int | None = None
+    for frame in found:
+        where = _values(frame.file).get(frame.span)
+        if where is None:
+            return ""
+        kind, names, index = where
+        if kind == "return":
+            which = index if index is not None else which
+            continue
+        if index is not None:
+            return names[index]
+        if len(names) == 1:
+            return names[0]
+        return names[which] if which is not None and which < len(names) else ""
+    return ""
+
+
+@functools.cache
+def _tree(file: str) -> ast.Module | None:
+    try:
+        return ast.parse(Path(file).read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return None
+
+
+@functools.cache
+def _values(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
+    """What happens to the value of an expression: by its position ("assign" or "return", names, which of several)."""
+    found: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
+    tree = _tree(file)
+    for node in ast.walk(tree) if tree is not None else ():
+        if isinstance(node, ast.Call):  # SurfaceGains(c=.., e=..)
+            found |= {_span(word.value): ("assign", (word.arg,), None) for word in node.keywords if word.arg}
+        if isinstance(node, ast.Return) and node.value is not None:
+            kind, names, value = "return", (), node.value
+        elif isinstance(node, ast.Assign) and len(node.targets) == 1:
+            target, value, kind = node.targets[0], node.value, "assign"
+            several = target.elts if isinstance(target, ast.Tuple) else [target]
+            names = tuple(one.id if isinstance(one, ast.Name) else "" for one in several)
+        else:
+            continue
+        if isinstance(value, ast.Tuple):
+            for k, element in enumerate(value.elts):
+                if kind == "return" or len(names) == len(value.elts):
+                    found[_span(element)] = (kind, names, k)
+        else:
+            found[_span(value)] = (kind, names, None)
+    return found
+
+
+def _span(node: Any) -> tuple[int, int, int, int]:
+    return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
+
+
+def _name(frame: Frame) -> str:
+    return re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", frame.name).strip(".")
+
+
+@functools.cache
+def _about(file: str, at: int) -> str:
+    tree, best = _tree(file), None
+    for node in ast.walk(tree) if tree is not None else ():
+        if isinstance(node, ast.FunctionDef) and node.lineno <= at <= (node.end_lineno or 0):
+            best = node if best is None or node.lineno >= best.lineno else best
+    text = None if best is None else ast.get_docstring(best)
+    return "" if not text else " ".join(text.split("\n\n")[0].split())
+
+
+def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
+    """(class, docstring) of a part's class and of those it is derived from, up to the common ones."""
+    found = []
+    for cls in type(part).__mro__:
+        if cls in until or cls.__module__ in ("builtins", "abc", "typing"):
+            continue
+        text = cls.__dict__.get("__doc__")
+        if text and not text.startswith(f"{cls.__name__}(") and text not in [said for _, said in found]:
+            found.append((cls.__name__, inspect.cleandoc(text)))
+    return found
+
+
+@functools.cache
+def comments(cls: type) -> dict[str, str]:
+    """What stands beside each field of a class in the source: meaning and unit."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+        except (OSError, TypeError):
+            continue
+        above: list[str] = []
+        for text in source.splitlines():
+            alone = re.match(r"\s+#\s?(.*)$", text)
+            field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(.*))?$", text)
+            if alone:
+                above.append(alone[1])
+                continue
+            if field and not text.strip().endswith(":"):
+                said = field[2] or " ".join(above)
+                if said:
+                    found[field[1]] = said.strip()
+            above = []
+    return found

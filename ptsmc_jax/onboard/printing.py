@@ -1,0 +1,283 @@
+"""Expressions as the body of a C function: named variables in the order of the source, its functions as sections."""
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
+
+WIDTH = 110  # of a line
+LONGEST = 90  # characters of an expression that is written inside another one
+RESERVED = set(
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p "
+    "out before now y0 y1 yn j0 j1 jn gamma main index div exp log sin cos tan sqrt pow abs larger smaller "
+    "sign_of".split()
+)
+INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13), "rem": ("%", 13), "lt": ("<", 10),
+         "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
+         "or": ("||", 4)}  # fmt: skip
+PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # functions of the file's own, by operation
+ATOMS = ("constant", "place", "variable", "index", "table")
+ATOM, UNARY, CHOICE = 20, 14, 3  # precedences
+
+
+def number(value: Any, kind: str) -> str:
+    """A constant as C has it."""
+    if kind == BOOL:
+        return "1" if value else "0"
+    if kind != REAL:
+        return str(int(value))
+    if value != value:
+        return "R(NAN)"
+    if value in (float("inf"), float("-inf")):
+        return "R(INFINITY)" if value > 0 else "R(-INFINITY)"
+    short = str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(value)
+    return f"R({short})"
+
+
+def declared(kind: str) -> str:
+    """C's type."""
+    return {REAL: "real", BOOL: "int"}.get(kind, kind)
+
+
+class Printer:
+    """The statements of one function."""
+
+    def __init__(self, taken: Iterable[str] = ()):
+        self.names: dict[int, str] = {}  # of nodes
+        self.bases: dict[int, str] = {}  # of titles
+        self.taken = RESERVED | set(taken)
+        self.uses: Counter[int] = Counter()
+        self.nodes: dict[int, Node] = {}
+        self.kept: set[int] = set()
+        self.lengths: dict[int, int] = {}  # of expressions, roughly
+        self.counts: Counter[str] = Counter()
+        self.section: Any = None
+        self.count = 0
+
+    def body(self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ") -> list[str]:
+        """Lines of a block that sets these places."""
+        for _, node in outputs:
+            self._use(node)
+        for node in sorted(self.nodes.values(), key=lambda node: node.serial):
+            self.lengths[id(node)] = 8 if node.op in ATOMS else 3 + sum(self.lengths[id(arg)] for arg in node.args)
+            if self._alone(node):
+                self.kept.add(id(node))
+                self.lengths[id(node)] = 8
+        lines = self._block(block, indent)
+        if outputs and self.section is not None:
+            lines.append("")
+        lines += [line for place, node in outputs for line in wrapped(f"{place} = {self.text(node)};", indent)]
+        return lines
+
+    # which nodes are needed, and which have a variable of their own
+
+    def _use(self, node: Node, times: int = 1) -> None:
+        first = id(node) not in self.nodes
+        self.uses[id(node)] += times
+        self.nodes[id(node)] = node
+        if not first:
+            return
+        for arg in node.args:
+            self._use(arg)
+        if node.op == "region":
+            self._use_region(node.value)
+
+    def _use_region(self, region: Region) -> None:
+        again = 1 if region.kind == "branch" else 2  # what a loop computes with is computed before it
+        if region.test is not None:
+            self._use(region.test)
+        for node in (*region.initial, *(entry for _, entries in region.tables for entry in entries)):
+            self._use(node)
+        for outputs in region.outputs:
+            for node in outputs:
+                self._use(node)
+        if again > 1:
+            inside = {id(block) for block in region.blocks}
+            for node in list(self.nodes.values()):
+                for arg in node.args:
+                    if id(node.block) in inside and id(arg.block) not in inside:
+                        self.uses[id(arg)] += 1
+
+    def _alone(self, node: Node) -> bool:
+        if node.op in ATOMS or node.op == "region":
+            return False
+        return node.title is not None or self.uses[id(node)] > 1 or self.lengths[id(node)] > LONGEST
+
+    # statements
+
+    def _block(self, block: Block, indent: str) -> list[str]:
+        lines: list[str] = []
+        for node in block.nodes:
+            if id(node) not in self.nodes:
+                continue
+            if node.op == "region":
+                lines += self._heading(node, indent)
+                lines += self._region(node.value, indent)
+            elif id(node) in self.kept:
+                lines += self._heading(node, indent)
+                text = self.text(node, inside=True)
+                lines += wrapped(f"const {declared(node.kind)} {self._name(node)} = {text};", indent)
+        return lines
+
+    def _heading(self, node: Node, indent: str) -> list[str]:
+        section = node.section
+        if section is None or section == self.section:
+            return []
+        self.section = section
+        said = f"{section.name}, {section.place}" + (f": {section.about}" if section.about else "")
+        return ["", *comment(said, indent)]
+
+    def _region(self, region: Region, indent: str) -> list[str]:
+        live = [id(node) in self.nodes for node in region.results]
+        if region.kind == "branch":
+            return self._branch(region, indent, live)
+        return self._loop(region, indent)
+
+    def _branch(self, region: Region, indent: str, live: list[bool]) -> list[str]:
+        results = [node for node, on in zip(region.results, live, strict=True) if on]
+        lines = [f"{indent}{declared(node.kind)} {self._name(node)};" for node in results]
+        assert region.test is not None
+        lines += wrapped(f"if ({self.text(region.test)}) {{", indent)
+        for k, (block, outputs) in enumerate(zip(region.blocks, region.outputs, strict=True)):
+            if k:
+                lines.append(f"{indent}}} else {{")
+            outer = self.section
+            lines += self._block(block, indent + "    ")
+            for node, output, on in zip(region.results, outputs, live, strict=True):
+                if on:
+                    lines += wrapped(f"{self._name(node)} = {self.text(output)};", indent + "    ")
+            self.section = outer if k == 0 else None
+        return [*lines, f"{indent}}}"]
+
+    def _loop(self, region: Region, indent: str) -> list[str]:
+        inner, lines = indent + "    ", []
+        for node, start, result in zip(region.carried, region.initial, region.results, strict=True):
+            node.title, node.part = result.title, result.part
+            self.names[id(result)] = self._name(node)
+            lines += wrapped(f"{declared(node.kind)} {self._name(node)} = {self.text(start)};", indent)
+        for table, entries in region.tables:
+            listed = ", ".join(self.text(entry) for entry in entries)
+            lines += wrapped(f"const {declared(table.kind)} {self._name(table)}[{len(entries)}] = {{{listed}}};",
+                                   indent)  # fmt: skip
+        for table, _ in region.rows:
+            lines.append(f"{indent}{declared(table.kind)} {self._name(table)}[{region.length}];")
+        if region.kind == "count":
+            assert region.index is not None
+            k = self._name(region.index)
+            lines.append(f"{indent}for (int {k} = 0; {k} < {region.length}; {k}++) {{")
+        else:
+            lines.append(f"{indent}for (;;) {{")
+            lines += self._block(region.blocks[0], inner)
+            lines += wrapped(f"if (!({self.text(region.outputs[0][0])})) {{", inner)
+            lines += [f"{inner}    break;", f"{inner}}}"]
+        lines += self._block(region.blocks[-1], inner)
+        after = []
+        for node, output in zip(region.carried, region.outputs[-1], strict=False):
+            if output is node:
+                continue
+            then = self._fresh(f"{self._name(node)}_next")
+            lines += wrapped(f"const {declared(node.kind)} {then} = {self.text(output)};", inner)
+            after.append(f"{inner}{self._name(node)} = {then};")
+        for table, which in region.rows:
+            k = self._name(region.index) if region.index is not None else ""
+            lines += wrapped(f"{self._name(table)}[{k}] = {self.text(region.outputs[-1][which])};", inner)
+        self.section = None
+        return [*lines, *after, f"{indent}}}"]
+
+    # names
+
+    def _name(self, node: Node) -> str:
+        if id(node) not in self.names:
+            if node.title is None:
+                what = {"index": "k", "table": "table"}.get(node.op, "a")
+                self.count += 1
+                self.names[id(node)] = self._fresh(f"{what}{self.count}")
+            else:
+                base = self._base(node)
+                self.names[id(node)] = self._fresh(f"{base}_{node.part}" if node.part else base, used=base)
+        return self.names[id(node)]
+
+    def _base(self, node: Node) -> str:
+        assert node.title is not None
+        if id(node.title) not in self.bases:
+            plain = re.sub(r"\W", "_", node.title.name).strip("_") or "x"
+            plain = f"{plain}_" if plain in RESERVED or plain[0].isdigit() else plain
+            self.bases[id(node.title)] = self._fresh(plain)
+        return self.bases[id(node.title)]
+
+    def _fresh(self, name: str, used: str = "") -> str:
+        found, k = name, ord("b")
+        while found in self.taken and found != used:
+            found, k = f"{name}_{chr(k)}" if k <= ord("z") else f"{name}_{k}", k + 1
+        self.taken.add(found)
+        return found
+
+    # expressions
+
+    def text(self, node: Node, inside: bool = False) -> str:
+        """An expression; inside: its own, not the variable that it has."""
+        return self._text(node, inside)[0]
+
+    def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
+        if node.op == "constant":
+            return number(node.value, node.kind), ATOM
+        if node.op == "place":
+            return node.value, ATOM
+        if node.op in ATOMS or (id(node) in self.kept and not inside):
+            return self._name(node), ATOM
+        self.counts[node.op] += 1
+        if node.op == "add" and node.args[1].op == "neg" and id(node.args[1]) not in self.kept:
+            return self._infix("-", 12, node.args[0], node.args[1].args[0])
+        if node.op in INFIX:
+            return self._infix(*INFIX[node.op], *node.args)
+        if node.op in ("neg", "not"):
+            return ("-" if node.op == "neg" else "!") + self._at_least(node.args[0], UNARY + 1), UNARY
+        if node.op == "select":
+            test, yes, no = (self._at_least(arg, CHOICE + 1) for arg in node.args)
+            return f"{test} ? {yes} : {no}", CHOICE
+        if node.op == "convert":
+            return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
+        if node.op == "entry":
+            return f"{self._name(node.args[0])}[{self.text(node.args[1])}]", ATOM
+        listed = ", ".join(self.text(arg) for arg in node.args)
+        if node.op in PLAIN:
+            own = PLAIN[node.op] + ("" if node.kind == REAL else "_whole")
+            return f"{own}({listed})", ATOM
+        if node.op == "abs" and node.kind != REAL:
+            return f"larger_whole({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
+        if node.op == "isfinite":
+            return f"isfinite({listed})", ATOM
+        return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
+
+    def _infix(self, sign: str, level: int, a: Node, b: Node) -> tuple[str, int]:
+        logical = sign in ("&&", "||")  # compilers warn where these are mixed, or comparisons compared
+        mixed = logical and a.op in ("and", "or") and INFIX[a.op][0] != sign
+        compared = level in (9, 10)
+        left = self._at_least(a, ATOM if mixed else 11 if compared else level)
+        right = self._at_least(b, 11 if compared else level + 1)
+        return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", level
+
+    def _at_least(self, node: Node, level: int) -> str:
+        text, own = self._text(node)
+        return text if own >= level else f"({text})"
+
+
+def wrapped(text: str, indent: str) -> list[str]:
+    """A statement on as many lines as it takes."""
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "    ",
+                         break_long_words=False, break_on_hyphens=False)  # fmt: skip
+
+
+def comment(text: str, indent: str = "") -> list[str]:
+    """A comment of C, a paragraph a line of the text, wrapped."""
+    safe = text.replace("*/", "* /").replace("/*", "/ *")
+    lines = [line for paragraph in safe.splitlines()
+             for line in textwrap.wrap(paragraph, WIDTH - len(indent) - 6, break_long_words=False,
+                                       break_on_hyphens=False)]  # fmt: skip
+    if len(lines) == 1:
+        return [f"{indent}/* {lines[0]} */"]
+    return [f"{indent}/* {lines[0]}", *(f"{indent} * {line}" for line in lines[1:]), f"{indent} */"]

@@ -1,0 +1,125 @@
+"""What each elementwise primitive is in C."""
+
+from collections.abc import Callable
+from typing import Any
+
+from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
+
+# functions of `numerics.elementary` that are written out for XLA: C has them
+KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
+
+
+def power(pool: Pool, x: Node, exponent: int) -> Node:
+    """x^exponent by squaring, as XLA does it."""
+    left, found, square = abs(exponent), None, x
+    while left:
+        if left & 1:
+            found = square if found is None else pool.make("mul", found, square)
+        left >>= 1
+        if left:
+            square = pool.make("mul", square, square)
+    one = pool.constant(1.0, REAL)
+    found = one if found is None else found
+    return pool.make("div", one, found) if exponent < 0 else found
+
+
+def convert(pool: Pool, kind: str, x: Node) -> Node:
+    """A number of another kind."""
+    if x.kind == kind:
+        return x
+    if x.op == "constant":
+        return pool.constant(x.value, kind)
+    if kind == BOOL:
+        return pool.make("ne", x, pool.constant(0, x.kind), kind=BOOL)
+    if x.kind == BOOL:
+        return pool.make("select", x, pool.constant(1, kind), pool.constant(0, kind), kind=kind) if kind == REAL \
+            else pool.make("convert", x, kind=kind)  # fmt: skip
+    return pool.make("convert", x, kind=kind)
+
+
+def _plain(op: str) -> Callable:
+    return lambda pool, params, kind, *x: pool.make(op, *x, kind=kind)
+
+
+def _logical(op: str) -> Callable:
+    def rule(pool: Pool, params: Any, kind: str, *x: Node) -> Node:
+        if kind != BOOL:
+            raise KeyError(op)  # bits of whole numbers
+        return pool.make(op, *x, kind=BOOL)
+
+    return rule
+
+
+def _xor(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
+    if kind != BOOL:
+        raise KeyError("xor")
+    return pool.make("ne", a, b, kind=BOOL)
+
+
+def _select(pool: Pool, params: Any, kind: str, which: Node, *cases: Node) -> Node:
+    if which.kind == BOOL:
+        no, yes = cases
+        return pool.make("select", which, yes, no, kind=kind)
+    chosen = cases[-1]
+    for k in range(len(cases) - 2, -1, -1):
+        test = pool.make("le", which, pool.constant(k, which.kind), kind=BOOL)
+        chosen = pool.make("select", test, cases[k], chosen, kind=kind)
+    return chosen
+
+
+def _clamp(pool: Pool, params: Any, kind: str, low: Node, x: Node, high: Node) -> Node:
+    return pool.make("min", pool.make("max", x, low, kind=kind), high, kind=kind)
+
+
+def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    even = "EVEN" in str(params["rounding_method"]) or int(params["rounding_method"]) == 1
+    return pool.make("rint" if even else "round", x)
+
+
+def _rem(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
+    return pool.make("fmod" if kind == REAL else "rem", a, b, kind=kind)
+
+
+def _logistic(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    one = pool.constant(1.0, REAL)
+    return pool.make("div", one, pool.make("add", one, pool.make("exp", pool.make("neg", x))))
+
+
+def _rsqrt(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    return pool.make("div", pool.constant(1.0, REAL), pool.make("sqrt", x))
+
+
+def _square(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    return pool.make("mul", x, x, kind=kind)
+
+
+def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    if kind != REAL:
+        raise KeyError("integer_pow")
+    return power(pool, x, params["y"])
+
+
+def _pow(pool: Pool, params: Any, kind: str, x: Node, y: Node) -> Node:
+    return pool.make("pow", x, convert(pool, REAL, y))
+
+
+def _same(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    return x
+
+
+ELEMENTWISE: dict[str, Callable] = {
+    **{op: _plain(op) for op in ("add", "sub", "mul", "div", "neg", "max", "min", "abs", "sign", "atan2")},
+    **{op: _plain(op) for op in ("lt", "le", "gt", "ge", "eq", "ne")},
+    **{op: _plain(op) for op in "sqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan sinh cosh tanh asinh "
+       "acosh atanh erf erfc floor ceil".split()},
+    **{f"{op}_to": _plain(op) for op in ("lt", "le", "eq")},
+    "lgamma": _plain("lgamma"),
+    "nextafter": _plain("nextafter"),
+    "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),
+    "and": _logical("and"), "or": _logical("or"), "not": _logical("not"), "xor": _xor,
+    "add_any": _plain("add"), "pow": _pow, "integer_pow": _integer_pow, "square": _square, "rsqrt": _rsqrt,
+    "select_n": _select, "clamp": _clamp, "round": _round, "rem": _rem, "logistic": _logistic,
+    "convert_element_type": lambda pool, params, kind, x: convert(pool, kind, x),
+    "stop_gradient": _same, "copy": _same, "copy_p": _same, "reduce_precision": _same, "optimization_barrier": _same,
+    "pvary": _same,
+}  # fmt: skip

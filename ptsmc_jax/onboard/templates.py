@@ -1,0 +1,320 @@
+"""The text around the generated functions: header, parameters, step, the program that checks it, Makefile."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ptsmc_jax.onboard.expressions import REAL
+from ptsmc_jax.onboard.fields import Field
+from ptsmc_jax.onboard.generate import Code
+from ptsmc_jax.onboard.printing import comment, declared, number
+
+STATUS = {
+    "OK": "done",
+    "SATURATED": "done; a limit of the actuators cuts the command",
+    "MISSED": "done; the last sample is not one period ago, so the observer has left this one out",
+    "SINGULAR": "the law is next to its singularity: its last good command",
+    "INPUT": "not finite, no rotation, too fast, or no later than the last one: the last good command; nothing is kept",
+    "OVERFLOW": "a result is not finite: the last good command; nothing is kept",
+}
+
+
+class About(NamedTuple):
+    """What the files say of where they come from."""
+
+    name: str  # a C identifier
+    scenario: str  # its file
+    digest: str
+    law: str
+    filtered: bool
+    spacecraft: bool
+    wheels: bool
+    delay: int
+
+
+def filled(file: str, **values: str) -> str:
+    """A file of `files` with these values in place of @name@."""
+    text = (Path(__file__).parent / "files" / file).read_text(encoding="utf-8")
+    for name, value in values.items():
+        text = text.replace(f"@{name}@", value)
+    return text
+
+
+def member(made: Field) -> list[str]:
+    """A line of a struct, with what the field is."""
+    size = "".join(f"[{n}]" for n in made.shape)
+    text = f"    {declared(made.kind).replace('real', 'ptsmc_real')} {made.name}{size};"
+    about = " ".join(made.about.split()).replace("*/", "* /")
+    if not about:
+        return [text]
+    line = f"{text} /* {about} */"
+    return [line] if len(line) <= 110 else [*comment(about, "    "), text]
+
+
+def struct(name: str, about: str, members: Sequence[Field], first: Sequence[str] = (), last: Sequence[str] = ()) -> str:
+    """A struct of C."""
+    lines = [*comment(about), "typedef struct {", *first]
+    for made in members:
+        lines += member(made)
+    return "\n".join([*lines, *last, f"}} {name};"])
+
+
+def header(code: Code, about: About) -> str:
+    """ptsmc_NAME.h."""
+    guard = f"PTSMC_{about.name.upper()}_H"
+    listed = []
+    for k, (name, said) in enumerate(STATUS.items()):
+        listed += [*comment(said, "    "), f"    PTSMC_{name} = {k}{',' if k + 1 < len(STATUS) else ''}"]
+    remembered = "What is remembered from sample to sample; ptsmc_init fills it."
+    time = ["    double t; /* of the sample, from the start of the manoeuvre [s]; double, since it is subtracted */"]
+    flags = ["    double t; /* of the last sample [s] */", "    int started; /* 0 until the first sample */",
+             "    int tracking; /* 0: the sign of the attitude and the law's clearance are chosen anew */"]  # fmt: skip
+    if about.filtered:
+        remembered += (
+            " A filter that has run before the manoeuvre: set attitude and bias after that, else it starts from the "
+            "first star tracker sample."
+        )
+    parameters = "Gains, body, devices: numbers that may change without another export. Derived ones: see README.md."
+    return "\n\n".join([
+        "\n".join(comment(f"ptsmc_{about.name}.h: {about.law}, from {about.scenario}.\nMade by ptsmc export; scenario "
+                          f"SHA-256 {about.digest}.")),
+        f"#ifndef {guard}\n#define {guard}",
+        "#include <stdint.h>",
+        "#ifdef __cplusplus\nextern \"C\" {\n#endif",
+        "/* Numbers: double, or float with -DPTSMC_REAL=float. */\n#ifndef PTSMC_REAL\n#define PTSMC_REAL double\n"
+        "#endif\ntypedef PTSMC_REAL ptsmc_real;",
+        f'#define PTSMC_SCENARIO "{about.digest}"',
+        "\n".join(["/* What ptsmc_step returns, the gravest last. */", "enum ptsmc_status {", *listed, "};"]),
+        struct("ptsmc_params", parameters, code.parameters),
+        struct("ptsmc_in", "What is measured at a sample.", code.inputs, time),
+        struct("ptsmc_out", "What comes of it.", code.outputs),
+        struct("ptsmc_state", remembered, code.state, flags, ["    ptsmc_out last; /* good one */"]),
+        "/* The parameters of the scenario. */\nextern const ptsmc_params ptsmc_parameters;",
+        "/* Before the first sample. */\nvoid ptsmc_init(const ptsmc_params *p, ptsmc_state *state);",
+        "\n".join(comment("One sample, once a period: reads in, sets out, which is finite whatever happens, and "
+                          "returns a status. No allocation, no global state."))
+        + "\nint ptsmc_step(const ptsmc_params *p, ptsmc_state *state, const ptsmc_in *in, ptsmc_out *out);",
+        "#ifdef __cplusplus\n}\n#endif\n#endif\n",
+    ])  # fmt: skip
+
+
+def values(code: Code, about: About) -> str:
+    """ptsmc_NAME_parameters.c."""
+    lines = [*comment(f"The parameters of {about.scenario} (SHA-256 {about.digest})."),
+             f'#include "ptsmc_{about.name}.h"', "", "#define R(x) ((ptsmc_real)(x))", "",
+             "const ptsmc_params ptsmc_parameters = {"]  # fmt: skip
+    for made in code.parameters:
+        lines += [f"    {_initial(code.values[made.name], made.kind)}, /* {made.name} */"]
+    lines[-1] = (
+        lines[-1].replace("}, /*", "} /*") if lines[-1].startswith("    {") else lines[-1].replace("), /*", ") /*")
+    )
+    return "\n".join([*lines, "};", ""])
+
+
+def _initial(value: Any, kind: str) -> str:
+    if np.ndim(value) == 0:
+        return number(value.item(), kind)
+    return "{" + ", ".join(_initial(row, kind) for row in value) + "}"
+
+
+def source(code: Code, about: About) -> str:
+    """ptsmc_NAME.c."""
+    head = f"""\
+#include "ptsmc_{about.name}.h"
+
+#include <math.h>
+
+typedef ptsmc_real real;
+
+/* A number, and a function of math.h, of the type in use. */
+#define R(x) ((real)(x))
+#define PTSMC_IS_double 0
+#define PTSMC_IS_float 1
+#define PTSMC_JOIN(a, b) a##b
+#define PTSMC_IS(type) PTSMC_JOIN(PTSMC_IS_, type)
+#if PTSMC_IS(PTSMC_REAL)
+#define M(function) function##f
+#else
+#define M(function) function
+#endif
+"""
+    body = "\n\n".join(code.functions)
+    helpers = [text for name, text in HELPERS.items() if f"{name}(" in body]
+    doc = comment(f"ptsmc_{about.name}.c: {about.law}, from {about.scenario}.\nMade by ptsmc export; scenario SHA-256 "
+                  f"{about.digest}. Headings name the functions of the source that this is traced from, with "
+                  "the equations of Chen, Ju, Wang, Li, The prescribed time sliding mode control for attitude tracking "
+                  "of spacecraft.")  # fmt: skip
+    return "\n".join([*doc, "", head, *helpers, body, "", *_checks(code, about), "", *_step(code, about), ""])
+
+
+HELPERS = {
+    "larger": "static real larger(real a, real b)\n{\n    return a > b ? a : b;\n}\n",
+    "smaller": "static real smaller(real a, real b)\n{\n    return a < b ? a : b;\n}\n",
+    "sign_of": "static real sign_of(real x)\n{\n    return x > R(0) ? R(1) : (x < R(0) ? R(-1) : R(0));\n}\n",
+    "larger_whole": "static int32_t larger_whole(int32_t a, int32_t b)\n{\n    return a > b ? a : b;\n}\n",
+    "smaller_whole": "static int32_t smaller_whole(int32_t a, int32_t b)\n{\n    return a < b ? a : b;\n}\n",
+    "sign_of_whole": "static int32_t sign_of_whole(int32_t x)\n{\n    return (x > 0) - (x < 0);\n}\n",
+}
+
+
+def _finite(made: Field, owner: str) -> str:
+    if not made.shape:
+        return f"isfinite({owner}{made.name})"
+    first = owner + made.name + "[0]" * len(made.shape)
+    return f"finite(&{first}, {made.size})"
+
+
+def _all(terms: Sequence[str], indent: str) -> list[str]:
+    lines = [f"{indent}{term}{' &&' if k + 1 < len(terms) else ';'}" for k, term in enumerate(terms)]
+    return [f"    return {lines[0].strip()}", *lines[1:]]
+
+
+def _checks(code: Code, about: About) -> list[str]:
+    reals = [made for made in code.inputs if made.kind == REAL]
+    lines = ["static int finite(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
+             "        if (!isfinite(v[k])) {", "            return 0;", "        }", "    }", "    return 1;", "}", "",
+             "/* Whether an input can be used. */"]  # fmt: skip
+    parameters = "const ptsmc_params *p, " if about.spacecraft else ""
+    lines += [f"static int usable({parameters}const ptsmc_state *state, const ptsmc_in *in)", "{"]
+    required = [made for made in reals if not (about.filtered and made.name == "attitude")]
+    if about.spacecraft:
+        lines += [
+            "    const real *const q = in->attitude;", "    const real *const w = in->rate;",
+            "    const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];",
+            "    const real turn = (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) * p->period * p->period; /* [rad^2] */",
+            "    const int rotation = isfinite(square) && square > R(0.25) && square < R(4);",
+        ]  # fmt: skip
+        if about.filtered:
+            lines += [
+                "    const real *const known = state->attitude;",
+                "    const int aligned = known[0] * known[0] + known[1] * known[1] + known[2] * known[2] +",
+                "        known[3] * known[3] > R(0.25);",
+                "    const int attitude = in->attitude_valid != 0 ? rotation : aligned;",
+            ]
+        turned = ["attitude" if about.filtered else "rotation", "turn < R(1)"]
+    else:
+        turned = []
+    terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)", *(_finite(made, "in->") for made in required),
+             *turned]  # fmt: skip
+    lines += [*_all(terms, "        "), "}", "", "/* Whether everything that is kept, and goes out, is finite. */",
+              "static int sound(const ptsmc_state *now, const ptsmc_out *out)", "{"]  # fmt: skip
+    kept = [_finite(made, "now->") for made in code.state if made.kind == REAL]
+    return [*lines, *_all([*kept, *(_finite(made, "out->") for made in code.outputs)], "        "), "}"]
+
+
+def _step(code: Code, about: About) -> list[str]:
+    call = code.calls
+    singular = any(made.name == "clearance" for made in code.state)
+    lines = [
+        "void ptsmc_init(const ptsmc_params *p, ptsmc_state *state)", "{",
+        "    static const ptsmc_state none = {0};", "",
+        "    *state = none;", f"    {call['begin'].replace('&now', 'state')};",
+        *([] if "p" in _arguments(call["begin"]) else ["    (void)p;"]), "}", "",
+        "int ptsmc_step(const ptsmc_params *p, ptsmc_state *state, const ptsmc_in *in, ptsmc_out *out)", "{",
+        "    const real t = (real)in->t;",
+        "    const real dt = state->started ? (real)(in->t - state->t) : R(0);",
+        "    const int regular = state->started && M(fabs)(dt - p->period) <= R(0.1) * p->period;",
+        "    const int tracking = state->tracking;",
+        "    int status = state->started && !regular ? PTSMC_MISSED : PTSMC_OK;",
+        "    ptsmc_state now;", "    ptsmc_out found;", "",
+        f"    if (!usable({'p, ' if about.spacecraft else ''}state, in)) {{", "        *out = state->last;",
+        "        return PTSMC_INPUT;", "    }",
+        "    now = *state;", "    found = state->last;", f"    {call['sense']};", f"    {call['observe']};",
+        f"    {call['command']};",
+    ]  # fmt: skip
+    arguments = {name for text in call.values() for name in _arguments(text)}
+    if "tracking" not in arguments:
+        lines.remove("    const int tracking = state->tracking;")
+    if "t" not in arguments:
+        lines.remove("    const real t = (real)in->t;")
+    if "act" in call:
+        lines += [f"    if ({call['act']} && status == PTSMC_OK) {{", "        status = PTSMC_SATURATED;", "    }"]
+    lines += [
+        "    if (!sound(&now, &found)) {",
+        "        *out = state->last;",
+        "        return PTSMC_OVERFLOW;",
+        "    }",
+    ]
+    if singular:
+        lines += ["    now.tracking = now.clearance >= R(0.001);", "    if (!now.tracking) {",
+                  "        status = PTSMC_SINGULAR;", "    }"]  # fmt: skip
+    else:
+        lines += ["    now.tracking = 1;"]
+    return [*lines, "    now.t = in->t;", "    now.started = 1;", "    now.last = found;", "    *state = now;",
+            "    *out = found;", "    return status;", "}"]  # fmt: skip
+
+
+def _arguments(call: str) -> list[str]:
+    return call[call.index("(") + 1 : -1].split(", ")
+
+
+def columns(code: Code) -> dict[str, list[str]]:
+    """The columns of vectors.csv that are inputs, outputs and state, as C has them, in order."""
+
+    def all_of(members: Sequence[Field], owner: str) -> list[str]:
+        return [owner + element for made in members for element in made.elements()]
+
+    return {
+        "in": ["t", *all_of(code.inputs, "")],
+        "out": all_of(code.outputs, ""),
+        "state": ["t", "started", "tracking", *all_of(code.state, ""), *all_of(code.outputs, "last.")],
+    }
+
+
+def flat(code: Code, about: About) -> str:
+    """ptsmc_NAME_flat.h: the structs as rows of doubles, for check.c and for other programs that call it."""
+    kinds = {made.name: made.kind for made in (*code.inputs, *code.state, *code.outputs)}
+    lists = columns(code)
+
+    def kind(column: str) -> str:
+        name = column.removeprefix("last.").partition("[")[0]
+        return {"t": "double", "started": "int", "tracking": "int"}.get(
+            name, declared(kinds.get(name, REAL)).replace("real", "ptsmc_real")
+        )
+
+    lines = [f"/* Structs of ptsmc_{about.name}.h from and to rows of doubles, in the order of vectors.csv. */",
+             f'#include "ptsmc_{about.name}.h"', ""]  # fmt: skip
+    lines += ["enum {", *(f"    PTSMC_{name.upper()}_SIZE = {len(found)}{',' if name != 'state' else ''}"
+                          for name, found in lists.items()), "};", ""]  # fmt: skip
+    for name in ("in", "state"):
+        lines += [f"static void {name}_from(const double *v, ptsmc_{name} *x)", "{"]
+        lines += [f"    x->{column} = ({kind(column)})v[{k}];" for k, column in enumerate(lists[name])] + ["}", ""]
+    for name in ("out", "state"):
+        lines += [f"static void {name}_to(const ptsmc_{name} *x, double *v)", "{"]
+        lines += [f"    v[{k}] = (double)x->{column};" for k, column in enumerate(lists[name])] + ["}", ""]
+    return "\n".join(lines)
+
+
+def makefile(about: About) -> str:
+    """Makefile."""
+    return filled("Makefile", name=about.name)
+
+
+def check(code: Code, about: About) -> str:
+    """check.c."""
+    lists = columns(code)
+    names = [f"{kind}.{column}" for kind in ("out", "state") for column in lists[kind]]
+    listed = ",\n".join(f'    "{name}"' for name in names)
+    return filled("check.c", name=about.name, listed=listed)
+
+
+def operations(code: Code) -> dict[str, int]:
+    """Operations of a step at most, by sort."""
+    count = code.counts
+    sums = sum(count.get(op, 0) for op in ("add", "sub", "neg"))
+    others = {"sums": sums, "products": count.get("mul", 0), "quotients": count.get("div", 0),
+              "roots": count.get("sqrt", 0) + count.get("cbrt", 0)}  # fmt: skip
+    plain = {"add", "sub", "neg", "mul", "div", "sqrt", "cbrt", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not",
+             "select", "max", "min", "abs", "sign", "convert", "entry", "isfinite", "floor", "rint"}  # fmt: skip
+    others["comparisons and choices"] = sum(count.get(op, 0) for op in plain) - sum(others.values())
+    others["elementary functions"] = sum(n for op, n in count.items() if op not in plain)
+    return others
+
+
+def stack(code: Code, real: int = 8) -> int:
+    """Bytes of stack of a step at most, if no variable shared a place with another."""
+    fields = sum(made.size * (real if made.kind == REAL else 4) for made in (*code.state, *code.outputs, *code.outputs))
+    return int(math.ceil((fields + code.variables * real + 256) / 16) * 16)

@@ -1,0 +1,267 @@
+"""A trace becomes scalar expressions: each array is taken apart, each primitive has a rule, or is refused by name.
+
+As `batching.lanes` does it: reshapes and slices move components, small products are sums. Branches and loops become
+regions; short loops with a fixed length are written out.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from ptsmc_jax.batching import components
+from ptsmc_jax.batching.components import object_array
+from ptsmc_jax.batching.lanes import called
+from ptsmc_jax.onboard import origins
+from ptsmc_jax.onboard.control import CONTROL
+from ptsmc_jax.onboard.expressions import BOOL, Node, Pool, Title, kind_of
+from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
+
+LARGEST = 4096  # components of an array
+
+
+class NoRuleError(ValueError):
+    """What cannot be written in C. Its text is one sentence that names the line it stands in."""
+
+
+class Translator:
+    """Evaluates traces on arrays of nodes."""
+
+    def __init__(self, pool: Pool):
+        self.pool = pool
+        self.held: list[origins.Frame] | None = None  # where a call stands: what is inside belongs there
+
+    def constant(self, array: Any) -> np.ndarray:
+        """An array that is known, taken apart."""
+        array = np.asarray(array)
+        if array.size > LARGEST:
+            raise NoRuleError(f"a table of {array.size} numbers is too large to be written in C, at most {LARGEST} are")
+        kind = kind_of(array.dtype)
+        return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
+
+    def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Components of a trace's outputs."""
+        jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+        known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
+        known |= dict(zip(jaxpr.invars, args, strict=True))
+        spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
+        for k, eqn in enumerate(jaxpr.eqns):
+            values = [self.constant(v.val) if isinstance(v, core.Literal) else known[v] for v in eqn.invars]
+            where = self.held or origins.frames(eqn)
+            outer, self.pool.section = self.pool.section, origins.section(where) or self.pool.section
+            results = self.apply(eqn, values, where)
+            self.pool.section = outer
+            if self.held is None and (k + 1 == len(spans) or spans[k + 1] != spans[k]):
+                self._name(results, origins.title(where))
+            for variable, result in zip(eqn.outvars, results, strict=True):
+                known[variable] = result
+        return [self.constant(v.val) if isinstance(v, core.Literal) else known[v] for v in jaxpr.outvars]
+
+    def _name(self, results: Sequence[np.ndarray], title: str) -> None:
+        if not title or title == "_" or len(results) != 1:
+            return
+        group = Title(title)
+        for index in np.ndindex(results[0].shape):
+            node: Any = results[0][index]
+            if node.title is None and node.op not in ("constant", "place"):
+                node.title, node.part = group, "".join(str(i + 1) for i in index)
+
+    def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
+        """Components of one equation's outputs."""
+        name, inner = eqn.primitive.name, called(eqn)
+        if name == "custom_jvp_call" or name == "custom_vjp_call":
+            inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
+            told = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
+            known = KNOWN_FUNCTIONS.get(getattr(told, "func_name", ""))
+            if known is not None and len(eqn.outvars) == 1:
+                return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
+        if inner is not None:
+            outer, self.held = self.held, where
+            results = self.evaluate(inner, values)
+            self.held = outer
+            return results
+        if name in CONTROL:
+            return CONTROL[name](self, eqn, values)
+        if all(node.op == "constant" for value in values for node in value.flat):
+            with jax.ensure_compile_time_eval():
+                known = [jnp.asarray(_known(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)]
+                return [self.constant(found) for found in components.bind(eqn, known)]
+        if name in ELEMENTWISE:
+            found = self._elementwise(eqn, values)
+            if found is not None:
+                return [found]
+        if name in _FOLDS:
+            return [self._reduction(eqn, values[0])]
+        if name == "dot_general":
+            return [self._contraction(eqn, *values)]
+        if name in _SCANS:
+            return [self._cumulative(eqn, values[0])]
+        if name in ("argmax", "argmin"):
+            return [self._place_of_extreme(eqn, values[0])]
+        if name in _MOVES:
+            found = self._moved(eqn, values)
+            if found is not None:
+                return found
+        raise self.refused(eqn, where)
+
+    def refused(self, eqn: Any, where: list[origins.Frame]) -> NoRuleError:
+        """There is no rule for this primitive."""
+        at = origins.line(where)
+        return NoRuleError(
+            f"`{eqn.primitive.name}`{f' ({at})' if at else ''} cannot be written in C, but must be made of sums, "
+            "products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
+        )
+
+    def _each(self, rule: Any, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        flat = [np.broadcast_to(v, shape).reshape(-1) for v in values]
+        return object_array(shape, (rule(*entry) for entry in zip(*flat, strict=True)))
+
+    def _elementwise(self, eqn: Any, values: Sequence[np.ndarray]) -> np.ndarray | None:
+        aval = eqn.outvars[0].aval
+        try:
+            kind = kind_of(aval.dtype)
+            rule = ELEMENTWISE[eqn.primitive.name]
+            return self._each(lambda *entry: rule(self.pool, eqn.params, kind, *entry), values, aval.shape)
+        except KeyError:  # a type, or a variant of the primitive, that has no counterpart
+            return None
+
+    def _reduction(self, eqn: Any, value: np.ndarray) -> np.ndarray:
+        axes, op = eqn.params["axes"], _FOLDS[eqn.primitive.name]
+        kept = [a for a in range(value.ndim) if a not in axes]
+        shape = tuple(value.shape[a] for a in kept)
+        rows = value.transpose([*kept, *axes]).reshape((*shape, -1))
+        kind = kind_of(eqn.outvars[0].aval.dtype)
+        return object_array(shape, (self._fold(op, kind, rows[i]) for i in np.ndindex(*shape)))
+
+    def _fold(self, op: str, kind: str, items: Any) -> Node:
+        items = list(items)
+        total = items[0] if items else self.pool.constant(op == "and", kind)
+        for item in items[1:]:
+            total = self.pool.make(op, total, item, kind=kind)
+        return total
+
+    def _contraction(self, eqn: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        contracted, batched = eqn.params["dimension_numbers"]
+        aval = eqn.outvars[0].aval
+        kind = kind_of(aval.dtype)
+
+        def rows(parts: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+            kept = [a for a in range(parts.ndim) if a not in (*axes, *batch)]
+            sizes = [int(np.prod([parts.shape[a] for a in group], dtype=int)) for group in (batch, kept, axes)]
+            return parts.transpose([*batch, *kept, *axes]).reshape(sizes)
+
+        a, b = (rows(*row) for row in zip((left, right), contracted, batched, strict=True))
+        items = (
+            self._fold("add", kind, [self.pool.make("mul", *p, kind=kind) for p in zip(a[k, i], b[k, j], strict=True)])
+            for k in range(a.shape[0])
+            for i in range(a.shape[1])
+            for j in range(b.shape[1])
+        )
+        return object_array(aval.shape, items)
+
+    def _cumulative(self, eqn: Any, value: np.ndarray) -> np.ndarray:
+        axis, kind = eqn.params["axis"], kind_of(eqn.outvars[0].aval.dtype)
+        parts = np.moveaxis(value.copy(), axis, 0)
+        order = list(range(len(parts)))[:: -1 if eqn.params["reverse"] else 1]
+        for before, k in pairwise(order):
+            for i in np.ndindex(*parts.shape[1:]):
+                parts[(k, *i)] = self.pool.make(
+                    _SCANS[eqn.primitive.name], parts[(before, *i)], parts[(k, *i)], kind=kind
+                )
+        return np.moveaxis(parts, 0, axis)
+
+    def _place_of_extreme(self, eqn: Any, value: np.ndarray) -> np.ndarray:
+        (axis,), kind = eqn.params["axes"], kind_of(eqn.outvars[0].aval.dtype)
+        test = "gt" if eqn.primitive.name == "argmax" else "lt"
+        parts = np.moveaxis(value, axis, -1)
+
+        def one(entries: np.ndarray) -> Node:
+            best, at = entries[0], self.pool.constant(0, kind)
+            for k, entry in enumerate(entries[1:], 1):
+                beyond = self.pool.make(test, entry, best, kind=BOOL)
+                at = self.pool.make("select", beyond, self.pool.constant(k, kind), at, kind=kind)
+                best = self.pool.make("select", beyond, entry, best, kind=entry.kind)
+            return at
+
+        return object_array(parts.shape[:-1], (one(parts[i]) for i in np.ndindex(*parts.shape[:-1])))
+
+    def _moved(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+        """Components moved as the primitive moves entries; by places that are known, or chosen among them."""
+        name = eqn.primitive.name
+        if name in ("dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add"):
+            return self._indexed(eqn, values)
+        pool, numbered = [], []
+        for value in values:
+            numbered.append(np.arange(len(pool), len(pool) + value.size, dtype=np.int32).reshape(value.shape))
+            pool += list(value.flat)
+        with jax.ensure_compile_time_eval():
+            outputs = [np.asarray(chosen) for chosen in components.bind(eqn, [jnp.asarray(n) for n in numbered])]
+        return [object_array(out.shape, (pool[k] for k in out.flat)) for out in outputs]
+
+    def _indexed(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+        """A slice, a row or an update at places that are computed: chosen among all that there may be."""
+        name = eqn.primitive.name
+        many = 2 if name in ("dynamic_update_slice",) or name.startswith("scatter") else 1
+        arrays = [values[0], *([values[1]] if name == "dynamic_update_slice" else [])]
+        places = values[many:] if name == "dynamic_slice" or name == "dynamic_update_slice" else [values[1]]
+        if name.startswith("scatter"):
+            arrays, places = [values[0], values[2]], [values[1]]
+        flat = [node for place in places for node in place.flat]
+        open_places = [node for node in flat if node.op != "constant"]
+        if len({id(node) for node in open_places}) > 1 or name == "scatter-add":
+            return None
+        if not open_places:
+            return [self._at(eqn, values, arrays, places, None, 0)]
+        chosen, index = open_places[0], None
+        bound = max(values[0].shape)
+        for k in range(bound - 1, -1, -1):
+            case = self._at(eqn, values, arrays, places, chosen, k)
+            if index is None:
+                index = case
+                continue
+            beyond = self.pool.make("le", chosen, self.pool.constant(k, chosen.kind), kind=BOOL)
+            index = self._each(
+                lambda yes, no, beyond=beyond: self.pool.make("select", beyond, yes, no, kind=yes.kind),
+                [case, index],
+                case.shape,
+            )
+        return None if index is None else [index]
+
+    def _at(self, eqn, values, arrays, places, chosen, k) -> np.ndarray:
+        pool: list[Node] = []
+        numbered: dict[int, np.ndarray] = {}
+        for array in arrays:
+            numbered[id(array)] = np.arange(len(pool), len(pool) + array.size, dtype=np.int32).reshape(array.shape)
+            pool += list(array.flat)
+        pool.append(self.pool.constant(0, arrays[0].flat[0].kind))
+        operands = []
+        for variable, value in zip(eqn.invars, values, strict=True):
+            if id(value) in numbered:
+                operands.append(jnp.asarray(numbered[id(value)]))
+            else:
+                known = [k if node is chosen else node.value for node in value.flat]
+                operands.append(jnp.asarray(np.asarray(known).reshape(value.shape), dtype=variable.aval.dtype))
+        params = dict(eqn.params)
+        with jax.ensure_compile_time_eval():
+            out = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(params))
+        out = np.asarray(out)
+        inside = (out >= 0) & (out < len(pool) - 1)
+        return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
+
+
+def _known(value: np.ndarray) -> np.ndarray:
+    """An array of nodes that are all known."""
+    return np.asarray([node.value for node in value.flat]).reshape(value.shape)
+
+
+_FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
+          "reduce_or": "or"}  # fmt: skip
+_SCANS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+_MOVES = set(
+    "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "
+    "dynamic_slice dynamic_update_slice gather scatter".split()
+)

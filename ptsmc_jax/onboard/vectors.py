@@ -1,0 +1,166 @@
+"""What a flight computer is given and gives, sample by sample, as the simulator flies it: what C is checked by."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ptsmc_jax import programs
+from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.devices.sensors import Sensors
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics import draws
+from ptsmc_jax.onboard.board import Board
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.computer import boot, decide, schedule, told
+from ptsmc_jax.simulation.rollout import DISTURBANCE_WALK, SINGULAR_CLEARANCE, over_period
+
+
+class Samples(NamedTuple):
+    """A run by samples, arrays (samples, ..); what there is none of is None."""
+
+    t: Array  # [s]
+    flown: Array  # bool: its period has a length
+    measured: Any  # state as the sensors say it
+    valid: Array | None  # bool: the star tracker has an attitude
+    before: Any  # Estimate of the attitude filter before the sample
+    estimate: Any  # and after it
+    gyro: Array | None  # rate as measured [rad/s]
+    applied: Array  # mean torque over the last period [N m]
+    acting: Array | None  # torque of the channels [N m]
+    momentum: Array | None  # of the wheels [N m s]
+    seen: Any  # state as the law sees it
+    observer: Any  # memory
+    law: Any  # memory
+    queue: Array | None
+    d_hat: Array
+    command: Array
+    s: Array
+    torque: Array  # on the body from this sample on [N m]
+    wheel_torque: Array | None
+    limited: Array  # bool
+    clearance: Array
+    clearance_unit: Array
+
+
+def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
+    """A trial by samples: the sampled loop of `rollout` without its metrics."""
+    parts = dispersion.apply(parts, seed, trial)
+    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    law, actuators = parts.controller, Actuators() if parts.actuators is None else parts.actuators
+    target = parts.reference(jnp.zeros_like(parts.t_end))
+    x0 = law.align(parts.initial, target)
+    k2 = parts.observer.error_bound()
+    listed, about, started = schedule(parts, ticks)
+    walk = draws.stream(seed, trial, DISTURBANCE_WALK)
+    sensors, wheels = parts.sensors, actuators.wheels
+
+    def period(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
+        (now, dt_before, *_), (x, computer, acting, pushed, unit) = tick, carry
+        dt = now.t_next - now.t
+        measured, sensing = x, computer.sensing
+        if sensors is not None:
+            read = sensors.sample if isinstance(sensors, Sensors) else sensors.measure
+            measured, _ = read(sensing, x, now, dt_before)
+        before = getattr(sensing, "estimate", None)
+        applied = computer.told[0]
+        (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, x)
+        drive, queue = actuators.command(acting, u, w, dt, now.noise_weight)
+        if pushed is not None:
+            pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
+        x_next = over_period(parts, now.t, x, drive, pushed, dt)
+        known = (drive.c, None) if actuators.holds else told(actuators, drive, dt)
+        distance = law.clearance(computer.seen, target)
+        unit = jnp.where(jnp.isnan(unit), law.whole_clearance(distance), unit)
+        row = Samples(
+            t=now.t, flown=dt > 0.0, measured=measured,
+            valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
+            before=before, estimate=getattr(computer.sensing, "estimate", None),
+            gyro=getattr(computer.sensing, "rate", None),
+            applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.memory,
+            law=computer.law, queue=queue, d_hat=d_hat, command=u, s=s,
+            torque=drive.c if wheels is None else wheels.axes @ drive.c,
+            wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
+            clearance=distance / unit, clearance_unit=unit,
+        )  # fmt: skip
+        return (x_next, computer._replace(told=known), actuators.end(acting, drive, queue, dt), pushed, unit), row
+
+    computer = boot(parts, seed, trial, x0, started)
+    if actuators.holds:
+        computer = computer._replace(told=(jnp.zeros(parts.plant.inputs), None))
+    pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+    start = x0, computer, actuators.begin(parts.plant.inputs), pushed, jnp.full_like(parts.t_end, jnp.nan)
+    return jax.lax.scan(period, start, listed)[1]
+
+
+@programs.jit
+def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
+    """Trials by samples, (trials, samples, ..)."""
+    return jax.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)
+
+
+def known_alike(dispersion: Dispersion) -> Dispersion:
+    """A dispersion without what the flight computer knows: its reference and its torque limit are those told."""
+    levels = {name: level for name, level in dispersion.levels.items() if name != "torque_limit"}
+    return Dispersion(**{**vars(dispersion), "reference": None, "levels": levels})
+
+
+def usable(samples: Samples) -> bool:
+    """Whether a trial is finite, and stays away from the law's singularity."""
+    finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(samples))
+    return finite and bool(np.min(samples.clearance) >= SINGULAR_CLEARANCE)
+
+
+def one(samples: Samples, trial: int) -> Samples:
+    """A trial of many, on NumPy arrays, without samples of no length."""
+    found = jax.tree.map(lambda v: np.asarray(v[trial]), samples)
+    return jax.tree.map(lambda v: v[found.flown], found)
+
+
+def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
+    given = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
+             "acting": samples.acting, "attitude_valid": samples.valid}  # fmt: skip
+    kept = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
+            "wheel_momentum": samples.momentum, "clearance": samples.clearance,
+            "clearance_unit": samples.clearance_unit}  # fmt: skip
+    if isinstance(samples.seen, AttitudeState):
+        given |= {"attitude": samples.measured.q, "rate": samples.measured.w}
+        kept |= {"attitude": samples.seen.q, "rate": samples.seen.w}
+    if samples.estimate is not None:
+        kept |= {"bias": samples.estimate.bias, "gyro": samples.gyro}
+    came = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
+    one = np.ones_like(samples.t)
+    outputs = _columns(board.outputs, came)
+    state = np.column_stack([samples.t, one, one, _columns(board.state, kept), outputs])
+    return np.column_stack([samples.t, _columns(board.inputs, given)]), outputs, state
+
+
+def first_state(board: Board, samples: Samples) -> np.ndarray:
+    """The state before a trial's first sample, (columns,)."""
+    law, observer = (board.parameters[name].begin() for name in ("law", "observer"))
+    kept = {"law": jax.tree.map(lambda v: np.asarray(v)[None], law),
+            "observer": jax.tree.map(lambda v: np.asarray(v)[None], observer)}  # fmt: skip
+    if samples.before is not None:
+        kept |= {"attitude": samples.before.q[:1], "bias": samples.before.bias[:1]}
+    empty = np.zeros((1, sum(int(np.prod(leaf.shape, dtype=int)) for leaf in jax.tree.leaves(board.outputs))))
+    return np.column_stack([np.zeros((1, 3)), _columns(board.state, kept), empty])[0]
+
+
+def _columns(shapes: dict[str, Any], values: dict[str, Any]) -> np.ndarray:
+    """Columns of named trees, in their order; zero where there is no value."""
+    found = []
+    for name, shape in shapes.items():
+        given = values.get(name)
+        for k, leaf in enumerate(jax.tree.leaves(shape)):
+            size = int(np.prod(leaf.shape, dtype=int))
+            if given is None:
+                count = next(len(v) for v in jax.tree.leaves([v for v in values.values() if v is not None]))
+                found.append(np.zeros((count, size)))
+            else:
+                column = np.asarray(jax.tree.leaves(given)[k], dtype=float)
+                found.append(column.reshape(len(column), size))
+    return np.column_stack(found) if found else np.zeros((0, 0))

@@ -1,0 +1,76 @@
+"""JAX functions and controllers compiled by the machine's C compiler, for the tests of C."""
+
+import ctypes
+import os
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax.batching.components import object_array
+from ptsmc_jax.onboard import printing, templates
+from ptsmc_jax.onboard.expressions import Pool, kind_of
+from ptsmc_jax.onboard.translate import Translator
+
+CC = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+needs_compiler = pytest.mark.skipif(CC is None, reason="this machine has no C compiler")
+STRICT = "-std=c99 -pedantic -Wall -Wextra -Werror -Wconversion".split()
+HEAD = """
+#include <math.h>
+#include <stdint.h>
+typedef double real;
+#define R(x) ((real)(x))
+#define M(function) function
+"""
+
+
+def body(function, *args):
+    """The statements of a function of arrays in C, and its printer."""
+    closed = jax.make_jaxpr(function)(*args)
+    pool, given, at = Pool(), [], 0
+    for arg in args:
+        array = np.asarray(arg)
+        kind = kind_of(array.dtype)
+        text = {"real": "in[{}]", "int": "(in[{}] != 0.0)"}.get(kind, f"(({kind})in[{{}}])")
+        places = [pool.place(text.format(at + k), kind) for k in range(array.size)]
+        given.append(object_array(array.shape, places))
+        at += array.size
+    results = Translator(pool).evaluate(closed, given)
+    flat = [node for result in results for node in result.flat]
+    printer = printing.Printer(["in", "out"])
+    return printer.body(pool.block, [(f"out[{k}]", node) for k, node in enumerate(flat)]), printer
+
+
+def source(function, *args):
+    """A program of C that computes it."""
+    lines, _ = body(function, *args)
+    text = "\n".join(lines)
+    helpers = "\n".join(code for name, code in templates.HELPERS.items() if f"{name}(" in text)
+    signature = "void run(const double *in, double *out)"
+    return f"{HEAD}{helpers}\n{signature};\n\n{signature}\n{{\n{text}\n}}\n"
+
+
+def library(folder, text, *options):
+    """A shared library of a program."""
+    path = folder / "run.c"
+    path.write_text(text)
+    assert CC is not None
+    flags = [*STRICT, "-O1", "-shared", "-fPIC", *options, str(path), "-o", str(folder / "run.so"), "-lm"]
+    done = subprocess.run([CC, *flags], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr + text
+    return ctypes.CDLL(str(folder / "run.so"))
+
+
+def both(folder, function, *args):
+    """Outputs of a function in C and in JAX, flat."""
+    expected = np.concatenate(
+        [np.ravel(np.asarray(v, dtype=float)) for v in jax.tree.leaves(function(*map(jnp.asarray, args)))]
+    )
+    given = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in args])
+    found = np.full(expected.shape, np.nan)
+    run = library(folder, source(function, *map(jnp.asarray, args))).run
+    run(given.ctypes.data_as(ctypes.c_void_p), found.ctypes.data_as(ctypes.c_void_p))
+    return found, expected

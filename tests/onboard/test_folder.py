@@ -1,0 +1,93 @@
+"""A controller's folder: it compiles without a warning, replays what the simulator flew, and refuses what it must."""
+
+import csv
+import shutil
+import subprocess
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.onboard import folder
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from tests.helpers import SHORT
+from tests.onboard.compiled import CC, needs_compiler
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The folder of a short flight on raw samples."""
+    place = tmp_path_factory.mktemp("short")
+    (place / "short.toml").write_text(SHORT)
+    return folder.export(place / "short.toml", place / "controller", trials=2)
+
+
+def make(place, *args):
+    return subprocess.run(["make", "-B", f"CC={CC}", *args], cwd=place, capture_output=True, text=True, check=False)
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_it_compiles_without_a_warning_and_replays_the_simulator(short, tmp_path, real):
+    place = shutil.copytree(short, tmp_path / "controller")
+    done = make(place, "check", f"REAL={real}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "130 samples; other status: 0" in done.stdout
+    # another gain is another flight
+    (parameters,) = place.glob("*_parameters.c")
+    text = parameters.read_text()
+    assert "R(3), /* law_eta */" in text
+    parameters.write_text(text.replace("R(3), /* law_eta */", "R(3.01), /* law_eta */"))
+    assert make(place, "check", f"REAL={real}").returncode != 0
+
+
+def test_vectors_are_the_run_that_the_simulator_flies(short):
+    """Command by command: the recorded trial is the rollout's, of which the history keeps commands and estimates."""
+    with (short / "vectors.csv").open() as file:
+        header, *rows = csv.reader(file)
+    mine = [row for row in rows if row[0] == "1" and row[1] != "-1"]
+    ready = scenario.study(scenario.read(short / "scenario.toml"))
+    parts = ready.dispersion.apply(ready.parts, jnp.uint32(0), jnp.uint32(1))
+    log = rollout.simulate_jit(parts, jnp.uint32(0), jnp.uint32(1), record=True).log
+    assert log is not None
+    for name, column in (("out.command", log.commanded), ("out.d_hat", log.d_hat), ("out.s", log.s)):
+        at = header.index(f"{name}[0]")
+        found = np.array([[float(v) for v in row[at : at + 3]] for row in mine])
+        np.testing.assert_allclose(found, np.asarray(column)[: len(found)], rtol=1e-11, atol=1e-13)
+
+
+def test_other_gains_are_other_parameters_and_the_same_code(short, tmp_path):
+    known = scenario.replace(
+        scenario.read(short / "scenario.toml"), controller__eta=4.0, spacecraft__inertia=[9, 11, 13]
+    )
+    other = folder.export(known, tmp_path / "other", name="short", trials=1)
+
+    def code(place):
+        return (place / "ptsmc_short.c").read_text().splitlines()[3:]
+
+    assert code(other) == code(short)
+    assert (other / "ptsmc_short_parameters.c").read_text() != (short / "ptsmc_short_parameters.c").read_text()
+
+
+def test_the_law_stands_in_it_with_its_names_and_equations(short):
+    text = (short / "ptsmc_short.c").read_text()
+    assert "(56), (57) before and (59), (60) after the hand-over." in text.replace("\n * ", " ")
+    for line in ("const real error_1 = attitude[0] - p->reference_q[0];", "const real wanted_3 = -switching_3"):
+        assert line in text
+    assert "eta > 2" in (short / "ptsmc_short.h").read_text()
+
+
+def test_a_continuous_loop_and_a_full_folder_are_refused(short, tmp_path):
+    with pytest.raises(ScenarioError, match=r'^loop.mode is "continuous", but must be "sampled" to be exported'):
+        folder.export(scenario.from_tables({}), tmp_path / "x")
+    with pytest.raises(RefusedError, match="holds something already"):
+        folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), short)
+    assert not (tmp_path / "x").exists()
+
+
+def test_names_are_ones_that_c_takes():
+    assert [folder.identifier(name) for name in ("tuned", "2 flights", "é-x", "")] == ["tuned", "c_2_flights", "x", "c"]

@@ -1,0 +1,120 @@
+"""Functions of arrays in C compute what JAX computes; what C cannot say is refused by its line."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax.numerics import attitude, elementary, guards, matrices
+from ptsmc_jax.onboard.translate import NoRuleError
+from tests.onboard.compiled import body, both, needs_compiler
+
+X = np.array([0.3, -1.2, 0.7])
+POSITIVE = np.array([0.3, 1.2, 2.7])
+MATRIX = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [0.0, 0.2, 1.1]])
+
+
+def counted(x):
+    return jax.lax.fori_loop(0, 30, lambda k, y: 0.9 * y + jnp.sin(x) / (k + 1.0), x)
+
+
+def gone_through(x):
+    def step(total, row):
+        return total + row[0] * x, total * row[1]
+
+    return jax.lax.scan(step, jnp.zeros(3), (jnp.linspace(0.0, 1.0, 20), jnp.linspace(1.0, 2.0, 20)))
+
+
+def backwards(x):
+    return jax.lax.scan(lambda c, row: (c * 0.5 + row, c), x, jnp.linspace(0.0, 1.0, 20), reverse=True)
+
+
+def until(x):
+    return jax.lax.while_loop(lambda y: jnp.sum(y * y) > 1e-3, lambda y: 0.7 * y, x)
+
+
+def branched(x):
+    return jax.lax.cond(x[0] > 0.0, lambda: (jnp.cos(x), x[1]), lambda: (jnp.sin(x), x[2]))
+
+
+def switched(x):
+    return jax.lax.switch(jnp.int32(3.0 * x[0] + 1.5), [lambda: x, lambda: 2.0 * x, lambda: x**2, lambda: x[::-1]])
+
+
+def tabled(x):
+    return jnp.interp(x[0], jnp.linspace(-1.0, 1.0, 5), jnp.asarray([1.0, 3.0, 2.0, -1.0, 0.5]))
+
+
+FUNCTIONS = {
+    "elementary": (lambda x: (jnp.sin(x) * jnp.cos(x) + jnp.tan(x), jnp.exp(x), jnp.tanh(x), jnp.arctan(x)), X),
+    "roots": (lambda x: (jnp.sqrt(x), jnp.cbrt(x), jnp.log(x), jnp.log1p(x), jnp.expm1(-x), x**0.3), POSITIVE),
+    "signs": (lambda x: (jnp.sign(x), jnp.abs(x), jnp.floor(x), jnp.ceil(x), jnp.round(2.0 * x), -x), X),
+    "powers": (lambda x: (x**2, x**3, x**5, x**-2, 1.0 / x, x**7), X),
+    "limits": (lambda x: (jnp.clip(x, -0.5, 0.5), jnp.maximum(x, 0.1), jnp.minimum(x, x[::-1])), X),
+    "comparisons": (lambda x: jnp.where((x > 0.0) & ~(x == 0.7) | (x < -1.0), x, 2.0 * x), X),
+    "products": (lambda x, m: (m @ x, x @ m @ x, m @ m, jnp.outer(x, x), jnp.cross(x, m[0]), m.T @ x), X, MATRIX),
+    "reductions": (lambda m: (m.sum(), m.max(axis=0), m.min(axis=1), m.prod(), jnp.cumsum(m, axis=1)), MATRIX),
+    "moved": (lambda m: (m[1], m[:, ::-1], jnp.roll(m, 1), jnp.concatenate([m[0], m[2]]), m.reshape(-1)[3:7]), MATRIX),
+    "places": (lambda x, m: (jnp.argmax(x), x.at[1].set(4.0), m[:, 2], jnp.pad(x, 1)), X, MATRIX),
+    "whole numbers": (lambda k, x: (x * k, k // 2 + 1, jnp.where(k % 3 == 1, x, -x)), np.int32(7), X),
+    "counted loop": (counted, X),
+    "loop over a table": (gone_through, X),
+    "loop backwards": (backwards, X),
+    "loop until": (until, X),
+    "branch": (branched, X),
+    "branches": (switched, X),
+    "table": (tabled, X),
+    "solve": (lambda m, x: (matrices.solve(m, x), matrices.determinant(m)), MATRIX, X),
+    "attitudes": (lambda x: attitude.from_rotation_vector(x), X),
+    "small attitudes": (lambda x: attitude.from_rotation_vector(1e-5 * x), X),
+    "logarithm written out": (lambda x: (elementary.log(x), elementary.arctan2(x[0], x[1])), POSITIVE),
+    "guarded": (lambda x, b: (guards.norm(x), guards.signed_power(x, b), guards.smooth_sign(x, b)), X, np.float64(0.4)),
+    "derivatives": (lambda x: jax.jacfwd(lambda y: jnp.sin(y) * jnp.cross(y, x) / (1.0 + y @ y))(2.0 * x), X),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_in_c_is_the_one_in_jax(name, tmp_path):
+    function, *args = FUNCTIONS[name]
+    found, expected = both(tmp_path, function, *args)
+    # a few roundings each, of numbers of order one
+    np.testing.assert_allclose(found, expected, rtol=2e-15, atol=2e-15)
+
+
+def text(function, *args):
+    return "\n".join(body(function, *map(jnp.asarray, args))[0])
+
+
+def test_equal_expressions_are_one_and_what_is_known_is_computed():
+    code = text(lambda x: (x[0] * x[1] + jnp.sin(x[1] * x[0]), 0.0 * x[2] + 1.0 * x[0], jnp.sqrt(4.0) * x[0]), X)
+    assert code.count(" * ") == 2  # x0 x1 once, and 2 x0
+    assert "R(2) * in[0]" in code
+    assert "in[2]" not in code
+
+
+def test_names_are_those_of_the_source():
+    def law(x):
+        wanted = -2.0 * x
+        speed = jnp.sum(wanted * wanted)
+        return wanted / (1.0 + speed)
+
+    code = text(law, X)
+    assert "const real wanted_2 = R(-2) * in[1];" in code
+    assert "const real speed = wanted_1 * wanted_1" in code
+
+
+def test_branches_are_branches_and_loops_loops():
+    assert "if (in[0] > R(0)) {" in text(branched, X)
+    assert "for (int k" in text(counted, X)
+    assert "for (" not in text(lambda x: jax.lax.fori_loop(0, 3, lambda k, y: 0.5 * y + x, x), X)
+    assert "break;" in text(until, X)
+
+
+def test_what_c_cannot_say_is_refused_by_its_line():
+    def law(x):
+        return jnp.linalg.eigvalsh(jnp.outer(x, x))
+
+    line = law.__code__.co_firstlineno + 1
+    with pytest.raises(NoRuleError, match=rf"^`eigh` \(.*test_translate\.py:{line}\) cannot be written in C, but must"):
+        body(law, X)

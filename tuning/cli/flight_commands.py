@@ -1,0 +1,46 @@
+"""The command that takes gains to flight."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole
+from tuning.output import terminal
+
+
+def export(
+    scenario: Annotated[
+        Path, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled", such as a tuned.toml.')
+    ],
+    /,
+    *,
+    out: Out = None,
+    name: Annotated[str | None, Parameter(help="Name of the C files; by default the scenario file's.")] = None,
+    trials: Annotated[str, Parameter(help="Trials in vectors.csv, a whole number from 1 to 100.")] = "3",
+    seed: Seed = "0",
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> int:
+    """Write the scenario's flight computer as C99: attitude filter, observer, law, wheels; with vectors that check it.
+
+    Exit status: 0 done, 2 bad input, or something in it that C cannot say.
+    """
+    key, count = whole("--seed", seed), whole("--trials", trials, 1, 100)
+    loaded, folder = prepare(scenario, "export", out, trust=trust)
+    from ptsmc_jax.campaigns import store
+
+    store.check(folder, force)
+    from ptsmc_jax.onboard import folder as controllers
+    from ptsmc_jax.onboard import templates
+
+    made = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
+    store.write(folder, lambda making: controllers.write(making, made, key, count))
+    if not quiet:
+        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code).items() if n)
+        terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")
+    return 0
+
+
+COMMANDS = (export,)
