@@ -84,7 +84,10 @@ def metric_list() -> str:
         ("A spacecraft's", catalogues.CATALOGUE),
         ("Those of chains and systems", catalogues.STATE_CATALOGUE),
     ):
-        parts += [f"## {title}", _grid("metric unit meaning", [[f"`{key}`", *told] for key, told in known.items()])]
+        parts += [
+            f"## {title}",
+            _grid("metric unit meaning", [[f"`{key}`", one.unit, one.meaning] for key, one in known.items()]),
+        ]
     return _page([*parts, ERRORS])
 
 

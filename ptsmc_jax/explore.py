@@ -24,7 +24,7 @@ from ptsmc_jax.theory.error_floor import Floor
 class Quantities(Mapping[str, float]):
     """Numbers by name, shown with their units and meanings."""
 
-    def __init__(self, values: Mapping[str, float], catalogue: Mapping[str, tuple[str, str]]):
+    def __init__(self, values: Mapping[str, float], catalogue: Mapping[str, catalogues.Entry]):
         self._values, self._catalogue = dict(values), catalogue
 
     def __getitem__(self, name: str) -> float:
@@ -37,10 +37,13 @@ class Quantities(Mapping[str, float]):
         return len(self._values)
 
     def __repr__(self) -> str:
-        return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name][0]}" for name, value in self.items())
+        return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name].unit}" for name, value in self.items())
 
     def _repr_html_(self) -> str:
-        rows = [(name, _number(value), *self._catalogue[name]) for name, value in self.items()]
+        rows = [
+            (name, _number(value), self._catalogue[name].unit, self._catalogue[name].meaning)
+            for name, value in self.items()
+        ]
         return _table(("metric", "value", "unit", "meaning"), rows)
 
 
@@ -169,7 +172,7 @@ def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdi
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
     """The unit of each metric of this kind of plant."""
-    return {name: unit for name, (unit, _) in catalogues.CATALOGUES[kind].items()}
+    return {name: entry.unit for name, entry in catalogues.CATALOGUES[kind].items()}
 
 
 def _whole(name: str, value: object, least: int = 0) -> None:

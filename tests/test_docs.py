@@ -65,7 +65,7 @@ def test_the_references_name_everything():
             for struct in structs:
                 assert all(f"`{key}`" in scenarios for key in struct.__struct_fields__ if key != "kind"), struct
     for catalogue in catalogues.CATALOGUES.values():
-        assert all(f"| `{metric}` | {unit} | " in metric_list for metric, (unit, _) in catalogue.items())
+        assert all(f"| `{metric}` | {entry.unit} | " in metric_list for metric, entry in catalogue.items())
 
 
 def test_what_others_rely_on_is_documented():

@@ -55,13 +55,13 @@ def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():
 
 def test_tables_show_units_and_escape_what_they_show(flight):
     shown = flight._repr_html_()
-    for name, (unit, meaning) in flight.run.catalogue.items():
+    for name, entry in flight.run.catalogue.items():
         assert f"<td>{name}</td>" in shown
-        assert f"<td>{unit}</td>" in shown
-        assert meaning.replace("'", "&#x27;") in shown
+        assert f"<td>{entry.unit}</td>" in shown
+        assert entry.meaning.replace("'", "&#x27;") in shown
     assert "status: ok" in repr(flight)
     assert re.search(r"peak_torque +[\d.]+ N m", repr(flight.metrics))
-    hostile = explore.Quantities({"<b>": 1.0}, {"<b>": ("<script>", "&")})
+    hostile = explore.Quantities({"<b>": 1.0}, {"<b>": catalogues.Entry("<script>", "&")})
     assert "<b>" not in hostile._repr_html_()
     assert "<script>" not in hostile._repr_html_()
     assert "&lt;script&gt;" in hostile._repr_html_()

@@ -30,7 +30,7 @@ HOUSE = {
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
-        "simulation": "catalogues clock metrics | assembly requirements | computer | rollout",
+        "simulation": "catalogues clock interval | assembly metric_rows requirements | computer metrics | rollout",
         "dispersions": "base | attitudes inertias numbers quantities | variation | planned",
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """

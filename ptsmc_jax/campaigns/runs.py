@@ -16,6 +16,7 @@ from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.catalogues import Entry
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import error_floor
@@ -31,7 +32,7 @@ class Run:
     parts: Parts  # as flown
     log: Log  # numpy arrays (time, component), intervals of length zero left out
     metrics: dict[str, float]
-    catalogue: dict[str, tuple[str, str]]  # what those are: name -> (unit, meaning)
+    catalogue: dict[str, Entry]  # what those are
     status: str
     reason: str
     bad_time: float  # [s], NaN if none

@@ -74,7 +74,11 @@ def check(scenario: Scenario) -> None:
 
 
 def _check_requirements(scenario: Scenario) -> None:
+    entries = catalogues.CATALOGUES[scenario.plant.kind]
     for key, value in scenario.requirements.items():
+        table = entries[key].table if key in entries else None
+        if table is not None and getattr(scenario, table) is None:
+            raise ScenarioError(f"requirements.{key} needs [{table}], but there is no [{table}] table")
         if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
             raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
         if key in catalogues.MARGINS and scenario.loop.mode != "sampled":
@@ -202,8 +206,6 @@ def _check_devices(scenario: Scenario) -> None:
         limit = device.momentum_limit
         if limit is not None and any(abs(h) > limit for h in device.momentum or ()):
             raise wrong("wheels.momentum", device.momentum, f"within wheels.momentum_limit, {limit}")
-    if device is None and "peak_wheel_momentum" in scenario.requirements:
-        raise ScenarioError("requirements.peak_wheel_momentum needs reaction wheels, but there is no [wheels] table")
 
 
 def _check_loop(scenario: Scenario) -> None:

@@ -44,24 +44,24 @@ class Study:
         return self.dispersion.varies or self.parts.sensors is not None or self.parts.walk_rate is not None
 
     @property
-    def catalogue(self) -> dict[str, tuple[str, str]]:
-        """The metrics that this plant has: name -> (unit, what it is)."""
+    def catalogue(self) -> dict[str, catalogues.Entry]:
+        """The metrics that this scenario's runs have, by name."""
         return catalogue(self.scenario)
 
 
-def catalogue(scenario: Scenario) -> dict[str, tuple[str, str]]:
-    """The metrics that a scenario's plant has: name -> (unit, what it is)."""
-    names = catalogues.CATALOGUES[scenario.plant.kind]
-    return names if scenario.wheels is not None else {k: v for k, v in names.items() if "wheel" not in k}
+def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
+    """The metrics that a scenario's runs have, by name."""
+    entries = catalogues.CATALOGUES[scenario.plant.kind]
+    return {name: e for name, e in entries.items() if e.table is None or getattr(scenario, e.table) is not None}
 
 
 def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """What a scenario asks of its runs."""
     units = catalogues.CATALOGUES[scenario.plant.kind]
     return tuple(
-        Requirement(name, value.limit, units[name][0], value.quantile, value.confidence)
+        Requirement(name, value.limit, units[name].unit, value.quantile, value.confidence)
         if isinstance(value, t.Limit)
-        else Requirement(name, float(value), units[name][0])
+        else Requirement(name, float(value), units[name].unit)
         for name, value in scenario.requirements.items()
         if name in units
     )

@@ -1,33 +1,46 @@
-"""The metrics of a run by name: what `[requirements]` may ask for."""
+"""The metrics of a run by name, a row each for every kind of plant that has it: what `[requirements]` may ask for.
 
-# name: (unit, what it is)
+How each comes about is in `metric_rows`; here is what can be said without JAX.
+"""
+
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """A metric's unit and meaning; table: of the scenario, without which a run lacks it."""
+
+    unit: str
+    meaning: str
+    table: str | None = None
+
+
 CATALOGUE = {
-    "terminal_error": ("-", "2-norm of the attitude error vector at t_f"),
-    "terminal_angle": ("rad", "angle to the reference attitude at t_f"),
-    "window_error": ("-", "RMS of that 2-norm over the window after t_f"),
-    "hold_error": ("-", "largest of that 2-norm from t_f to t_end"),
-    "peak_torque": ("N m", "largest commanded torque about one axis, before the actuator"),
-    "peak_torque_delivered": ("N m", "largest delivered torque about one axis"),
-    "saturated": ("-", "fraction of the time in which a limit of the actuators cuts the command"),
-    "effort": ("N m s", "integral of the 1-norm of the delivered torque"),
-    "settling_time": ("s", "time from which the angle stays below settling_angle"),
-    "chattering": ("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
-    "peak_rate": ("rad/s", "largest 2-norm of the body rate"),
-    "peak_momentum": ("N m s", "largest 2-norm of the body's angular momentum"),
-    "peak_wheel_momentum": ("N m s", "largest momentum stored in one reaction wheel"),
+    "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),
+    "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
+    "window_error": Entry("-", "RMS of that 2-norm over the window after t_f"),
+    "hold_error": Entry("-", "largest of that 2-norm from t_f to t_end"),
+    "peak_torque": Entry("N m", "largest commanded torque about one axis, before the actuator"),
+    "peak_torque_delivered": Entry("N m", "largest delivered torque about one axis"),
+    "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
+    "effort": Entry("N m s", "integral of the 1-norm of the delivered torque"),
+    "settling_time": Entry("s", "time from which the angle stays below settling_angle"),
+    "chattering": Entry("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
+    "peak_rate": Entry("rad/s", "largest 2-norm of the body rate"),
+    "peak_momentum": Entry("N m s", "largest 2-norm of the body's angular momentum"),
+    "peak_wheel_momentum": Entry("N m s", "largest momentum stored in one reaction wheel", "wheels"),
 }
 # The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
 STATE_CATALOGUE = {
-    "terminal_error": ("x1", "|x_1| at t_f"),
-    "window_error": ("x1", "RMS of |x_1| over the window after t_f"),
-    "hold_error": ("x1", "largest |x_1| from t_f to t_end"),
-    "peak_torque": ("u", "largest commanded component of the input, before the actuator"),
-    "peak_torque_delivered": ("u", "largest delivered component of the input"),
-    "saturated": ("-", "fraction of the time in which a limit of the actuators cuts the command"),
-    "effort": ("u s", "integral of the 1-norm of the delivered input"),
-    "settling_time": ("s", "time from which |x_1| stays below settling_angle"),
-    "chattering": ("u/s", "total variation of the delivered input per second after t_f, largest component"),
-    "peak_rate": ("x2", "largest |x_2|"),
+    "terminal_error": Entry("x1", "|x_1| at t_f"),
+    "window_error": Entry("x1", "RMS of |x_1| over the window after t_f"),
+    "hold_error": Entry("x1", "largest |x_1| from t_f to t_end"),
+    "peak_torque": Entry("u", "largest commanded component of the input, before the actuator"),
+    "peak_torque_delivered": Entry("u", "largest delivered component of the input"),
+    "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
+    "effort": Entry("u s", "integral of the 1-norm of the delivered input"),
+    "settling_time": Entry("s", "time from which |x_1| stays below settling_angle"),
+    "chattering": Entry("u/s", "total variation of the delivered input per second after t_f, largest component"),
+    "peak_rate": Entry("x2", "largest |x_2|"),
 }
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 

@@ -21,6 +21,8 @@ from ptsmc_jax.simulation import metrics
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.computer import Computer, boot, decide, schedule, told
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
+from ptsmc_jax.simulation.metric_rows import Running
 
 Scalar = Float[Array, ""]
 
@@ -69,8 +71,8 @@ class Result(NamedTuple):
 class _State(NamedTuple):
     x: Any
     u: Array  # delivered at the end of the last interval
-    sight: metrics.Sight
-    running: metrics.Running
+    snapshot: Snapshot
+    running: Running
     status: Array
     bad_time: Array
 
@@ -78,7 +80,7 @@ class _State(NamedTuple):
 class _Course(NamedTuple):
     """What a run begins with and is judged by."""
 
-    judged: metrics.Judged
+    criteria: Criteria
     x0: Any
     first: Any  # the reference at t = 0
     arrival: Any  # and at t_f
@@ -99,11 +101,11 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.
     """
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
+    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
     whole = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
-    course = _Course(judged, x0, target, parts.reference(judged.t_f), jax.lax.stop_gradient(whole))
+    course = _Course(criteria, x0, target, parts.reference(criteria.t_f), jax.lax.stop_gradient(whole))
     loop = _continuous if isinstance(parts.clock, Graded) else _sampled
     return loop(parts, ticks, course, seed, trial, record)
 
@@ -138,24 +140,24 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels) if record else None
         start = state.x
         x = fly(start, now.t, drive, pushed, dt)
-        weights, torques = (1.0,), (delivered,)
+        weights, acting = (1.0,), (delivered,)
         if actuators.moves:
             weights = (1 / 6, 4 / 6, 1 / 6)
-            torques = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
+            acting = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
         if wheels is not None:  # in the middle too: a lag may turn the torque around within the period
             stored = jnp.stack([actuators.wheels_at(drive, s)[0] for s in (dt / 2, dt)])
-        span = _Torques((u,) * len(torques), torques, weights, drive.limited, stored)
+        torques = _Torques((u,) * len(acting), acting, weights, drive.limited, stored)
 
         def until(t: Scalar) -> Any:
             return fly(start, now.t, drive, pushed, t - now.t)
 
-        state = _advance(parts, course, state, now, target, x, span, until, dt / parts.substeps)
+        state = _advance(parts, course, state, now, target, x, torques, until, dt / parts.substeps)
         computer = computer._replace(told=None if actuators.holds else told(actuators, drive, dt))
         return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
 
     acting = actuators.begin(parts.plant.inputs)
     state = _begin(parts, course, acting.h)
-    first = state.sight
+    first = state.snapshot
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
     computer = boot(parts, seed, trial, course.x0, started)
     if actuators.holds:  # the state has it
@@ -216,25 +218,25 @@ def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record
         row = _row(parts, now.t, state.x, target, d_hat, u, u, s, dt > 0.0) if record else None
         x = parts.plant.normalise(x)
         _, _, (u_end, _) = rate(now.t_next, x, memory)
-        torques = (u, u_middle, u_end)
-        span = _Torques(torques, torques, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
-        return (_advance(parts, course, state, now, target, x, span, lambda t: x, dt), memory), row
+        three = (u, u_middle, u_end)
+        torques = _Torques(three, three, (1 / 6, 4 / 6, 1 / 6), jnp.asarray(False), None)
+        return (_advance(parts, course, state, now, target, x, torques, lambda t: x, dt), memory), row
 
     state = _begin(parts, course)
-    first = state.sight
+    first = state.snapshot
     (state, memory), rows = jax.lax.scan(step, (state, observer.begin()), (ticks, decays))
     return _finish(parts, course, first, state, memory, k2, rows, None)
 
 
 def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State:
-    judged, x0 = course.judged, course.x0
-    zero, none = jnp.zeros_like(judged.t_f), jnp.zeros(parts.plant.inputs)
-    sight = _sight(parts, course.first, x0)
+    criteria, x0 = course.criteria, course.x0
+    zero, none = jnp.zeros_like(criteria.t_f), jnp.zeros(parts.plant.inputs)
+    snapshot = _snapshot(parts, course.first, x0)
     state = _State(
         x=x0,
         u=none,
-        sight=sight,
-        running=metrics.begin(sight, judged, parts.plant.inputs, wheels),
+        snapshot=snapshot,
+        running=metrics.begin(Start(snapshot, parts.plant.inputs, wheels), criteria),
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
@@ -257,58 +259,58 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torq
 
     step: longest integration step taken in it [s].
     """
-    law, judged, target_next = parts.controller, course.judged, parts.reference(now.t_next)
-    sight = _sight(parts, target_next, x)
+    law, criteria, target_next = parts.controller, course.criteria, parts.reference(now.t_next)
+    snapshot = _snapshot(parts, target_next, x)
 
-    def errors() -> tuple:
-        return law.errors(state.x, target), law.errors(x, target_next)
+    def errors() -> Errors:
+        return Errors(*law.errors(state.x, target), *law.errors(x, target_next))
 
-    def arrival() -> tuple:
-        reached = until(judged.t_f)
-        return law.errors(reached, course.arrival)[0], law.angle(reached, course.arrival)
+    def arrival() -> Arrival:
+        reached = until(criteria.t_f)
+        return Arrival(law.errors(reached, course.arrival)[0], law.angle(reached, course.arrival))
 
-    span = metrics.Span(now.t, now.t_next, state.sight, sight, errors, arrival, state.u, *torques)
+    interval = Interval(now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, *torques)
     after = state._replace(
         x=x,
         u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
-        sight=sight,
-        running=metrics.update(state.running, span, judged),
+        snapshot=snapshot,
+        running=metrics.update(state.running, interval, criteria),
     )
     status, bad_time = _watch(parts, course, after, target_next, now.t_next, step, torques.delivered[-1])
     return after._replace(status=status, bad_time=bad_time)
 
 
 def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, world: _World | None) -> Result:
-    judged = course.judged
-    log, angle_at_t_f = None, state.running.late.angle_at_t_f
+    criteria = course.criteria
+    log, angle_at_t_f = None, state.running.arrival.angle
     acting = None if world is None else world.acting
     if rows is not None:  # the last row: the state at t_end, with the torque held until then or as it is there
-        target = parts.reference(judged.t_end)
-        hold = judged.t_end >= parts.controller.hand_over
+        target = parts.reference(criteria.t_end)
+        hold = criteria.t_end >= parts.controller.hand_over
         d_hat = parts.observer.estimate(memory)
-        about = state.x, target, d_hat, k2(judged.t_end)
+        about = state.x, target, d_hat, k2(criteria.t_end)
         if world is None:
-            u, s = parts.controller.torque(judged.t_end, hold, *about)
+            u, s = parts.controller.torque(criteria.t_end, hold, *about)
         else:  # the input is held
-            sample = Sample(judged.t_end, hold, parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+            sample = Sample(criteria.t_end, hold, parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
             _, s, _ = parts.controller.command(world.computer.law, sample, *about)
             u = state.u
         pushed = None if world is None else world.pushed
         wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
-        last = _row(parts, judged.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
+        last = _row(parts, criteria.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
-    found = metrics.finish(state.running, judged)
-    begun = metrics.begin(first, judged, parts.plant.inputs, None if acting is None else acting.h)
-    unbounded = (state.status == OK) & metrics.unbounded(found, begun)
-    missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * judged.settling_angle))
+    found = metrics.finish(state.running, criteria)
+    start = Start(first, parts.plant.inputs, None if acting is None else acting.h)
+    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria), criteria)
+    missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * criteria.settling_angle))
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
-    bad_time = jnp.where(unbounded, judged.t_end, jnp.where(missed, judged.t_f, state.bad_time))
+    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
     return Result(found, status, bad_time, log)
 
 
-def _sight(parts: Parts, target: Any, x: Any) -> metrics.Sight:
+def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     angle = parts.controller.angle(x, target)
-    return metrics.Sight(angle, parts.plant.speed(x), guards.norm(parts.plant.momentum(x)))
+    return Snapshot(angle, parts.plant.speed(x), guards.norm(parts.plant.momentum(x)))
 
 
 def _watch(

@@ -27,8 +27,9 @@ from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.simulation import metrics, rollout
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.clock import Graded
+from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
 UNKNOWN = 1e5  # 1 sigma of a state at t = 0, in those of its sensor: of no weight beside the first sample
@@ -66,8 +67,8 @@ def along(parts: Parts, log: Log) -> Floor:
     delay = 0 if parts.actuators is None else parts.actuators.delay
     seen = deviations(_model(parts, log, ticks), delay)
     squares = np.sum(seen.reshape(len(seen), 3, -1) ** 2, axis=2)
-    judged = metrics.Judged(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
-    total = float(_total(ticks.t, ticks.t_next, squares, judged))
+    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
+    total = float(_total(ticks.t, ticks.t_next, squares, criteria))
     return Floor(float(np.sqrt(total / float(parts.window))), ticks.t_next, np.sqrt(squares[:, 2]))
 
 
@@ -91,9 +92,9 @@ def _ticks(parts: Parts) -> Any:
 
 
 @programs.jit
-def _total(t: Array, t_next: Array, squares: Array, judged: metrics.Judged) -> Array:
+def _total(t: Array, t_next: Array, squares: Array, criteria: Criteria) -> Array:
     """Over the window, of squares (periods, 3) at start, middle and end."""
-    return jnp.sum(metrics.in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), judged))
+    return jnp.sum(integral_in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), criteria))
 
 
 def deviations(model: Model, delay: int = 0) -> np.ndarray:
@@ -187,7 +188,7 @@ class _Linear(NamedTuple):
     """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
 
     seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
-    cubic that `metrics` draws.
+    cubic that `metric_rows` draws.
     """
 
     move: Array  # (periods, n, n)

@@ -1,4 +1,4 @@
-"""Metrics against plain numpy on the history of the same run, and against hand-made spans."""
+"""Metrics against plain numpy on the history of the same run, and against hand-made intervals."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from ptsmc_jax.simulation import catalogues, metrics, rollout
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from tests.helpers import parts, vector
 
 
@@ -72,18 +73,18 @@ def test_settling_time(run):
     assert log.t[last] <= float(found.settling_time) <= log.t[last + 1]
 
 
-def span(t, t_next, angles, torque=0.0, delivered=None):
-    start, end = (metrics.Sight(vector(a), vector(a), vector(a)) for a in angles)
+def interval(t, t_next, angles, torque=0.0, delivered=None):
+    start, end = (Snapshot(vector(a), vector(a), vector(a)) for a in angles)
     u = vector([torque, 0.0, 0.0])
     got = u if delivered is None else vector([delivered, 0.0, 0.0])
     first, last = ((vector([a / 2, 0, 0]), jnp.zeros(3)) for a in angles)
-    return metrics.Span(
+    return Interval(
         t=vector(t),
         t_next=vector(t_next),
         start=start,
         end=end,
-        errors=lambda: (first, last),
-        arrival=lambda: (last[0], end.angle),
+        errors=lambda: Errors(*first, *last),
+        arrival=lambda: Arrival(last[0], end.angle),
         last_torque=jnp.zeros(3),
         commanded=(u,),
         delivered=(got,),
@@ -93,27 +94,27 @@ def span(t, t_next, angles, torque=0.0, delivered=None):
     )
 
 
-def judge(spans, t_end=4.0):
-    judged = metrics.Judged(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
-    running, torque = metrics.begin(spans[0].start, judged, 3), jnp.zeros(3)
-    for one in spans:
-        running = metrics.update(running, one._replace(last_torque=torque), judged)
+def judge(intervals, t_end=4.0):
+    criteria = Criteria(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
+    running, torque = metrics.begin(Start(intervals[0].start, 3, None), criteria), jnp.zeros(3)
+    for one in intervals:
+        running = metrics.update(running, one._replace(last_torque=torque), criteria)
         torque = one.delivered[-1] if one.t_next > one.t else torque
-    return metrics.finish(running, judged)
+    return metrics.finish(running, criteria)
 
 
 def test_settling_interpolates_restarts_and_is_nan_where_it_never_comes():
-    falls = judge([span(0, 1, (1.0, 0.5)), span(1, 2, (0.5, 0.3)), span(2, 4, (0.3, 0.05))])
+    falls = judge([interval(0, 1, (1.0, 0.5)), interval(1, 2, (0.5, 0.3)), interval(2, 4, (0.3, 0.05))])
     np.testing.assert_allclose(falls.settling_time, 2.0 + 2.0 * 0.2 / 0.25)
-    again = judge([span(0, 1, (0.05, 0.05)), span(1, 2, (0.05, 0.3)), span(2, 4, (0.3, 0.05))])
+    again = judge([interval(0, 1, (0.05, 0.05)), interval(1, 2, (0.05, 0.3)), interval(2, 4, (0.3, 0.05))])
     assert float(again.settling_time) > 2.0
-    assert float(judge([span(0, 1, (0.05, 0.05)), span(1, 4, (0.05, 0.01))]).settling_time) == 0.0
-    assert np.isnan(float(judge([span(0, 1, (1.0, 0.05)), span(1, 4, (0.05, 0.2))]).settling_time))
-    assert np.isnan(float(judge([span(0, 1, (1.0, 0.05)), span(1, 4, (0.05, np.nan))]).settling_time))
+    assert float(judge([interval(0, 1, (0.05, 0.05)), interval(1, 4, (0.05, 0.01))]).settling_time) == 0.0
+    assert np.isnan(float(judge([interval(0, 1, (1.0, 0.05)), interval(1, 4, (0.05, 0.2))]).settling_time))
+    assert np.isnan(float(judge([interval(0, 1, (1.0, 0.05)), interval(1, 4, (0.05, np.nan))]).settling_time))
 
 
 def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
-    found = judge([span(0, 1, (1, 1), 3.0, 2.0), span(1, 3, (1, 1), 1.0), span(3, 4, (1, 1), -1.0)])
+    found = judge([interval(0, 1, (1, 1), 3.0, 2.0), interval(1, 3, (1, 1), 1.0), interval(3, 4, (1, 1), -1.0)])
     np.testing.assert_allclose(found.saturated, 0.25)
     np.testing.assert_allclose([found.peak_torque, found.peak_torque_delivered], [3.0, 2.0])
     np.testing.assert_allclose(found.effort, 2.0 + 2.0 + 1.0)
@@ -121,14 +122,15 @@ def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
 
 
 def test_an_interval_of_length_zero_changes_nothing():
-    plain = [span(0, 1, (1.0, 0.5), 1.0), span(1, 4, (0.5, 0.2), 0.5)]
-    with_empty = [plain[0], span(1, 1, (9.0, 9.0), 99.0), plain[1]]
+    plain = [interval(0, 1, (1.0, 0.5), 1.0), interval(1, 4, (0.5, 0.2), 0.5)]
+    with_empty = [plain[0], interval(1, 1, (9.0, 9.0), 99.0), plain[1]]
     for a, b in zip(judge(plain), judge(with_empty), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_catalogue_names_every_metric():
-    assert tuple(catalogues.CATALOGUE) == metrics.Metrics._fields
+    rows = {name for catalogue in catalogues.CATALOGUES.values() for name in catalogue}
+    assert rows == set(metrics.Metrics._fields)
 
 
 @pytest.mark.parametrize("flight", [False, True])

@@ -139,8 +139,8 @@ class _File:
         )
         yield f"{'#' if live is None else ''}[requirements]"
         for name, limit in (live or REQUIREMENTS).items():
-            unit, meaning = catalogue[name]
-            yield from _line(live is None, name, limit, f"{meaning} [{unit}]")
+            entry = catalogue[name]
+            yield from _line(live is None, name, limit, f"{entry.meaning} [{entry.unit}]")
 
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """What the keys of a table of this kind are where they are absent, as far as they are anything."""

@@ -246,7 +246,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     from ptsmc_jax.simulation.catalogues import CATALOGUES
 
-    summary, units = result.summary, {name: unit for name, (unit, _) in CATALOGUES[result.kind].items()}
+    summary, units = result.summary, {name: entry.unit for name, entry in CATALOGUES[result.kind].items()}
     known = result.scenario.get("requirements", {}).get("peak_torque")
     limit = known.get("limit") if isinstance(known, dict) else known
     caption = "Smaller is better in both. Point at one for its gains; bars are 95 % intervals, dashed is the limit."

@@ -37,8 +37,13 @@ def run(summary: Summary, kind: str) -> Table:
     none = "never" if summary["status"] in ("ok", "missed") else "-"
     known = {name: said for name, said in CATALOGUES[kind].items() if name in summary}
     rows = [
-        (name, none if (value := summary[name]) is None or value != value else f"{value:.5g}", unit, meaning)
-        for name, (unit, meaning) in known.items()
+        (
+            name,
+            none if (value := summary[name]) is None or value != value else f"{value:.5g}",
+            entry.unit,
+            entry.meaning,
+        )
+        for name, entry in known.items()
     ]
     return Table(("metric", "value", "unit", "meaning"), rows)
 

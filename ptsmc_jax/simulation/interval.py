@@ -1,0 +1,86 @@
+"""One interval of a run as its metrics see it: both ends, the torques in between, what the run is judged by."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+class Criteria(NamedTuple):
+    """Times that the metrics refer to [s] and the settling angle [rad]."""
+
+    t_f: Array
+    t_end: Array
+    window: Array
+    settling_angle: Array
+
+
+class Snapshot(NamedTuple):
+    """What the metrics see of the true state at one time."""
+
+    angle: Array  # to the reference [rad]; for other plants |x_1|
+    rate: Array  # `Plant.speed`, |w| [rad/s]
+    momentum: Array  # |J w| [N m s]
+
+
+class Start(NamedTuple):
+    """What the metrics see at t = 0."""
+
+    snapshot: Snapshot
+    inputs: int  # of the plant
+    wheel_momentum: Array | None  # (wheels,) [N m s]; None: no wheels
+
+
+class Arrival(NamedTuple):
+    """The true state at t_f as the law sees it; zero before."""
+
+    error: Array  # (m,) what the law drives to zero [-], for other plants x_1
+    angle: Array  # to the reference [rad]
+
+
+class Errors(NamedTuple):
+    """What the law drives to zero at both ends of an interval, (m,) [-], for other plants x_1, and its rate [1/s]."""
+
+    start: Array
+    start_rate: Array
+    end: Array
+    end_rate: Array
+
+
+class Interval(NamedTuple):
+    """A control period, or a step of the continuous loop; torques at `weights`, quadrature nodes in it.
+
+    There is one node where the torque is held.
+    """
+
+    t: Array  # [s]
+    t_next: Array
+    start: Snapshot
+    end: Snapshot
+    errors: Callable[[], Errors]  # made from t_f on only
+    arrival: Callable[[], Arrival]  # of an interval that t_f lies in
+    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
+    commanded: tuple[Array, ...]  # (m,) each [N m]
+    delivered: tuple[Array, ...]
+    weights: tuple[float, ...]  # sum to 1
+    limited: Array  # bool: a limit of the actuators cuts the command
+    wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
+
+    @property
+    def length(self) -> Array:
+        """In s."""
+        return self.t_next - self.t
+
+
+def integral_in_window(t: Array, t_next: Array, squares: tuple[Array, Array, Array], criteria: Criteria) -> Array:
+    """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s]."""
+    dt, (g0, g1, g2) = t_next - t, squares
+
+    def fraction(time: Array) -> Array:
+        return jnp.clip((time - t) / dt, 0.0, 1.0)
+
+    def primitive(x: Array) -> Array:
+        return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))
+
+    return dt * (primitive(fraction(criteria.t_f + criteria.window)) - primitive(fraction(criteria.t_f)))

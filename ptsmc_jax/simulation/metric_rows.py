@@ -1,0 +1,139 @@
+"""Every metric, a row each: what it remembers at t = 0, after each interval, and the value at the end of the run."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ptsmc_jax.numerics import guards
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, integral_in_window
+
+
+class Running(NamedTuple):
+    """Where a run stands: the state at t_f, and what each metric remembers, by its name."""
+
+    arrival: Arrival
+    memories: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric comes about; its unit and meaning stand in `catalogues`, for the plants that have it.
+
+    It changes after every interval of positive length by `update`, or by `update_late`, which sees intervals that
+    reach beyond t_f only, and the errors at their ends. Its value is what it remembers at t_end, unless `value` makes
+    another one of it. A metric that a run lacks is NaN from t = 0 on.
+    """
+
+    begin: Callable[[Start, Criteria], Any] = lambda start, criteria: jnp.zeros_like(criteria.t_f)
+    update: Callable[[Any, Interval, Criteria], Any] | None = None
+    update_late: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
+    value: Callable[[Any, Running, Criteria], Array] = lambda memory, running, criteria: memory
+    may_lack: bool = False  # a run that is finite may end with NaN
+
+
+def _largest(torques: tuple[Array, ...]) -> Array:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques]))
+
+
+def _effort(effort: Array, interval: Interval, criteria: Criteria) -> Array:
+    norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(interval.weights, interval.delivered, strict=True))
+    return effort + interval.length * sum(norms)
+
+
+def _unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
+    return ~(snapshot.angle < criteria.settling_angle)  # an angle that is no number is not settled
+
+
+def _settled_at(settled_at: Array, interval: Interval, criteria: Criteria) -> Array:
+    """End of the last time spent above the settling angle [s], by linear interpolation; infinite while above it."""
+    start, end = interval.start, interval.end
+    above, above_next = _unsettled(start, criteria), _unsettled(end, criteria)
+    drop = jnp.where(above & ~above_next, start.angle - end.angle, 1.0)
+    crossing = interval.t + interval.length * (start.angle - criteria.settling_angle) / drop
+    return jnp.where(above_next, jnp.inf, jnp.where(above, crossing, settled_at))
+
+
+def _square_error(square: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    """Integral of |error|^2 over the window so far; fourth order, once differentiable in t_f.
+
+    The error in between is the cubic through both ends and slopes (Hermite), its square the parabola through the ends
+    and the middle, integrated exactly.
+    """
+    middle = (errors.start + errors.end) / 2 + interval.length / 8 * (errors.start_rate - errors.end_rate)
+    g0, g1, g2 = (jnp.sum(e * e) for e in (errors.start, middle, errors.end))
+    return square + integral_in_window(interval.t, interval.t_next, (g0, g1, g2), criteria)
+
+
+def _hold_error(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, guards.norm(errors.end)), largest)
+
+
+def _variation(variation: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    """Of the delivered torque from t_f on, (m,) [N m]: the jump at the start of the interval, then what is inside."""
+    delivered = interval.delivered
+    jump = jnp.where(interval.t > criteria.t_f, jnp.abs(delivered[0] - interval.last_torque), 0.0)
+    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
+    return variation + jump + jnp.where(interval.t >= criteria.t_f, inside, 0.0)
+
+
+def _chattering(variation: Array, running: Running, criteria: Criteria) -> Array:
+    still = criteria.t_end - criteria.t_f
+    return jnp.max(variation) / jnp.where(still > 0.0, still, 1.0)
+
+
+def _wheels_at_start(start: Start, criteria: Criteria) -> Array:
+    zero, stored = jnp.zeros_like(criteria.t_f), start.wheel_momentum
+    return jnp.full_like(zero, jnp.nan) if stored is None else jnp.max(jnp.abs(stored))
+
+
+def _wheels(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+    stored = interval.wheel_momentum
+    return largest if stored is None else jnp.maximum(largest, jnp.max(jnp.abs(stored)))
+
+
+METRICS = {
+    "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
+    "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
+    "window_error": Metric(
+        update_late=_square_error, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
+    ),
+    "hold_error": Metric(
+        update_late=_hold_error,
+        value=lambda largest, run, criteria: jnp.maximum(largest, guards.norm(run.arrival.error)),
+    ),
+    "peak_torque": Metric(
+        update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.commanded))
+    ),
+    "peak_torque_delivered": Metric(
+        update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.delivered))
+    ),
+    "saturated": Metric(
+        update=lambda limited_for, interval, criteria: limited_for + interval.length * interval.limited,
+        value=lambda limited_for, run, criteria: jnp.where(
+            jnp.isnan(run.memories["effort"]), jnp.nan, limited_for / criteria.t_end
+        ),
+    ),
+    "effort": Metric(update=_effort),
+    "settling_time": Metric(
+        begin=lambda start, criteria: jnp.where(_unsettled(start.snapshot, criteria), jnp.inf, 0.0),
+        update=_settled_at,
+        value=lambda settled_at, run, criteria: jnp.where(jnp.isfinite(settled_at), settled_at, jnp.nan),
+        may_lack=True,
+    ),
+    "chattering": Metric(
+        begin=lambda start, criteria: jnp.zeros(start.inputs), update_late=_variation, value=_chattering
+    ),
+    "peak_rate": Metric(
+        begin=lambda start, criteria: start.snapshot.rate,
+        update=lambda largest, interval, criteria: jnp.maximum(largest, interval.end.rate),
+    ),
+    "peak_momentum": Metric(
+        begin=lambda start, criteria: start.snapshot.momentum,
+        update=lambda largest, interval, criteria: jnp.maximum(largest, interval.end.momentum),
+    ),
+    "peak_wheel_momentum": Metric(begin=_wheels_at_start, update=_wheels),
+}
