@@ -4,8 +4,10 @@
 """
 
 import sys
+import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from ptsmc_jax.scenario import errors, keys, layouts
@@ -111,7 +113,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
         yield from _dispersion(struct)
         return
     borrowed = issubclass(struct, Attitude) and table != "initial"
-    fallback = layouts.defaults(plant, 2, "prescribed_time").get(table, {}) if table == "initial" else {}
+    fallback = _case_i(plant).get(table, {}) if table == "initial" else {}
     rows = [
         [f"`{key.name}`", key.allowed, _default(fallback.get(key.name, key.default)), key.unit, key.meaning]
         for key in keys.of(struct)
@@ -121,6 +123,12 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
         yield _grid("key allowed default unit meaning", rows)
     if borrowed:
         yield "And one of the attitude keys of `[initial]`."
+
+
+def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
+    """The defaults of a plant that no key tells, under the paper's law."""
+    made = layouts.SCENARIOS[plant]
+    return made.fallback(typing.cast(type[Table], made.TABLES["plant"])(), (), "prescribed_time")
 
 
 def _dispersion(struct: type[Table]) -> Iterator[str]:

@@ -35,15 +35,14 @@ HOUSE = {
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """
             errors systems values
-            attitude_keys device_tables dispersion_tables keys plant_tables
-            scales
-            gain_bounds
-            own
+            attitude_keys dispersion_tables gain_record keys scales
+            device_tables gain_bounds own start_checks
             disturbance_tables law_record observer_tables reference_tables
             baseline_tables
             own_laws
             law_tables
             tables
+            spacecraft_scenario state_scenario
             layouts
             checks parsing
             free_gains timing

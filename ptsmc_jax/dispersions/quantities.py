@@ -96,7 +96,7 @@ def _positive(given: np.ndarray) -> np.ndarray:
 
 def _attitude() -> Quantity:
     return Quantity(
-        lambda parts: numbered("initial_q", 4) if isinstance(parts.initial, AttitudeState) else [],
+        lambda parts: numbered("initial_q", 4) if parts.plant.attitude else [],
         lambda parts: parts.initial.q,
         lambda parts, q: replace(parts, initial=AttitudeState(q, parts.initial.w)),
         _unit,
@@ -105,7 +105,7 @@ def _attitude() -> Quantity:
 
 def _rate() -> Quantity:
     return Quantity(
-        lambda parts: numbered("initial_w", 3) if isinstance(parts.initial, AttitudeState) else [],
+        lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
         lambda parts: parts.initial.w,
         lambda parts, w: replace(parts, initial=AttitudeState(parts.initial.q, w)),
     )
@@ -113,7 +113,7 @@ def _rate() -> Quantity:
 
 def _state() -> Quantity:
     return Quantity(
-        lambda parts: [] if isinstance(parts.initial, AttitudeState) else numbered("initial_x", parts.initial.size),
+        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.initial.size),
         lambda parts: parts.initial,
         lambda parts, x: replace(parts, initial=x),
     )

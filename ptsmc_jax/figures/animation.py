@@ -10,7 +10,6 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.figure import Figure
 
 from ptsmc_jax.figures.style import RC, STYLES
-from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.simulation.rollout import Log, Parts
 
 SIDES = (0.5, 0.35, 0.25)  # half edges of the box that is drawn; shapes say nothing of the inertia
@@ -42,7 +41,7 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
 
     Frames are evenly spread over the run. Raises ValueError where the plant is no spacecraft, or for fewer than two.
     """
-    if not isinstance(parts.plant, Spacecraft):
+    if not parts.plant.attitude:
         raise ValueError("only a spacecraft can be animated; look at a run's plot() instead")
     if frames < 2:
         raise ValueError(f"frames is {frames}, but must be at least 2")

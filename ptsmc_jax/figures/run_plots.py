@@ -16,7 +16,6 @@ from ptsmc_jax.figures.style import RC, STYLES, TIME, figure_of
 from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.paper.remark_2 import Measured
-from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
@@ -31,7 +30,7 @@ def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
         figures["wheels"] = wheels(parts, log)
-    if isinstance(parts.plant, Spacecraft):
+    if parts.plant.attitude:
         return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
     return {"states": states(parts, log), **figures}
 
@@ -212,7 +211,7 @@ def observers(found: Sequence[Measured]) -> Figure:
 
 def _names(parts: Parts) -> tuple[str, str, str]:
     """Labels of the error and the input, and the input's unit behind a number."""
-    if not isinstance(parts.plant, Spacecraft):
+    if not parts.plant.attitude:
         return "$|x_1|$", "input u", ""
     additive = isinstance(parts.controller, PrescribedTime)
     return "|$\\varepsilon_1$| [-]" if additive else "|v| [-]", "torque [N m]", " N m"

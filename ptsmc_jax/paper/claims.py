@@ -10,7 +10,6 @@ import numpy as np
 
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.scenario import from_tables, study
 
 _CHAIN = {"disturbance_bound": 0.01, "delta": 0.01}  # the example of Remark 1; Section 3 names no delta
@@ -67,8 +66,8 @@ def claims(flown: dict[str, Run]) -> list[Claim]:
 
 def _size(run: Run) -> np.ndarray:
     """Norm of the state of a chain, or largest component of the attitude error vector, over time."""
-    chain = isinstance(run.parts.plant, integrator_chain.Chain)
-    return np.linalg.norm(run.log.x, axis=1) if chain else np.abs(run.log.error).max(axis=1)
+    attitude = run.parts.plant.attitude
+    return np.abs(run.log.error).max(axis=1) if attitude else np.linalg.norm(run.log.x, axis=1)
 
 
 def _at_and_after(run: Run) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ class Plant(ABC):
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
+    unknown_pace: ClassVar[bool] = False  # made of functions of one's own: how fast it is, is seen along a run only
+    attitude: ClassVar[bool] = False  # its state holds a quaternion q and a body rate w
 
     @property
     def inputs(self) -> int:

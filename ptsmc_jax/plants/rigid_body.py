@@ -1,7 +1,7 @@
 """The rigid spacecraft of (1), (2), with reaction wheels."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +27,7 @@ class AttitudeState(NamedTuple):
 class Spacecraft(Plant):
     """Rigid spacecraft, J w' = -w x J w + u + d (2); build it with `spacecraft`, which checks the inertia."""
 
+    attitude: ClassVar[bool] = True
     inertia: Leaf  # (3, 3) J [kg m^2]
     inertia_inverse: Leaf  # (3, 3) [1/(kg m^2)], factored once: no solve in the loop
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ class System(Plant):
     H: Any  # -> (n,)
     G: Any  # -> (n, n)
     D: Any  # -> (n, n), or None for the identity
+    unknown_pace: ClassVar[bool] = True
     inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
     inertia_inverse: Leaf  # (n, n)
 

@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.errors import show, wrong
-from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, between
+from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, between
 from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.values import NotNegative, Positive
 
@@ -35,7 +35,7 @@ class BaselineTable(LawTable, frozen=True):
         """The law of eps'' = a + d, a class of `laws` with a field for each gain."""
         raise NotImplementedError
 
-    def error_motion(self, plant: str) -> Any:
+    def error_motion(self, motion: str) -> Any:
         """The error that it drives to zero."""
         from ptsmc_jax.laws import error_motions
 
@@ -44,17 +44,17 @@ class BaselineTable(LawTable, frozen=True):
             "chain": error_motions.ErrorOfChain,
             "system": error_motions.ErrorOfSystem,
         }
-        return errors[plant]
+        return errors[motion]
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """The law on the error of this kind of plant."""
         from ptsmc_jax.laws.acceleration import on
 
-        return on(self.error_motion(plant), self.law())
+        return on(self.error_motion(motion), self.law())
 
     def check(self, scenario: Any) -> None:
         """They are laws of second order."""
-        order = getattr(scenario.plant, "order", 2)
+        order = scenario.order
         if order != 2:
             raise wrong("plant.order", order, f"2 with controller.kind = {show(self.kind)}, a law of second order")  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -88,11 +88,11 @@ class PDController(BaselineTable, frozen=True):
 
         return PD
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """That of a spacecraft turns the body, not the error vector."""
         from ptsmc_jax.laws.pd import QuaternionPD
 
-        return QuaternionPD if plant == "spacecraft" else super().physics(plant)
+        return QuaternionPD if motion == "spacecraft" else super().physics(motion)
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """The rate at the goal if all of its spring's potential energy had become motion."""

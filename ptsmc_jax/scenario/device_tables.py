@@ -1,10 +1,20 @@
-"""The tables of a scenario file that name devices: actuators, sensors, wheels and the attitude filter."""
+"""The tables of a scenario file that name devices: actuators and sensors, wheels and filters, and what they build.
 
-from typing import Annotated, Literal
+A filter is its physics in `devices`, a table here, and a row in `FILTERS`; wheels likewise in `WHEELS`.
+"""
 
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
 from msgspec import Meta
 
-from ptsmc_jax.scenario.values import Count, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax import formulas
+from ptsmc_jax.scenario import errors
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.gain_record import Choice, GainBounds
+from ptsmc_jax.scenario.values import Count, Kinds, NotNegative, NotNegatives, Positive, Table, Three
 
 
 class Actuators(Table, frozen=True):
@@ -23,6 +33,39 @@ class Actuators(Table, frozen=True):
     torque_lag: Positive | None = None
     torque_step: Positive | None = None
     delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
+    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # that can be drawn: the keys, any of which gives it
+
+    @property
+    def periods_late(self) -> int:
+        """Control periods from measuring to acting."""
+        return self.delay or 0
+
+    @property
+    def moving(self) -> bool:
+        """Whether the torque changes within a control period."""
+        return self.torque_rate_limit is not None or self.torque_lag is not None
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+
+    def noise_of_s(self, scenario: Any) -> float:
+        """Noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample, in its units."""
+        raise NotImplementedError
+
+    def sensors(self, scenario: Any) -> Any:
+        """Parts of `devices.sensors`; None: the law sees the true state."""
+        raise NotImplementedError
+
+    def actuators(self, wheels: Any) -> Any:
+        """Limits, lag, delay and wheels (None: none); None where the torque is the commanded one."""
+        from ptsmc_jax.devices.actuators import Actuators as Physics
+        from ptsmc_jax.numerics.pytrees import vector
+
+        values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
+        if wheels is None and self.periods_late == 0 and all(value is None for value in values):
+            return None
+        limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
+        return Physics(limit, rate_limit, lag, step, wheels, self.periods_late)
 
 
 class Hardware(Actuators, frozen=True):
@@ -43,6 +86,55 @@ class Hardware(Actuators, frozen=True):
     rate_bias: NotNegative | None = None
     rate_bias_walk: NotNegative | None = None
     star_tracker_every: Count | None = None
+    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "attitude_noise": ("attitude_noise",),
+        "rate_noise": ("rate_noise", "rate_noise_density"),
+        "torque_limit": ("torque_limit",),
+    }
+
+    def gyro_noise(self, period: float) -> float:
+        """Noise of the gyro, 1 sigma a sample [rad/s]."""
+        return self.rate_noise or formulas.per_sample(self.rate_noise_density or 0.0, period)
+
+    def interval(self, period: float) -> float:
+        """Between two samples of the star tracker [s]."""
+        return period * (self.star_tracker_every or 1)
+
+    def check(self, scenario: Any) -> None:
+        """One noise of the gyro; a star tracker that pauses needs a filter."""
+        if self.rate_noise is not None and self.rate_noise_density is not None:
+            raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
+        if self.star_tracker_every not in (None, 1) and not scenario.estimator.on:
+            raise ScenarioError(
+                f"hardware.star_tracker_every is {self.star_tracker_every}, but without a filter the law needs a "
+                'sample every period; allowed is 1, or [filter] with kind = "steady_state"'
+            )
+
+    def noise_of_s(self, scenario: Any) -> float:
+        """The error is half an angle: s = eps' + c eps has sigma_s = (sigma_w^2 + c^2 sigma_q^2)^(1/2) / 2 [1/s].
+
+        Of the additive error at most that, where the reference is turned away from the inertial axes.
+        """
+        rate = getattr(scenario.controller, "surface_rate", 1.0)
+        return 0.5 * math.hypot(self.gyro_noise(scenario.loop.period), rate * (self.attitude_noise or 0.0))
+
+    def sensors(self, scenario: Any) -> Any:
+        """Star tracker, gyro and filter."""
+        from ptsmc_jax.devices.sensors import Sensors
+        from ptsmc_jax.numerics.pytrees import vector
+
+        noises = (self.attitude_noise, self.rate_noise, self.rate_noise_density, self.rate_bias, self.rate_bias_walk)
+        if not scenario.estimator.on and all(noise is None for noise in noises):
+            return None
+        period, walk = scenario.loop.period, self.rate_bias_walk
+        return Sensors(
+            vector(self.attitude_noise or 0.0),
+            vector(self.gyro_noise(period)),
+            None if self.rate_bias is None else vector(self.rate_bias),
+            None if walk is None else vector(formulas.per_sample(walk, period)),
+            scenario.estimator.build(scenario),
+            self.star_tracker_every or 1,
+        )
 
 
 class StateHardware(Actuators, frozen=True):
@@ -56,15 +148,63 @@ class StateHardware(Actuators, frozen=True):
     """
 
     state_noise: NotNegatives | None = None
+    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "state_noise": ("state_noise",),
+        "torque_limit": ("torque_limit",),
+    }
+
+    def check(self, scenario: Any) -> None:
+        """One number for each state."""
+        states = len(scenario.plant.x0)
+        if self.state_noise is not None and len(self.state_noise) != states:
+            raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")
+
+    def noise_of_s(self, scenario: Any) -> float:
+        """By the weights of the surface; of a system that of its noisiest surface."""
+        law = scenario.controller
+        a, rate = getattr(law, "a", (1.0,)), getattr(law, "surface_rate", 1.0)
+        weights = [one * rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
+        noises = self.state_noise or [0.0] * len(weights)
+        if len(noises) == len(weights):
+            return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=True)))
+        inputs = len(noises) // 2  # a system's positions and rates
+        return max(math.hypot(weights[0] * x, weights[1] * v) for x, v in zip(noises, noises[inputs:], strict=False))
+
+    def sensors(self, scenario: Any) -> Any:
+        """`sensors.StateSensor`."""
+        from ptsmc_jax.devices.sensors import StateSensor
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return None if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
-class NoFilter(Table, frozen=True):
+class FilterTable(Table, frozen=True):
+    """An attitude filter, or none."""
+
+    on: ClassVar[bool] = True
+    gains: ClassVar[Mapping[str, GainBounds]] = {}  # that tuning may move
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+
+    def build(self, scenario: Any) -> Any:
+        """A part of `devices` that `Sensors` reads through; None: the samples themselves."""
+
+
+class NoFilter(FilterTable, frozen=True):
     """None: the law sees the samples themselves."""
 
     kind: Literal["none"] = "none"
+    on: ClassVar[bool] = False
 
 
-class SteadyStateFilter(Table, frozen=True):
+def _usual_bandwidth(choice: Choice) -> tuple[float, float]:
+    scenario = choice.scenario
+    width = scenario.estimator.width(scenario)
+    return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
+
+
+class SteadyStateFilter(FilterTable, frozen=True):
     """A steady-state attitude filter, propagated by the gyro, corrected by the star tracker.
 
     Attributes:
@@ -73,6 +213,34 @@ class SteadyStateFilter(Table, frozen=True):
 
     kind: Literal["steady_state"] = "steady_state"
     bandwidth: Positive | None = None
+    gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": GainBounds(_usual_bandwidth)}
+
+    def width(self, scenario: Any) -> float:
+        """Its bandwidth [rad/s]: where star tracker and gyro weigh the same, if none is given."""
+        if self.bandwidth is not None:
+            return self.bandwidth
+        table, period = scenario.devices, scenario.loop.period
+        noises = table.attitude_noise or 0.0, table.gyro_noise(period)
+        return formulas.best_bandwidth(*noises, period, table.interval(period))
+
+    def check(self, scenario: Any) -> None:
+        """Noises that the bandwidth follows from."""
+        table = scenario.devices
+        noisy = table.attitude_noise and (table.rate_noise or table.rate_noise_density)
+        if self.bandwidth is None and not noisy:
+            raise ScenarioError(
+                "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
+            )
+
+    def build(self, scenario: Any) -> Any:
+        """`devices.attitude_filter`."""
+        from ptsmc_jax.devices.attitude_filter import attitude_filter
+        from ptsmc_jax.numerics.pytrees import vector
+
+        table, period = scenario.devices, scenario.loop.period
+        star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
+        every = table.star_tracker_every or 1
+        return attitude_filter(*(vector(v) for v in (self.width(scenario), star, gyro, walk, period)), every)
 
 
 class WheelLimits(Table, frozen=True):
@@ -89,6 +257,33 @@ class WheelLimits(Table, frozen=True):
     momentum_limit: Positive | None = None
     momentum: Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None = None
 
+    def spin_axes(self) -> Any:
+        """Of each wheel in body axes, (wheels, 3)."""
+        raise NotImplementedError
+
+    def refused(self, error: ValueError) -> ScenarioError:
+        """What is said of axes that are not allowed."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raise ScenarioError where its keys contradict each other."""
+        axes = self.spin_axes()
+        try:
+            formulas.wheel_axes(axes)
+        except ValueError as error:
+            raise self.refused(error) from None
+        if self.momentum is not None and len(self.momentum) != len(axes):
+            raise wrong("wheels.momentum", self.momentum, f"a list of {len(axes)} numbers, one for each wheel")
+        limit = self.momentum_limit
+        if limit is not None and any(abs(h) > limit for h in self.momentum or ()):
+            raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
+
+    def build(self) -> Any:
+        """`devices.reaction_wheels`."""
+        from ptsmc_jax.devices.reaction_wheels import wheels
+
+        return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
+
 
 class PyramidWheels(WheelLimits, frozen=True):
     """Four reaction wheels, 90 degrees apart about z; lag, step and rate limit of [hardware] are theirs.
@@ -99,6 +294,15 @@ class PyramidWheels(WheelLimits, frozen=True):
 
     kind: Literal["pyramid"] = "pyramid"
     cant_deg: Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")] = 35.264389682754654
+
+    def spin_axes(self) -> Any:
+        """Four, tilted."""
+        return formulas.pyramid(np.deg2rad(self.cant_deg))
+
+    def refused(self, error: ValueError) -> ScenarioError:
+        """The tilt is to blame."""
+        enough = "far enough from 0 and 90 degrees for the wheels to span all directions"
+        return wrong("wheels.cant_deg", self.cant_deg, enough)
 
 
 class AxesWheels(WheelLimits, frozen=True):
@@ -114,3 +318,16 @@ class AxesWheels(WheelLimits, frozen=True):
         (0.0, 1.0, 0.0),
         (0.0, 0.0, 1.0),
     )
+
+    def spin_axes(self) -> Any:
+        """Those of the table."""
+        return np.asarray(self.axes)
+
+    def refused(self, error: ValueError) -> ScenarioError:
+        """What is wrong with them."""
+        return ScenarioError(f"wheels.axes is {errors.brief(self.spin_axes().tolist())}: {error}")
+
+
+# by kind, the default first
+FILTERS: Kinds = {"steady_state": SteadyStateFilter, "none": NoFilter}
+WHEELS: Kinds = {"pyramid": PyramidWheels, "axes": AxesWheels}

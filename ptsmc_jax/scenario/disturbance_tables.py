@@ -6,6 +6,7 @@ A disturbance is its physics in `signals.disturbances`, a table here, and a row 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -29,6 +30,11 @@ class DisturbanceTable(Kind, frozen=True):
     """A disturbance, alone or one of several."""
 
     sampled_only: ClassVar[bool] = False
+
+    @property
+    def together(self) -> tuple[Any, ...]:
+        """The disturbances that act at once."""
+        return (self,)
 
     def quickest(self) -> float:
         """How fast it changes [rad/s]."""
@@ -171,6 +177,16 @@ class SumDisturbance(Kind, frozen=True):
 
     kind: Literal["sum"] = "sum"
     terms: Annotated[tuple[Any, ...], Meta(description=TERMS)] = ()
+
+    @property
+    def together(self) -> tuple[Any, ...]:
+        """All of them."""
+        return self.terms
+
+    def filled(self, scenario: Any, inputs: int) -> Any:
+        """Each with its lists where they are absent."""
+        each = tuple(term.filled(scenario, inputs) for term in self.terms)
+        return msgspec.structs.replace(self, terms=each)
 
 
 class EachRandomWalk(RandomWalk, frozen=True):

@@ -4,23 +4,10 @@ import math
 
 import msgspec
 
-from ptsmc_jax import formulas
-from ptsmc_jax.scenario import device_tables, errors, parsing, scales, tables
+from ptsmc_jax.scenario import errors, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import Choice, GainBounds
+from ptsmc_jax.scenario.gain_record import Choice, GainBounds
 from ptsmc_jax.scenario.tables import Scenario
-
-
-def filter_bandwidth(scenario: Scenario) -> float:
-    """Bandwidth of the scenario's filter [rad/s]: where star tracker and gyro weigh the same, if it gives none."""
-    assert isinstance(scenario.filter, device_tables.SteadyStateFilter)
-    if scenario.filter.bandwidth is not None:
-        return scenario.filter.bandwidth
-    table, period = scenario.hardware, scenario.loop.period
-    assert isinstance(table, device_tables.Hardware)
-    return formulas.best_bandwidth(
-        table.attitude_noise or 0.0, scales.gyro_noise(table, period), period, _interval(scenario)
-    )
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
@@ -32,8 +19,7 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     if free is None:
         law = scenario.controller
         first, rest = law.free(sampled=scenario.loop.mode == "sampled")
-        filtered = ("filter_bandwidth",) if _has_bandwidth(scenario) else ()
-        free = (*first, *scenario.observer.gains, *rest, *filtered)
+        free = (*first, *scenario.observer.gains, *rest, *scenario.estimator.gains)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -68,7 +54,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
             f"{said} observer.kind = {errors.show(scenario.observer.kind)} has no gain of that name; "
             "allowed is observer_gain with an observer of another kind"
         )
-    if "filter_bandwidth" in free and not _has_bandwidth(scenario):
+    if "filter_bandwidth" in free and "filter_bandwidth" not in scenario.estimator.gains:
         raise ScenarioError(
             f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
         )
@@ -106,14 +92,7 @@ def _check_bounds(choice: Choice, name: str) -> None:
 
 def _gain(scenario: Scenario, name: str) -> GainBounds:
     """The bounds of a gain that the scenario has."""
-    return {**scenario.controller.gains, **scenario.observer.gains, "filter_bandwidth": GainBounds(_usual_bandwidth)}[
-        name
-    ]
-
-
-def _usual_bandwidth(choice: Choice) -> tuple[float, float]:
-    width = filter_bandwidth(choice.scenario)
-    return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / _interval(choice.scenario)))
+    return {**scenario.controller.gains, **scenario.observer.gains, **scenario.estimator.gains}[name]
 
 
 def _default(choice: Choice, name: str) -> tuple[float, float]:
@@ -165,15 +144,5 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
 
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """The default bounds of a free gain, before they reach out to the scenario's own."""
-    tune = scenario.tune
-    assert tune is not None
+    tune = scenario.search
     return _gain(scenario, name).usual(Choice(scenario, tune.free or (), tune.bounds))
-
-
-def _has_bandwidth(scenario: Scenario) -> bool:
-    return isinstance(scenario.filter, device_tables.SteadyStateFilter)
-
-
-def _interval(scenario: Scenario) -> float:
-    """Between two samples of the star tracker [s]."""
-    return scenario.loop.period * (getattr(scenario.hardware, "star_tracker_every", None) or 1)

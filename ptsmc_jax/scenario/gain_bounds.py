@@ -1,76 +1,12 @@
-"""A gain that tuning may move: its usual bounds, how far they may be set, and what lies beyond them.
-
-Each law and observer names its gains beside its keys; here are the record, and those that several laws have.
-"""
+"""The bounds of gains that several laws have; each law and observer names its own beside its keys."""
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
-
-import numpy as np
+from collections.abc import Callable
+from typing import Any
 
 from ptsmc_jax.scenario import scales
+from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, Interval
 from ptsmc_jax.scenario.values import MOST_STEPS
-
-Interval = tuple[float, float]
-
-
-class Choice(NamedTuple):
-    """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
-
-    scenario: Any
-    free: tuple[str, ...]
-    bounds: Mapping[str, Interval]
-
-    @property
-    def law(self) -> Any:
-        """The table of the scenario's law."""
-        return self.scenario.controller
-
-    @property
-    def t_f(self) -> float:
-        """The prescribed time of the scenario [s]."""
-        return self.law.t_f
-
-    @property
-    def sampled(self) -> bool:
-        """Whether the loop is sampled."""
-        return self.scenario.loop.mode == "sampled"
-
-    @property
-    def shortest_delta(self) -> float:
-        """The shortest delta [s]: a period, if there is one."""
-        return self.scenario.loop.period if self.sampled else 0.0
-
-    def smallest(self, name: str) -> float:
-        """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
-        return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
-
-
-class Allowed(NamedTuple):
-    """Between which numbers bounds of a gain may be set, the upper one excluded."""
-
-    lower: float
-    upper: float
-    lower_included: bool = False
-
-
-def _positive(_: Choice) -> Allowed:
-    return Allowed(0.0, math.inf)
-
-
-class GainBounds(NamedTuple):
-    """The bounds of a gain, as functions of a `Choice`."""
-
-    usual: Callable[[Choice], Interval]  # where a scenario gives none
-    allowed: Callable[[Choice], Allowed] = _positive
-    below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
-    above: str | None = None  # and above the upper one
-
-
-def between(least: float, most: float) -> Callable[[Choice], Allowed]:
-    """Bounds that lie between two numbers."""
-    return lambda _: Allowed(least, most)
 
 
 def rounded(bound: float) -> float:
@@ -85,10 +21,8 @@ def hand_over(scenario: Any) -> float:
 
 def size(scenario: Any) -> float:
     """A body's mean moment of inertia, as a share of the paper's 12 kg m^2; 1 without a body."""
-    if scenario.spacecraft is None:
-        return 1.0
-    moments = np.asarray(scenario.spacecraft.inertia)
-    return float(np.mean(moments if moments.ndim == 1 else np.diag(moments))) / 12.0
+    mean, _ = scenario.moments
+    return 1.0 if mean is None else mean / 12.0
 
 
 def _converged(scenario: Any) -> float:

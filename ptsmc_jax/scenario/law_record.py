@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from ptsmc_jax.scenario import gain_bounds
-from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.values import Table
 
 
@@ -19,8 +19,8 @@ class LawTable(Table, frozen=True):
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
     prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
 
-    def physics(self, plant: str) -> Any:
-        """What flies on this kind of plant: a class of `laws`, its fields named as the keys."""
+    def physics(self, motion: str) -> Any:
+        """What flies on plants of this `Scenario.motion`: a class of `laws`, its fields named as the keys."""
         raise NotImplementedError
 
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -38,7 +38,7 @@ class LawTable(Table, frozen=True):
         """The law of a plant's model."""
         from ptsmc_jax.numerics.pytrees import vector
 
-        made = self.physics(scenario.plant.kind)
+        made = self.physics(scenario.motion)
         names = [f.name for f in dataclasses.fields(made) if f.name != "model" and not f.metadata.get("static")]
         own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
         return made(model, **{name: vector(value) for name, value in own.items()})

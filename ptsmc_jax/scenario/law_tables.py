@@ -13,7 +13,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
 from ptsmc_jax.scenario.values import NotNegative, Positive
@@ -95,7 +95,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """By its error."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeMultiplicative
 
@@ -130,7 +130,7 @@ class SystemController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative = 0.01
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """`laws.prescribed_time`."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
 
@@ -152,10 +152,10 @@ class ChainController(SystemController, frozen=True):
     )
     gains: ClassVar[Mapping[str, GainBounds]] = {
         **PrescribedTable.gains,
-        "eta": gain_bounds.eta(lambda scenario: float(scenario.plant.order)),  # Theorem 3
+        "eta": gain_bounds.eta(lambda scenario: float(scenario.order)),  # Theorem 3
     }
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """`laws.prescribed_time`."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain
 
@@ -164,7 +164,7 @@ class ChainController(SystemController, frozen=True):
     def check(self, scenario: Any) -> None:
         """Theorems 1 and 3, and a surface (39) that is stable."""
         super().check(scenario)
-        n = scenario.plant.order
+        n = scenario.order
         if not self.eta > n:
             theorem = "Theorem 1" if n == 2 else "Theorem 3"
             raise wrong("controller.eta", self.eta, f"greater than plant.order, {n} ({theorem})")

@@ -10,7 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import Meta
 
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds, dead_beat
+from ptsmc_jax.scenario.gain_bounds import dead_beat
+from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
 

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief, show
-from ptsmc_jax.scenario.gain_bounds import Allowed, Choice, GainBounds
+from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.values import Table
 
 Code = Annotated[Any, Meta(description=systems.WHERE)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.scenario import checks, systems
+from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario
@@ -19,8 +19,8 @@ from ptsmc_jax.simulation.rollout import Parts
 
 def check(parts: Parts, scenario: Scenario) -> None:
     """Raise ScenarioError where a part of one's own fails at t = 0, or returns what a run cannot go on with."""
-    tables = {"reference": scenario.reference, "observer": scenario.observer, "controller": scenario.controller}
-    terms = checks.terms(scenario)
+    tables = {name: getattr(scenario, name, None) for name in ("reference", "observer", "controller")}
+    terms = scenario.terms
     signals = (parts.disturbance,) if len(terms) == 1 else getattr(parts.disturbance, "terms", ())
     acting = iter(signals)
     for k, term in enumerate(terms):

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
-from ptsmc_jax.scenario.gain_bounds import GainBounds
+from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.own import Code, Own
 from ptsmc_jax.scenario.values import Positive
 
@@ -40,9 +40,9 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
         """The class that the code names, with what tuning may move."""
         return self.made
 
-    def physics(self, plant: str) -> Any:
+    def physics(self, motion: str) -> Any:
         """On the error of this kind of plant, with what tuning may move."""
-        made = super().physics(plant)
+        made = super().physics(motion)
         made.tunable = tuple(self.gains)
         return made
 
@@ -60,8 +60,8 @@ class OwnAttitudeLaw(OwnLaw, frozen=True):
 
     error: Literal["multiplicative", "additive"] = "multiplicative"
 
-    def error_motion(self, plant: str) -> Any:
+    def error_motion(self, motion: str) -> Any:
         """As it asks for."""
         from ptsmc_jax.laws.error_motions import ErrorVector
 
-        return ErrorVector if self.error == "additive" else super().error_motion(plant)
+        return ErrorVector if self.error == "additive" else super().error_motion(motion)

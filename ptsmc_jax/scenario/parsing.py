@@ -18,7 +18,7 @@ import msgspec
 from ptsmc_jax.scenario import attitude_keys, disturbance_tables, keys, layouts, own, systems
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
-from ptsmc_jax.scenario.layouts import TABLES
+from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, Positive, Table, Truth
 from ptsmc_jax.simulation import catalogues
@@ -67,17 +67,18 @@ def load(path: str | Path) -> dict[str, Any]:
     return raw
 
 
-def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]], *, run: bool = False) -> Scenario:
+def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     """Scenario from raw tables, absent keys at their defaults; raises ScenarioError.
 
-    metrics: names of the metrics by the kind of the plant; run: code of one's own may be run, for its keys.
+    run: code of one's own may be run, for its keys.
     """
     _check_shape(raw)
+    known = {"requirements", *(key for layout in TABLES.values() for key in layout)}
     for name, table in raw.items():
-        if name in Scenario.__struct_fields__ and not isinstance(table, Mapping):
+        if name in known and not isinstance(table, Mapping):
             raise wrong(name, table, "a table")
     kind = _plant_kind(raw.get("plant", {}))
-    layout = TABLES[kind]
+    kind_of_scenario, layout = SCENARIOS[kind], TABLES[kind]
     for name in raw:
         if name in layout or name == "requirements":
             continue
@@ -91,14 +92,8 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]], *, run
         raise ScenarioError(f"[{name}] is not a known table; {nearest(name, known, '[{}]')}")
 
     plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
-    order = 0
-    if kind == "chain":  # x0 says the order where it is absent
-        given = raw.get("plant", {})
-        order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
-        if order < 2:
-            raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
-    law = raw.get("controller", {}).get("kind", next(iter(layouts.LAWS[kind])))
-    fallback = layouts.defaults(kind, order, law)
+    law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
+    fallback = kind_of_scenario.fallback(plant, raw.get("plant", {}).keys(), law)
     found: dict[str, Any] = {}
     for name in layout:
         if name not in raw and name in layouts.OPTIONAL:
@@ -108,15 +103,13 @@ def parse(raw: Mapping[str, Any], metrics: Mapping[str, Collection[str]], *, run
             found[name] = _dispersion(given, kind)
         else:
             found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
-    if kind == "chain" and "order" not in raw.get("plant", {}):
-        found["plant"] = msgspec.structs.replace(found["plant"], order=order)
     for name in ("initial", "reference"):
         if name in found:
             attitude_keys.at_most_one(name, found[name])
     found["requirements"] = {
-        key: _requirement(key, value, metrics[kind]) for key, value in raw.get("requirements", {}).items()
+        key: _requirement(key, value, kind_of_scenario.metrics) for key, value in raw.get("requirements", {}).items()
     }
-    return Scenario(**found)
+    return kind_of_scenario(**found)
 
 
 def _check_shape(raw: Mapping[str, Any]) -> None:
@@ -166,7 +159,9 @@ def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Map
 
 def dump(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
-    return plain(scenario)
+    found = plain(scenario)
+    tables = [name for name in TABLES[scenario.plant.kind] if name != "tune"]
+    return {name: found[name] for name in (*tables, "requirements", "tune") if name in found}
 
 
 def plain(table: Table) -> dict[str, Any]:

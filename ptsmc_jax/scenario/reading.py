@@ -8,7 +8,6 @@ import msgspec
 
 from ptsmc_jax.scenario import checks, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.simulation import catalogues
 
 
 def read(path: str | Path) -> Scenario:
@@ -21,7 +20,7 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
 
     run: code of one's own may be run, without which its keys and gains are not known, and not checked: see `complete`.
     """
-    scenario = checks.resolve(parsing.parse(raw, catalogues.CATALOGUES, run=run))
+    scenario = checks.resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
     if scenario.tune is None or own.waits(scenario):
         return scenario

@@ -1,26 +1,18 @@
-"""The tables of a scenario file, all in one place; here those that say how a run is closed, judged and tuned.
+"""The tables that every scenario has, whatever its plant: how a run is closed, judged and tuned; and the scenario.
 
 A table is a struct whose docstring says what each key means, with its unit; its type says what is allowed and the
 default. Errors, `ptsmc new` and the scenario reference are made from them.
 """
 
-from typing import Annotated, Any, Literal
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from ptsmc_jax.scenario.device_tables import (
-    AxesWheels,
-    Hardware,
-    NoFilter,
-    PyramidWheels,
-    StateHardware,
-    SteadyStateFilter,
-)
-from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion
+from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.plant_tables import ChainPlant, Spacecraft, SpacecraftPlant, SystemPlant
-from ptsmc_jax.scenario.reference_tables import Initial
-from ptsmc_jax.scenario.values import Interval, NotNegative, Positive, Quantile, Table, Truth
+from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Table, Truth
+from ptsmc_jax.simulation.catalogues import Entry
 
 
 class Loop(Table, frozen=True):
@@ -93,20 +85,116 @@ class Tune(Table, frozen=True):
 
 
 class Scenario(Table, frozen=True, kw_only=True):
-    """A scenario as its file says it, every key resolved; tables that are None are off, or not of this plant's."""
+    """A scenario as its file says it, every key resolved: the tables that all plants have; optional ones may be off.
 
-    plant: SpacecraftPlant | ChainPlant | SystemPlant
-    spacecraft: Spacecraft | None = None
-    initial: Initial | None = None
-    # the tables of their kinds, see `layouts.TABLES`
-    reference: Any = None  # `reference_tables.ReferenceTable`
+    Each kind of plant has its own type, see `layouts.SCENARIOS`, which says what depends on the plant.
+    """
+
+    plant: Any
+    # the tables of their kinds, see `TABLES`
     disturbance: Any  # `disturbance_tables.DisturbanceTable`, or several
     controller: Any  # `law_tables.LawTable`
     observer: Any  # `observer_tables.ObserverTable`
     loop: Loop
-    hardware: Hardware | StateHardware | None = None
-    wheels: PyramidWheels | AxesWheels | None = None
-    filter: NoFilter | SteadyStateFilter | None = None
-    dispersion: Dispersion | StateDispersion | None = None
+    hardware: Any = None  # `device_tables.Actuators`
+    dispersion: Any = None
     requirements: dict[str, float | Limit] = {}  # noqa: RUF012
     tune: Tune | None = None
+
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # a table, or one for each kind, the default first
+    metrics: ClassVar[Mapping[str, Entry]] = {}
+    motion: ClassVar[str] = ""  # what the laws drive to zero: "spacecraft", "chain" or "system"
+    reaching: ClassVar[float] = 1.0  # how often K1 goes into what makes s decay after the hand-over: (60) halves it
+
+    @classmethod
+    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+        """Defaults that no single key tells, by table; given: keys of [plant] that are there, law: its kind."""
+        return {}
+
+    @property
+    def terms(self) -> tuple[Any, ...]:
+        """The disturbances that act together."""
+        return self.disturbance.together
+
+    @property
+    def inputs(self) -> int:
+        """How many inputs the plant has."""
+        raise NotImplementedError
+
+    @property
+    def order(self) -> int:
+        """Of the motion that a law drives to zero."""
+        return 2
+
+    @property
+    def grid_order(self) -> int:
+        """The order that the grid of the continuous loop is made for, see `clock.graded`."""
+        return self.order
+
+    @property
+    def devices(self) -> Any:
+        """The table [hardware], all of it off where it is absent."""
+        table: Any = self.TABLES["hardware"]
+        return table() if self.hardware is None else self.hardware
+
+    @property
+    def estimator(self) -> Any:
+        """The table [filter], `NoFilter` where it is absent."""
+        return NoFilter()
+
+    @property
+    def reaction_wheels(self) -> Any:
+        """The table [wheels]; None: there are none."""
+        return None
+
+    @property
+    def moments(self) -> tuple[float, float] | tuple[None, None]:
+        """Mean and largest moment of inertia [kg m^2]; None without a body."""
+        return None, None
+
+    @property
+    def search(self) -> Tune:
+        """The table [tune] of a scenario that is to be tuned."""
+        assert self.tune is not None, "a scenario without [tune]"
+        return self.tune
+
+    @property
+    def end(self) -> float:
+        """Of the run, `loop.t_end` [s]."""
+        assert self.loop.t_end is not None, "a scenario that is not resolved"
+        return self.loop.t_end
+
+    def resolved(self) -> Any:
+        """With the defaults of its plant that depend on other keys."""
+        return self
+
+    def check_plant(self) -> None:
+        """Raise ScenarioError where keys of the plant contradict each other."""
+        raise NotImplementedError
+
+    def model(self) -> Any:
+        """The plant as the law knows it, a part of `plants`."""
+        raise NotImplementedError
+
+    def truth(self, model: Any) -> Any:
+        """The plant that flies."""
+        return model
+
+    def start(self) -> Any:
+        """Its initial state."""
+        raise NotImplementedError
+
+    def target(self) -> Any:
+        """What the law is to reach, a part of `signals.references`."""
+        raise NotImplementedError
+
+    def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
+        """How fast the plant moves and turns [rad/s], by the key that says so, on the way to the shortest t_f [s]."""
+        return {}
+
+    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
+        """Raise ScenarioError where the law meets its singularity, see `flyable.study`."""
+
+    def spread(self, parts: Any) -> dict[str, Any]:
+        """What the plant has drawn for each trial, a part of `dispersions` each, by what `Dispersion` calls it."""
+        raise NotImplementedError

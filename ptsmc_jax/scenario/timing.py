@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,21 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
-from ptsmc_jax.laws.base import SecondOrder
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.observers import none
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario import checks, plant_tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
-from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.simulation.assembly import Parts, Setup
 from ptsmc_jax.theory import solutions
 
 MOST_SUBSTEPS = 200
-BASELINES = 50  # substeps at most, that a law to compare with asks for: a run that turns faster is marked
 MOVING = 4  # steps a period at least where the torque changes within it
 _SMOOTHED = ("disturbance.frequency", "plant.system")
 
@@ -53,28 +50,27 @@ def reach_of(scenario: Scenario) -> Reach:
     return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
 
 
-def timing(scenario: Scenario, parts: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
+def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:
     """Clock for gains within `reach`, and integration steps a control period; saves: times that are nodes [s].
 
     Raises ScenarioError where too many steps would be needed, naming what asks for them.
     """
-    loop, frequencies, visited = scenario.loop, _frequencies(scenario, parts, reach), None
-    if isinstance(parts.plant, System):
-        hurried = parts.with_t_f(vector(reach.smallest_t_f))
+    loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
+    if setup.plant.unknown_pace:
+        hurried = setup.with_t_f(vector(reach.smallest_t_f))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if loop.mode == "continuous":
         if "plant.system" in frequencies:
             frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
-        return _grid(scenario, reach, parts, saves, frequencies, visited), 1
-    assert loop.t_end is not None
+        return _grid(scenario, reach, setup, saves, frequencies, visited), 1
     substeps = _substeps(scenario, frequencies)
-    last = loop.t_end + reach.t_f - scenario.controller.t_f
+    last = scenario.end + reach.t_f - scenario.controller.t_f
     _check_steps(scenario, last, substeps)
     if loop.clock == "flight":
         return dataclasses.replace(clock.flight(loop.period, last), t_end=vector(loop.t_end)), substeps
-    late = loop.t_end - scenario.controller.t_f + reach.delta
-    return clock.anchored(loop.period, loop.t_end, reach.t_f, late), substeps
+    late = scenario.end - scenario.controller.t_f + reach.delta
+    return clock.anchored(loop.period, scenario.end, reach.t_f, late), substeps
 
 
 def steps(parts: Parts) -> int:
@@ -91,55 +87,16 @@ def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
         asks = (
             f"the sampled loop would take {needed:.6g} steps, {substeps} a period, and at most {MOST_STEPS} are allowed"
         )
-        if last > (scenario.loop.t_end or 0.0):
+        if last > scenario.end:
             raise ScenarioError(f"tune.bounds.t_f asks for runs of {last:.6g} s, but must be lower: {asks}")
         longer = f", or loop.period longer than {period}" if substeps <= MOVING else ""
         raise wrong("loop.t_end", scenario.loop.t_end, f"earlier{longer}: {asks}")
 
 
-def _frequencies(scenario: Scenario, parts: Parts, reach: Reach) -> dict[str, float]:
+def _frequencies(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
     """How fast things happen [rad/s], by the key that says so."""
-    found = {"disturbance.frequency": max(term.quickest() for term in checks.terms(scenario))}
-    if scenario.initial is not None:
-        found["initial.rate"] = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
-        assert scenario.reference is not None
-        found |= scenario.reference.frequencies()
-        key, rate = scenario.controller.turning(reach.smallest_t_f)
-        if not scenario.controller.prescribed:
-            rate = min(rate, 0.5 * BASELINES * 0.025 / scenario.loop.period)
-        found[key] = rate
-        for key, rate in _nutation(scenario, parts).items():
-            found[key] = found.get(key, 0.0) + rate
-    return found
-
-
-def _nutation(scenario: Scenario, parts: Parts) -> dict[str, float]:
-    """How fast a body with wheels nutates at most [rad/s], by the key that says so: |H| over its two smallest moments.
-
-    J w' = -w x H + u, where H = J w + A h changes in inertial axes by disturbances only: wheels that give a body its
-    rate take as much.
-    """
-    if scenario.wheels is None or scenario.initial is None:
-        return {}
-    assert parts.actuators is not None
-    assert parts.actuators.wheels is not None
-    least, middle, largest = np.linalg.eigvalsh(np.asarray(parts.plant.inertia))
-    turning = float(np.linalg.norm(scenario.initial.rate)) + _spread(scenario)
-    stored = np.linalg.norm(np.asarray(parts.actuators.wheels.axes @ parts.actuators.wheels.initial))
-    shares = {
-        "wheels.momentum": stored,
-        "initial.rate": largest * turning,
-        "disturbance.amplitude": sum(
-            term.impulse(float(scenario.loop.t_end or 0.0)) for term in checks.terms(scenario)
-        ),
-    }
-    return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
-
-
-def _spread(scenario: Scenario) -> float:
-    """How much faster than initial.rate a drawn body may turn [rad/s]; a normal rate: all but one in 10 000."""
-    table = getattr(scenario.dispersion, "rate", None)
-    return 0.0 if table is None else table.widest * table.of()[0]
+    disturbed = {"disturbance.frequency": max(term.quickest() for term in scenario.terms)}
+    return disturbed | scenario.frequencies(setup, reach.smallest_t_f)
 
 
 def _fastest(frequencies: Mapping[str, float]) -> float:
@@ -158,8 +115,7 @@ def _substeps(scenario: Scenario, frequencies: Mapping[str, float]) -> int:
     if needed > MOST_SUBSTEPS:
         asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
-    moving = any(getattr(scenario.hardware, key, None) is not None for key in ("torque_rate_limit", "torque_lag"))
-    return max(MOVING if moving else 1, math.ceil(needed))
+    return max(MOVING if scenario.devices.moving else 1, math.ceil(needed))
 
 
 def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
@@ -174,7 +130,7 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
         return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
     value = getattr(getattr(scenario, table), name, None)
     if value is None:  # of a term in a sum
-        value = [getattr(term, name) for term in checks.terms(scenario) if hasattr(term, name)]
+        value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
     if value == []:
         return ScenarioError(f"{table} is too fast: {asks}")
     return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {asks}")
@@ -187,11 +143,9 @@ def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
 
 
 @programs.jit
-def _rates_of_system(parts: Parts, visited: tuple) -> tuple:
+def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
     """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
-    plant, law = parts.plant, parts.controller
-    assert isinstance(plant, System)
-    assert isinstance(law, SecondOrder)
+    plant, law = typing.cast(System, setup.plant), setup.controller
     none = jnp.zeros(plant.inputs)
 
     def jacobian(t: Any, x: Any) -> Any:
@@ -199,16 +153,16 @@ def _rates_of_system(parts: Parts, visited: tuple) -> tuple:
         return plant.jacobian(t, x, u)
 
     def along(t: Any) -> Any:
-        return law.motion(t, parts.initial, none, none, none).w_dot
+        return law.motion(t, setup.initial, none, none, none).w_dot
 
-    times = parts.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
+    times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
     steady = jax.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
     return jax.vmap(jacobian)(*visited), steady
 
 
-def _fastest_of_system(parts: Parts, visited: tuple) -> float:
+def _fastest_of_system(setup: Setup, visited: tuple) -> float:
     """Fastest rate of a system of one's own along its run [rad/s]: of its modes, and of what time does to it."""
-    jacobians, (acceleration, change) = _rates_of_system(parts, visited)
+    jacobians, (acceleration, change) = _rates_of_system(setup, visited)
     matrices = np.asarray(jacobians)
     modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
     size, quick = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, change))
@@ -220,15 +174,14 @@ def _with_gain(observer: Any, gain: float) -> Any:
 
 
 def _grid(
-    scenario: Scenario, reach: Reach, parts: Parts, saves: object, frequencies: Mapping[str, float], visited: Any
+    scenario: Scenario, reach: Reach, setup: Setup, saves: object, frequencies: Mapping[str, float], visited: Any
 ) -> clock.Graded:
     """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
     loop = scenario.loop
-    assert loop.t_end is not None
-    t_end = loop.t_end + reach.t_f - scenario.controller.t_f
-    controller, observer, resolved = parts.controller, parts.observer, 0.0
+    t_end = scenario.end + reach.t_f - scenario.controller.t_f
+    controller, observer, resolved = setup.controller, setup.observer, 0.0
     saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
-    if not isinstance(observer, none.NoObserver):  # K2 is largest with the smallest gain
+    if hasattr(observer, "gain"):  # K2 is largest with the smallest gain
         resolved = _with_gain(observer, reach.largest_gain).fastest()
         observer = _with_gain(observer, reach.gain)
     names = ("t_f", "k1", "sign_width", "surface_rate")
@@ -240,8 +193,7 @@ def _grid(
             before, after = (float(v) for v in _boundary_layer(law, observer, visited))
             layer = (max(layer[0], before), max(layer[1], after))
     layer = (max(layer[0], resolved), max(layer[1], resolved))
-    rates, frequency = widest.hold_rates(), _fastest(frequencies)
-    order = 1 if isinstance(scenario.plant, plant_tables.SpacecraftPlant) else controller.order
+    rates, frequency, order = widest.hold_rates(), _fastest(frequencies), scenario.grid_order
 
     def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
         taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))

@@ -1,7 +1,8 @@
 """Disturbances d(t, x) of (2) and (25), alone or summed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -21,17 +22,24 @@ class Disturbance:
         """Disturbance at t [s] in the state x, (m,) [N m]."""
         raise NotImplementedError
 
+    drawn: ClassVar[Mapping[str, str]] = {}  # the fields whose numbers can be drawn, by "phase" and "amplitude"
+
     def fastest(self) -> float:
         """How fast it changes at most [rad/s], which the integration steps follow; 0: slowly."""
         return 0.0
 
+    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+        """The same as it acts on a body of this inertia [kg m^2]."""
+        return self
+
 
 @pytree
 @dataclass(frozen=True)
-class Constant:
+class Constant(Disturbance):
     """A constant disturbance; zero serves as none."""
 
     value: Leaf  # (m,) [N m]
+    drawn: ClassVar[Mapping[str, str]] = {"amplitude": "value"}
 
     def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
@@ -43,16 +51,19 @@ class Constant:
 class Bias(Constant):
     """A constant that is added to the disturbance of a scenario, see `with_bias`; its amplitude is none of theirs."""
 
+    drawn: ClassVar[Mapping[str, str]] = {}
+
 
 @pytree
 @dataclass(frozen=True)
-class Sinusoid:
+class Sinusoid(Disturbance):
     """bias + amplitude sin(frequency t + phase), per axis."""
 
     amplitude: Leaf  # (m,) [N m]
     frequency: Leaf  # (m,) [rad/s]
     phase: Leaf  # (m,) [rad]
     bias: Leaf  # (m,) [N m]
+    drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
     def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
@@ -61,7 +72,7 @@ class Sinusoid:
 
 @pytree
 @dataclass(frozen=True)
-class GravityGradient:
+class GravityGradient(Disturbance):
     """Gravity-gradient torque on a circular orbit, 3 n^2 c x J c, c the unit vector to the planet in body axes.
 
     Wie, Space Vehicle Dynamics and Control (2008), eq. (6.128). It depends on the true attitude.
@@ -71,6 +82,7 @@ class GravityGradient:
     orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
     rate: Leaf  # n [rad/s]
     phase: Leaf  # of the body at t = 0 [rad]
+    drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
     def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
         """Torque at t [s] in the state x, (3,) [N m]."""
@@ -79,10 +91,14 @@ class GravityGradient:
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.rate**2 * jnp.cross(c, self.inertia @ c)
 
+    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+        """The same on another body."""
+        return replace(self, inertia=inertia)
+
 
 @pytree
 @dataclass(frozen=True)
-class Sum:
+class Sum(Disturbance):
     """The sum of several disturbances."""
 
     terms: tuple[Any, ...]
@@ -94,48 +110,50 @@ class Sum:
             total = total + term(t, x)
         return total
 
+    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+        """Each of them."""
+        return Sum(tuple(on_body(term, inertia) for term in self.terms))
 
-# the fields that can be drawn, by the kind of the disturbance
-_FIELDS: dict[str, dict[type, str]] = {
-    "phase": {Sinusoid: "phase", GravityGradient: "phase"},
-    "amplitude": {Sinusoid: "amplitude", Constant: "value"},
-}
+
+def together(disturbance: Any) -> tuple[Any, ...]:
+    """The disturbances that act at once."""
+    return getattr(disturbance, "terms", (disturbance,))
+
+
+def _drawn(term: Any, what: str) -> str | None:
+    return getattr(term, "drawn", {}).get(what)
 
 
 def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
     """Every phase [rad] or amplitude [N m] of a disturbance, (count,): term after term, input after input."""
-    terms = disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
-    fields = [(term, _FIELDS[what].get(type(term))) for term in terms]
+    fields = [(term, _drawn(term, what)) for term in together(disturbance)]
     return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(getattr(term, field)) for term, field in fields if field)])
 
 
 def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
     """The disturbance with these phases [rad] or amplitudes [N m], as `values` gives them; what has none stays."""
     terms, used = [], 0
-    for term in disturbance.terms if isinstance(disturbance, Sum) else (disturbance,):
-        field = _FIELDS[what].get(type(term))
+    for term in together(disturbance):
+        field = _drawn(term, what)
         if field is not None:
             old = jnp.asarray(getattr(term, field))
             term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
             used += old.size
         terms.append(term)
-    return Sum(tuple(terms)) if isinstance(disturbance, Sum) else terms[0]
+    return Sum(tuple(terms)) if hasattr(disturbance, "terms") else terms[0]
 
 
 def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
     """What is added to a disturbance, (m,) [N m]; zero: nothing is."""
-    last = disturbance.terms[-1] if isinstance(disturbance, Sum) else disturbance
+    last = together(disturbance)[-1]
     return last.value if isinstance(last, Bias) else jnp.zeros(inputs)
 
 
 def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:
     """The disturbance with this added to it, (m,) [N m], in place of what was added before."""
-    terms = disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
-    return Sum((*(term for term in terms if not isinstance(term, Bias)), Bias(value)))
+    return Sum((*(term for term in together(disturbance) if not isinstance(term, Bias)), Bias(value)))
 
 
 def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:
-    """The disturbance as it acts on a body of this inertia [kg m^2]."""
-    if isinstance(disturbance, Sum):
-        return Sum(tuple(on_body(term, inertia) for term in disturbance.terms))
-    return replace(disturbance, inertia=inertia) if isinstance(disturbance, GravityGradient) else disturbance
+    """The disturbance as it acts on a body of this inertia [kg m^2]; a plain function acts alike on all."""
+    return disturbance.on_body(inertia) if hasattr(disturbance, "on_body") else disturbance

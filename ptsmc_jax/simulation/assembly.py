@@ -1,18 +1,20 @@
 """What a run is made of."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 
+_Setup = TypeVar("_Setup", bound="Setup")
+
 
 @pytree
-@dataclass(frozen=True)
-class Parts:
-    """Everything a run is made of. `plant` is the truth; controller and observer hold their own, nominal model."""
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """What a run is made of but for its clock. `plant` is the truth; controller and observer hold a nominal model."""
 
     plant: Plant
     disturbance: Any  # callable: t [s], true state -> (m,) [N m]
@@ -20,17 +22,32 @@ class Parts:
     controller: Any  # laws.Law
     observer: Any  # observers.Observer
     sensors: Any  # sensors.Sensor, or None: the law sees the true state
-    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # after t_f, for window_error [s]
     settling_angle: Leaf  # [rad]
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
+
+    def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
+        """The same with another prescribed time [s]; the time after it is kept."""
+        t_end = t_f + (self.t_end - self.controller.t_f)
+        return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
+
+    def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
+        """The parts of a run by this clock."""
+        return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Parts(Setup):
+    """Everything a run is made of."""
+
+    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
 
     def with_t_f(self, t_f: Leaf) -> "Parts":
-        """The parts with another prescribed time [s]; the time after it is kept."""
-        t_end = t_f + (self.t_end - self.controller.t_f)
-        law, timing = replace(self.controller, t_f=t_f), replace(self.clock, t_end=t_end)
-        return replace(self, controller=law, clock=timing, t_end=t_end)
+        """The same with another prescribed time [s]; the time after it is kept."""
+        moved = super().with_t_f(t_f)
+        return replace(moved, clock=replace(self.clock, t_end=moved.t_end))

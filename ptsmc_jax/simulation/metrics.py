@@ -56,12 +56,21 @@ def finish(running: Running, criteria: Criteria) -> Metrics:
     return Metrics(*(metric.value(running.memories[name], running, criteria) for name, metric in METRICS.items()))
 
 
-def unbounded(found: Metrics, begun: Running, criteria: Criteria) -> Array:
+def unbounded(found: Metrics, begun: Running) -> Array:
     """Whether a metric ends infinite or NaN: the square of what it is made of is beyond the largest number, say.
 
-    begun: what was remembered at t = 0, where a metric that the plant lacks is NaN already.
+    begun: what was remembered at t = 0, which is NaN where the run lacks a metric.
     """
-    values = zip(METRICS.values(), found, finish(begun, criteria), strict=True)
+    lacking = {
+        name: jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(memory)]))
+        for name, memory in begun.memories.items()
+    }
     return jnp.any(
-        jnp.stack([jnp.isinf(v) | (jnp.isnan(v) & ~jnp.isnan(first)) for row, v, first in values if not row.may_lack])
+        jnp.stack(
+            [
+                jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name])
+                for name, v in found._asdict().items()
+                if not METRICS[name].may_lack
+            ]
+        )
     )

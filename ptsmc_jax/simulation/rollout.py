@@ -301,7 +301,7 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     found = metrics.finish(state.running, criteria)
     start = Start(first, parts.plant.inputs, None if acting is None else acting.h)
-    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria), criteria)
+    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * criteria.settling_angle))
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))

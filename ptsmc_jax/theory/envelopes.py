@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.plants.integrator_chain import Chain
-from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory.solutions import _start, _surface, starts, state_envelope, visited
 
@@ -49,7 +48,7 @@ def switching_rate(parts: Parts) -> float:
 def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
     """The largest factor under the largest K2, and under the K2 that is left when the observer has settled."""
     law, bound = parts.controller, parts.observer.error_bound()
-    seen = visited(parts) if isinstance(parts.plant, System) else None
+    seen = visited(parts) if parts.plant.unknown_pace else None
     return law.switching_rate(bound.largest, seen), law.switching_rate(bound(parts.t_end), seen)
 
 

@@ -1,6 +1,7 @@
 """`ptsmc convert-attitude`: every form of an attitude is the same attitude, and can be pasted into a scenario."""
 
 import tomllib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,8 @@ def pasted(line, sequence):
     table = tomllib.loads(line)
     if "euler_deg" in table:
         table["sequence"] = sequence
-    initial = scenario.from_tables({"initial": table}).initial
-    assert initial is not None
-    return attitude_keys.quaternion(initial, "initial")
+    known: Any = scenario.from_tables({"initial": table})
+    return attitude_keys.quaternion(known.initial, "initial")
 
 
 def closed_forms(q):

@@ -21,6 +21,10 @@ ARM = {"plant": {"kind": "system", "system": second_order.system(
     1, F=lambda t, x, v: v, H=lambda t, x, v: 0.0 * x, G=lambda t, x, v: jnp.eye(1)), "x0": [1.0, 0.0]}}  # fmt: skip
 
 
+def noise_of_s(known):
+    return known.devices.noise_of_s(known)
+
+
 def flight(**changes):
     return scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **changes)
 
@@ -88,7 +92,7 @@ def test_noise_of_s_is_that_of_drawn_samples(rate):
         return law.torque(vector(25.0), jnp.asarray(True), seen, rest, jnp.zeros(3), vector(0.0))[1]
 
     found = np.std(np.asarray(jax.vmap(s)(vector(normals))), axis=0)
-    np.testing.assert_allclose(found, scales.noise_of_s(table), rtol=0.015)
+    np.testing.assert_allclose(found, noise_of_s(table), rtol=0.015)
 
 
 def test_noise_of_s_of_a_chain_has_the_surfaces_weights():
@@ -100,8 +104,8 @@ def test_noise_of_s_of_a_chain_has_the_surfaces_weights():
         "hardware": {"state_noise": [4e-4, 3e-4, 1e-3]},
     }
     expected = math.sqrt(3.6e-3**2 + 1.8e-3**2 + 1e-3**2)
-    np.testing.assert_allclose(scales.noise_of_s(scenario.from_tables(tables)), expected)
-    assert scales.noise_of_s(scenario.from_tables({})) == 0.0
+    np.testing.assert_allclose(noise_of_s(scenario.from_tables(tables)), expected)
+    assert noise_of_s(scenario.from_tables({})) == 0.0
 
 
 def test_below_the_narrowest_width_that_matters_the_slope_is_the_exact_signs():
@@ -122,4 +126,4 @@ def test_widths_go_by_the_noise_where_there_is_some():
     assert scales.widths(flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)) == scales.QUIET
     arm = {**ARM, "loop": {"mode": "sampled"}, "hardware": {"state_noise": [3e-4, 4e-4]},
            "controller": {"surface_rate": 2.0}}  # fmt: skip
-    np.testing.assert_allclose(scales.noise_of_s(scenario.from_tables(arm)), math.hypot(6e-4, 4e-4))
+    np.testing.assert_allclose(noise_of_s(scenario.from_tables(arm)), math.hypot(6e-4, 4e-4))

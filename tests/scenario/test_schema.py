@@ -11,11 +11,11 @@ from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheel
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.own import Own
-from ptsmc_jax.scenario.plant_tables import ChainPlant
 from ptsmc_jax.scenario.reference_tables import ReferenceTable
+from ptsmc_jax.scenario.state_scenario import ChainPlant, StateScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.catalogues import CATALOGUE, CATALOGUES, STATE_CATALOGUE
+from ptsmc_jax.simulation.catalogues import CATALOGUE, STATE_CATALOGUE
 from tests.helpers import ROOT
 
 # design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
@@ -284,7 +284,7 @@ def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
 
 
 def test_off_when_absent():
-    scenario = parsing.parse({}, CATALOGUES)
+    scenario = parsing.parse({})
     assert scenario.hardware is scenario.dispersion is scenario.tune is None
     assert scenario.requirements == {}
 
@@ -300,8 +300,12 @@ def test_tables_of_these_tests_name_every_key_there_is():
                 visit(getattr(parsed, key) if isinstance(parsed, Table) else parsed[key], value)
 
     for tables in COMPLETE:
-        visit(parsing.parse(tables, CATALOGUES), tables)
-    named.pop(Attitude)  # bases of others
+        visit(parsing.parse(tables), tables)
+    for base in (StateScenario, Attitude):  # bases of others
+        named.pop(base)
+    scenarios = [struct for struct in named if issubclass(struct, Scenario)]
+    seen = {table for scenario in scenarios for table in named.pop(scenario)}
+    assert seen == {table for scenario in scenarios for table in scenario.__struct_fields__}
     named.pop(Actuators)
     named.pop(WheelLimits)
     named.pop(ReferenceTable)

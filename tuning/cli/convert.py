@@ -1,6 +1,7 @@
 """`ptsmc convert-attitude`: one attitude in every form that a scenario takes."""
 
 import re
+import typing
 import warnings
 from collections.abc import Mapping
 
@@ -9,8 +10,7 @@ import numpy as np
 from ptsmc_jax.scenario import attitude_keys, parsing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.reference_tables import Initial
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from tuning.errors import UsageError
 
 SEQUENCE = "ZYX"
@@ -34,8 +34,7 @@ def quaternion(given: Mapping[str, str | None]) -> np.ndarray:
     if key == "euler_deg":
         raw["sequence"] = given.get("sequence") or SEQUENCE
     try:
-        scenario = parsing.parse({"initial": raw}, CATALOGUES)
-        assert isinstance(scenario.initial, Initial)
+        scenario = typing.cast(SpacecraftScenario, parsing.parse({"initial": raw}))
         return attitude_keys.quaternion(scenario.initial, "initial")
     except ScenarioError as error:
         raise UsageError(re.sub(r"initial\.(\w+)", lambda found: _option(found[1]), str(error))) from None

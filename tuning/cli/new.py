@@ -130,7 +130,7 @@ class _File:
 
     def requirements(self) -> Iterator[str]:
         """Those that are there, or two of the many."""
-        catalogue, live = catalogues.CATALOGUES[self.plant], self.live.get("requirements")
+        catalogue, live = self.resolved.metrics, self.live.get("requirements")
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
             f"The metrics are {', '.join(catalogue)}. "
@@ -147,7 +147,7 @@ class _File:
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
         table: Any = struct(**needed)
         if isinstance(table, Kind):
-            table = table.filled(self.resolved, checks.inputs(self.resolved))
+            table = table.filled(self.resolved, self.resolved.inputs)
         if isinstance(table, PrescribedTimeObserver):
             t_o, delta_o = table.times(self.resolved)
             table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
@@ -159,7 +159,7 @@ class _File:
             return key.default
         value = EXAMPLES[f"{table}.{key.name}"]
         if key.allowed.endswith("for each state"):
-            return [value] * len(checks.initial_state(self.resolved))
+            return [value] * len(self.resolved.plant.x0)
         return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
 
 
@@ -172,7 +172,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
     kind = plant or "spacecraft"
     given = raw or {"plant": {"kind": kind, **({"system": EXAMPLES["plant.system"]} if kind == "system" else {})}}
-    said = parsing.parse(given, catalogues.CATALOGUES)
+    said = parsing.parse(given)
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
     # a system stands in a file that its user has yet to write: it cannot be checked

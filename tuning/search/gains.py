@@ -14,11 +14,11 @@ from jaxtyping import Array
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
-from ptsmc_jax.scenario import keys, plant_tables
+from ptsmc_jax.scenario import keys
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
-from ptsmc_jax.scenario.device_tables import SteadyStateFilter
-from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.observer_tables import OBSERVERS, NonlinearObserver
+from ptsmc_jax.scenario.device_tables import FILTERS
+from ptsmc_jax.scenario.layouts import SCENARIOS
+from ptsmc_jax.scenario.observer_tables import NonlinearObserver
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.clock import Anchored
@@ -29,10 +29,11 @@ _AXIS = "observer_gain_"
 
 def units(plant: str) -> dict[str, str]:
     """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
+    tables: Any = SCENARIOS[plant].TABLES
     named: list[tuple[type[Table], dict[str, str]]] = [
-        *((law, {name: name for name in law.gains}) for law in LAWS[plant].values()),
-        *((observer, {"gain": "observer_gain"}) for observer in OBSERVERS[plant].values()),
-        (SteadyStateFilter, {"bandwidth": "filter_bandwidth"}),
+        *((law, {name: name for name in law.gains}) for law in tables["controller"].values()),
+        *((observer, {"gain": "observer_gain"}) for observer in tables["observer"].values()),
+        *((one, {"bandwidth": "filter_bandwidth"}) for one in FILTERS.values()),
     ]
     found: dict[str, str] = {}
     for table, gains in named:
@@ -165,8 +166,8 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
     delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
     gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
-    if isinstance(scenario.plant, plant_tables.ChainPlant):
-        gains["eta"] = scenario.plant.order + 1.0
+    if scenario.motion == "chain":
+        gains["eta"] = scenario.order + 1.0
     return {**gains, "observer_gain": 10.0} if isinstance(scenario.observer, NonlinearObserver) else gains
 
 
@@ -182,7 +183,7 @@ def papers(scenario: Scenario) -> Scenario:
 
 def differ(one: Scenario, other: Scenario) -> bool:
     """Whether two scenarios fly another law or other gains."""
-    return any(getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "filter"))
+    return any(getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "estimator"))
 
 
 def _each(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:

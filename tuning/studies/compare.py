@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import errors, own, parsing, plant_tables, replace, study, systems, tables
+from ptsmc_jax.scenario import errors, own, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -67,7 +67,7 @@ class Comparison:
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where there is nothing to compare with."""
-    if not isinstance(scenario.plant, plant_tables.SpacecraftPlant):
+    if scenario.motion != "spacecraft":
         kind = errors.show(scenario.plant.kind)
         raise ScenarioError(
             f'plant.kind is {kind}, but must be "spacecraft": the laws to compare with are for attitudes'

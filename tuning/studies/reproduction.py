@@ -10,7 +10,6 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import run_plots, style
 from ptsmc_jax.paper import claims, remark_2, slips
-from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.scenario import from_tables, parsing
 
 
@@ -70,7 +69,7 @@ def _figures(made: Reproduction) -> dict[str, Figure]:
     for name, run in made.cases.items():
         numbers, title, _ = claims.CASES[name]
         first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
-        chain = isinstance(run.parts.plant, Chain)
+        chain = not run.parts.plant.attitude
         parts = ("a", "b") if chain else ("", "")
         motion, label = (run_plots.states, "states") if chain else (run_plots.attitude, "attitude")
         heading = f"Fig. {first}{f' ({parts[0]})' if chain else ''}: {title}"

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 
 from ptsmc_jax.campaigns import store
-from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -57,7 +56,7 @@ def _number(value: Any) -> float | None:
 def names(ready: Study) -> tuple[list[str], list[str]]:
     """Of the inputs, and of what the sensors see."""
     plant = ready.parts.plant
-    if isinstance(plant, Spacecraft):
+    if plant.attitude:
         return list("xyz"), [f"{what} {axis}" for what in ("attitude", "rate") for axis in "xyz"]
     size = np.asarray(ready.parts.initial).size
     return [f"u{k + 1}" for k in range(plant.inputs)], [f"x{k + 1}" for k in range(size)]

@@ -1,0 +1,65 @@
+"""A gain that tuning may move: its usual bounds, how far they may be set, and what lies beyond them, in words."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+Interval = tuple[float, float]
+
+
+class Choice(NamedTuple):
+    """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
+
+    scenario: Any
+    free: tuple[str, ...]
+    bounds: Mapping[str, Interval]
+
+    @property
+    def law(self) -> Any:
+        """The table of the scenario's law."""
+        return self.scenario.controller
+
+    @property
+    def t_f(self) -> float:
+        """The prescribed time of the scenario [s]."""
+        return self.law.t_f
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the loop is sampled."""
+        return self.scenario.loop.mode == "sampled"
+
+    @property
+    def shortest_delta(self) -> float:
+        """The shortest delta [s]: a period, if there is one."""
+        return self.scenario.loop.period if self.sampled else 0.0
+
+    def smallest(self, name: str) -> float:
+        """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
+        return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
+
+
+class Allowed(NamedTuple):
+    """Between which numbers bounds of a gain may be set, the upper one excluded."""
+
+    lower: float
+    upper: float
+    lower_included: bool = False
+
+
+def _positive(_: Choice) -> Allowed:
+    return Allowed(0.0, math.inf)
+
+
+class GainBounds(NamedTuple):
+    """The bounds of a gain, as functions of a `Choice`."""
+
+    usual: Callable[[Choice], Interval]  # where a scenario gives none
+    allowed: Callable[[Choice], Allowed] = _positive
+    below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
+    above: str | None = None  # and above the upper one
+
+
+def between(least: float, most: float) -> Callable[[Choice], Allowed]:
+    """Bounds that lie between two numbers."""
+    return lambda _: Allowed(least, most)

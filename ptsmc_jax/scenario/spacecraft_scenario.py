@@ -1,0 +1,202 @@
+"""Scenarios of a rigid spacecraft: its tables, what is checked of them, and what they are made into."""
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from ptsmc_jax import formulas
+from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors
+from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
+from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
+from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
+from ptsmc_jax.scenario.values import Inertia, Kinds, Table
+from ptsmc_jax.simulation.catalogues import CATALOGUE
+
+# of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
+BASELINES = 50
+_CASE_I: dict[str, Mapping[str, Any]] = {
+    "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
+    "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
+}
+
+
+class SpacecraftPlant(Table, frozen=True):
+    """A rigid spacecraft, by quaternion and body rate; its body is [spacecraft], its start [initial]."""
+
+    kind: Literal["spacecraft"] = "spacecraft"
+
+
+class Spacecraft(Table, frozen=True):
+    """The rigid body.
+
+    Attributes:
+        inertia: three principal moments, or a full symmetric 3x3 tensor; with [wheels] of the whole spacecraft less
+            each wheel's spin inertia about its axis [kg m^2]
+        true_inertia: of the body that flies; default: inertia, which the law knows [kg m^2]
+    """
+
+    inertia: Inertia = (10.0, 12.0, 14.0)
+    true_inertia: Inertia | None = None
+
+
+class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
+    """A scenario of a rigid spacecraft."""
+
+    spacecraft: Spacecraft
+    initial: Initial
+    reference: Any  # `reference_tables.ReferenceTable`
+    wheels: WheelLimits | None = None
+    filter: FilterTable | None = None
+
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {
+        "plant": SpacecraftPlant,
+        "spacecraft": Spacecraft,
+        "initial": Initial,
+        "reference": REFERENCES,
+        "disturbance": DISTURBANCES["spacecraft"],
+        "controller": LAWS["spacecraft"],
+        "observer": OBSERVERS["spacecraft"],
+        "loop": Loop,
+        "hardware": Hardware,
+        "wheels": WHEELS,
+        "filter": FILTERS,
+        "dispersion": dispersion_tables.Dispersion,
+        "tune": Tune,
+    }
+    metrics: ClassVar[Any] = CATALOGUE
+    motion: ClassVar[str] = "spacecraft"
+    reaching: ClassVar[float] = 2.0
+
+    @classmethod
+    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+        """The paper's Case I."""
+        return _CASE_I
+
+    @property
+    def inputs(self) -> int:
+        """Torques about the body axes."""
+        return 3
+
+    @property
+    def grid_order(self) -> int:
+        """The paper's cases need no finer grid."""
+        return 1
+
+    @property
+    def estimator(self) -> Any:
+        """The table [filter], `NoFilter` where it is absent."""
+        return NoFilter() if self.filter is None else self.filter
+
+    @property
+    def reaction_wheels(self) -> Any:
+        """The table [wheels]; None: there are none."""
+        return self.wheels
+
+    @property
+    def moments(self) -> tuple[float, float]:
+        """Mean and largest moment of inertia [kg m^2]."""
+        values = np.asarray(self.spacecraft.inertia, dtype=float)
+        if values.ndim == 1:
+            return float(np.mean(values)), float(values.max())
+        return float(np.mean(np.diag(values))), float(np.linalg.eigvalsh(values).max())
+
+    def check_plant(self) -> None:
+        """A body that can be, attitudes that are given once, and devices that fit."""
+        for key in ("inertia", "true_inertia"):
+            value = getattr(self.spacecraft, key)
+            if value is not None:
+                try:
+                    formulas.check_inertia(value)
+                except ValueError as error:
+                    raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
+        attitude_keys.quaternion(self.initial, "initial")
+        self.reference.check()
+        several = len(self.terms) > 1 or self.disturbance.kind == "sum"
+        for k, term in enumerate(self.terms):
+            term.check(f"disturbance.terms[{k}]" if several else "disturbance")
+        self.devices.check(self)
+        self.estimator.check(self)
+        if self.wheels is not None:
+            self.wheels.check()
+
+    def model(self) -> Any:
+        """The body that the law knows."""
+        from ptsmc_jax.plants.rigid_body import spacecraft
+
+        return spacecraft(self.spacecraft.inertia)
+
+    def truth(self, model: Any) -> Any:
+        """The body with its true inertia, where the scenario gives one."""
+        from ptsmc_jax.plants.rigid_body import spacecraft
+
+        table = self.spacecraft
+        return spacecraft(table.inertia if table.true_inertia is None else table.true_inertia)
+
+    def start(self) -> Any:
+        """Attitude and rate at t = 0."""
+        import jax.numpy as jnp
+
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.plants.rigid_body import AttitudeState
+
+        q = jnp.asarray(attitude_keys.quaternion(self.initial, "initial"))
+        return AttitudeState(q, vector(self.initial.rate))
+
+    def target(self) -> Any:
+        """The reference."""
+        return self.reference.build()
+
+    @property
+    def turning(self) -> float:
+        """How fast the body turns at t = 0 [rad/s]; where it is drawn, all but one in 10 000."""
+        table = getattr(self.dispersion, "rate", None)
+        drawn = 0.0 if table is None else table.widest * table.of()[0]
+        return float(np.linalg.norm(self.initial.rate)) + drawn
+
+    def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
+        """Of the start, the reference, the law and the wheels."""
+        found = {"initial.rate": self.turning, **self.reference.frequencies()}
+        key, rate = self.controller.turning(t_f)
+        if not self.controller.prescribed:
+            rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)
+        found[key] = rate
+        for key, rate in self._nutation(setup).items():
+            found[key] = found.get(key, 0.0) + rate
+        return found
+
+    def _nutation(self, setup: Any) -> dict[str, float]:
+        """How fast a body with wheels nutates at most [rad/s], by the key that says so: |H| over its smallest moments.
+
+        J w' = -w x H + u, where H = J w + A h changes in inertial axes by disturbances only: wheels that give a body
+        its rate take as much.
+        """
+        if self.wheels is None:
+            return {}
+        wheels = setup.actuators.wheels
+        least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
+        shares = {
+            "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes @ wheels.initial)),
+            "initial.rate": largest * self.turning,
+            "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
+        }
+        return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
+
+    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
+        """The law's singularity on the reference, and on the way to it; a drawn trial that meets it is marked."""
+        from ptsmc_jax.scenario import start_checks
+
+        start_checks.reference(self, parts)
+        if not drawn or (dispersion.attitude is None and dispersion.reference is None):
+            start_checks.attitude(self, parts)
+
+    def spread(self, parts: Any) -> dict[str, Any]:
+        """Attitude, rate and inertia, and the reference."""
+        how = {"attitude": (), "rate": (3,), "inertia": (parts.plant.inertia,), "reference": ()}
+        asked = {key: getattr(self.dispersion, key) for key in how}
+        return {key: None if table is None else table.build(*how[key]) for key, table in asked.items()}

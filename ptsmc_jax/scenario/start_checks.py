@@ -1,0 +1,85 @@
+"""Starts from which a law meets its singularity, or that it cannot invert: refused before anything is flown."""
+
+import typing
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ptsmc_jax import programs
+from ptsmc_jax.laws.base import Prescribed
+from ptsmc_jax.laws.error_motions import ErrorVector
+from ptsmc_jax.observers.none import NoObserver
+from ptsmc_jax.plants.second_order import System
+from ptsmc_jax.scenario import attitude_keys, errors
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, Parts
+from ptsmc_jax.theory import solutions
+
+SINGULAR_CONDITION = 1e14  # of a matrix in double precision
+
+
+def system(scenario: Any, parts: Parts) -> None:
+    """Refuse a system that the law, or the observer, cannot invert where it starts."""
+    start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.plant)
+    matrices = {"dF/dx2 G": plant.slope(*start) @ plant.input_gain(*start)}
+    if not isinstance(parts.observer, NoObserver):
+        matrices["D"] = plant.disturbance_gain(*start)
+    for name, matrix in matrices.items():
+        if not np.linalg.cond(np.asarray(matrix)) < SINGULAR_CONDITION:
+            user = "the law" if name != "D" else f"observer.kind = {errors.show(scenario.observer.kind)}"
+            raise ScenarioError(
+                f"plant.system has a singular {name} at t = 0 in plant.x0, which {user} must invert; allowed is an "
+                "invertible one" + ("" if name != "D" else ', or observer.kind = "none"')
+            )
+
+
+_SINGULAR = "q4 = 0 (180 degrees from the inertial frame's identity), which the additive law cannot cross"
+_OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is singular"
+
+
+def reference(scenario: Any, parts: Parts) -> None:
+    """Refuse a reference on which the additive law meets its singularity."""
+    if not isinstance(parts.controller, ErrorVector):
+        return
+    grid = np.linspace(0.0, float(parts.t_end), 4001)
+    held = np.asarray(_scalar_part(parts, grid))
+    worst = int(np.argmin(np.abs(held)))
+    crosses = np.any(np.sign(held) != np.sign(held[0]))
+    if crosses or abs(held[worst]) < SINGULAR_CLEARANCE:
+        when = float(grid[int(np.argmax(np.sign(held) != np.sign(held[0])))]) if crosses else float(grid[worst])
+        raise ScenarioError(
+            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude reaches {_SINGULAR}, "
+            f"at t = {when:.4g} s; allowed is a reference that stays away from it until t_end, "
+            'or controller.error = "multiplicative"'
+        )
+
+
+@programs.jit
+def _scalar_part(parts: Parts, times: Array) -> Array:
+    """q_f4 of the reference at these times (times,) [s]."""
+    return jax.vmap(lambda time: parts.reference(time).q[3])(times)
+
+
+def attitude(scenario: Any, parts: Parts) -> None:
+    """Refuse an initial attitude from which the law meets its singularity on the way."""
+    additive, law = isinstance(parts.controller, ErrorVector), parts.controller
+    singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
+    key, value = attitude_keys.attitude_key(scenario.initial)
+    said = f"initial.{key} is {errors.brief(value)}"
+    if isinstance(law, Prescribed):
+        times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
+    else:  # of the others only the start is known
+        target = parts.reference(jnp.zeros_like(parts.t_end))
+        times, square = np.zeros(1), np.square([float(law.clearance(law.align(parts.initial, target), target))])
+    if square[0] < SINGULAR_CLEARANCE**2:
+        raise ScenarioError(f"{said}, but lies at {singular}; allowed is {name} of at least {SINGULAR_CLEARANCE}")
+    if square.min() < SINGULAR_CLEARANCE**2:
+        when = float(times[int(np.argmin(square))])
+        raise ScenarioError(
+            f"{said} with initial.rate = {errors.brief(scenario.initial.rate)}, but from there the path to the "
+            f"reference meets {singular}, at t = {when:.4g} s; allowed is a start whose path keeps {name} above "
+            f"{SINGULAR_CLEARANCE}"
+        )

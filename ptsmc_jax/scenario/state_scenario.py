@@ -1,0 +1,209 @@
+"""Scenarios of plants whose states are plain numbers, x0 in [plant]: integrator chains and systems of one's own."""
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems
+from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
+from ptsmc_jax.scenario.values import Kind, Kinds, Numbers, Table
+from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
+
+_PAPERS = "prescribed_time"
+
+
+class ChainPlant(Table, frozen=True):
+    """An integrator chain x_i' = x_(i+1), x_n' = u + d, equation (35): the paper's Section 3.
+
+    Attributes:
+        order: number n of states; as many as x0 has where it is absent
+        x0: initial state x_1 to x_n
+    """
+
+    kind: Literal["chain"] = "chain"
+    order: Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")] = 2
+    x0: Numbers = (5.0, 3.0)
+
+
+class SystemPlant(Table, frozen=True):
+    """A second-order system of one's own, x_1' = F, x_2' = H + G u + D d, equation (25), in a Python file.
+
+    A scenario that names one is a program: flying it runs that file, which can do what you can. Read it before you fly
+    somebody else's; results that name one are flown with --trust only.
+
+    Attributes:
+        system: where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed
+        x0: initial state, x_1 and then x_2
+    """
+
+    kind: Literal["system"] = "system"
+    system: Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')] = None
+    x0: Numbers = (1.0, 0.0)
+
+
+def _tables(plant: type[Table]) -> dict[str, type[Table] | Kinds]:
+    kind = plant().kind  # pyright: ignore[reportAttributeAccessIssue]
+    return {
+        "plant": plant,
+        "disturbance": DISTURBANCES[kind],
+        "controller": LAWS[kind],
+        "observer": OBSERVERS[kind],
+        "loop": Loop,
+        "hardware": device_tables.StateHardware,
+        "dispersion": dispersion_tables.StateDispersion,
+        "tune": Tune,
+    }
+
+
+class StateScenario(Scenario, frozen=True, kw_only=True):
+    """What chains and systems share."""
+
+    metrics: ClassVar[Any] = STATE_CATALOGUE
+
+    def resolved(self) -> Any:
+        """With as many widths of the drawn initial state as there are states."""
+        drawn = getattr(self.dispersion, "x0", None)
+        if drawn is None:
+            return self
+        width = getattr(drawn, drawn.width) or (1.0,) * len(self.plant.x0)
+        drawn = msgspec.structs.replace(drawn, **{drawn.width: width})
+        return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
+
+    def check_plant(self) -> None:
+        """Lists as long as there are inputs, or states."""
+        several = len(self.terms) > 1
+        for k, term in enumerate(self.terms):
+            self._check_each(f"disturbance.terms[{k}]" if several else "disturbance", term)
+        self._check_each("observer", self.observer)
+        self.devices.check(self)
+
+    def _check_each(self, name: str, table: Kind) -> None:
+        m = self.inputs
+        for key in table.each:
+            value = getattr(table, key)
+            if len(value) != m:
+                raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
+
+    def start(self) -> Any:
+        """The state x0."""
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return vector(self.plant.x0)
+
+    def spread(self, parts: Any) -> dict[str, Any]:
+        """The initial state."""
+        drawn = self.dispersion.x0
+        return {"state": None if drawn is None else drawn.build(len(self.plant.x0))}
+
+
+class ChainScenario(StateScenario, frozen=True, kw_only=True):
+    """A scenario of an integrator chain."""
+
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = _tables(ChainPlant)
+    motion: ClassVar[str] = "chain"
+
+    @classmethod
+    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+        """Figs. 1 and 2 for order 2 and 3, with poles at -1; the paper's t_f for every law.
+
+        x0 says the order where that is absent. Raises ScenarioError where there are too few states.
+        """
+        order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
+        if order < 2:
+            raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
+        x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
+        poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
+        papers = {"eta": order + 1.0, "a": poles_at_minus_one}
+        return {"plant": {"x0": x0, "order": order}, "controller": papers if law == _PAPERS else {"t_f": 5.0}}
+
+    @property
+    def inputs(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def order(self) -> int:
+        """As many as there are states."""
+        return self.plant.order
+
+    def check_plant(self) -> None:
+        """As many states as its order."""
+        n = self.plant.order
+        if len(self.plant.x0) != n:
+            raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
+        super().check_plant()
+
+    def model(self) -> Any:
+        """The chain."""
+        from ptsmc_jax.plants.integrator_chain import chain
+
+        return chain(self.plant.order)
+
+    def target(self) -> Any:
+        """Rest at the origin."""
+        from ptsmc_jax.signals.references import Origin
+
+        return Origin()
+
+
+class SystemScenario(StateScenario, frozen=True, kw_only=True):
+    """A scenario of a system of one's own."""
+
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = _tables(SystemPlant)
+    motion: ClassVar[str] = "system"
+
+    @classmethod
+    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+        """The paper's t_f of a chain, for every law but the paper's."""
+        return {"controller": {} if law == _PAPERS else {"t_f": 5.0}}
+
+    @property
+    def inputs(self) -> int:
+        """As many as x_1 has components."""
+        return len(self.plant.x0) // 2
+
+    def check_plant(self) -> None:
+        """What can be said without running the file that it names: whoever reads a scenario may not want that."""
+        plant = self.plant
+        if plant.system is None:
+            raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
+        if len(plant.x0) % 2:
+            raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
+        if isinstance(plant.system, str):
+            try:
+                systems.named(plant.system, systems.ALLOWED)
+            except ValueError as error:
+                raise ScenarioError(f"plant.system is {errors.brief(plant.system)}: {error}") from None
+        else:
+            self.model()
+        super().check_plant()
+
+    def model(self) -> Any:
+        """The system that the scenario holds, or names: that file is run. Raises ScenarioError where there is none."""
+        try:
+            found = systems.load(self.plant.system)
+        except ValueError as error:
+            raise ScenarioError(f"plant.system is {errors.brief(self.plant.system)}: {error}") from None
+        n = found.inputs
+        if n * 2 != len(self.plant.x0):
+            raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
+        return found
+
+    def target(self) -> Any:
+        """Time: the reference is in x_1, an error already."""
+        from ptsmc_jax.signals.references import Now
+
+        return Now()
+
+    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
+        """What the law, or the observer, must invert where it starts."""
+        from ptsmc_jax.scenario import start_checks
+
+        start_checks.system(self, parts)
