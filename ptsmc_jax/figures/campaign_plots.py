@@ -20,6 +20,7 @@ MARKS = {
     "missed": (STYLES[1][0], "^", 16.0),
     "singular": (STYLES[3][0], "x", 18.0),
     "diverged": (STYLES[2][0], "s", 16.0),
+    "unfinished": ("#000000", "+", 18.0),
 }
 
 

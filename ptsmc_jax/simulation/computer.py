@@ -26,8 +26,8 @@ class Computer(NamedTuple):
     seen: Any  # state as the law saw it at the last sample
     memory: Any  # of the observer
     law: Any  # memory of the law; None where it has none
-    # what the observer is told of the last period: mean torque [N m], and momentum of the wheels in it [N m s]
-    told: tuple[Array, Array | None] | None  # None: kept elsewhere
+    # what its actuators did in the last period: mean torque [N m], and momentum of the wheels in it [N m s]
+    applied: tuple[Array, Array | None] | None  # None: kept elsewhere
 
 
 class Decision(NamedTuple):
@@ -76,34 +76,52 @@ def boot(parts: Parts, seed: Whole, trial: Whole, x0: Any, first: Ticks) -> Comp
     sensing = None if parts.sensors is None else parts.sensors.begin(seed, trial, x0, first)
     none = jnp.zeros(parts.plant.inputs)
     wheels = parts.actuators is not None and parts.actuators.wheels is not None
-    told = none, none if wheels else None
-    return Computer(sensing, x0, parts.observer.begin(), parts.controller.begin(), told)
+    applied = none, none if wheels else None
+    return Computer(sensing, x0, parts.observer.begin(), parts.controller.begin(), applied)
+
+
+def measure(parts: Parts, period: Period, computer: Computer, x: Any) -> tuple[Any, Any]:
+    """The state as the sensors see it at the start of a period, and their memory; x: the true state."""
+    if parts.sensors is None:
+        return x, None
+    return parts.sensors.measure(computer.sensing, x, period.now, period.dt_before)
+
+
+def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:
+    """The disturbance (m,) [N m] by what the last period did to the state, and the observer's memory."""
+    observer, plant, dt = parts.observer, parts.plant, period.dt_before
+    assert computer.applied is not None
+    torque, stored = computer.applied
+    if stored is not None:  # w x h of the wheels, by the mean rate
+        torque = torque - jnp.cross((plant.velocity(computer.seen) + plant.velocity(seen)) / 2, stored)
+    impulse = observer.model.unexplained_impulse(period.now.t, computer.seen, seen, torque, dt)
+    memory = observer.update(period.matrix, computer.memory, impulse, period.now.t, dt)
+    memory = _kept(dt > 0.0, memory, computer.memory)
+    return observer.estimate(memory), memory
+
+
+def command(
+    parts: Parts, k2: Any, period: Period, computer: Computer, seen: Any, target: Any, d_hat: Array
+) -> tuple[Array, Array, Any]:
+    """The law's torque (m,) [N m], its sliding variable and its memory; k2: its K2(t) [s]."""
+    now, flown = period.now, period.length > 0.0
+    # a length that one may divide by, also in a period that is none
+    sample = Sample(now.t, now.hold, jnp.where(flown, period.length, parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
+    return u, s, _kept(flown, memory, computer.law)
 
 
 def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) -> tuple[Decision, Computer]:
     """The flight software in a control period: sensors, observer, law; k2: its K2(t) [s]; x: the true state.
 
-    `told` of the computer that comes back is the old one: what the period's command brings about is not known yet.
+    `applied` of the computer that comes back is the old one: what the period's command brings about is not known yet.
     """
-    now, dt_before, matrix = period
-    law, observer, sensors = parts.controller, parts.observer, parts.sensors
-    model, target = observer.model, parts.reference(now.t)
-    seen, sensing = (x, None) if sensors is None else sensors.measure(computer.sensing, x, now, dt_before)
-    w = parts.plant.velocity(seen)
-    assert computer.told is not None
-    applied, stored = computer.told
-    if stored is not None:
-        applied = applied - jnp.cross((parts.plant.velocity(computer.seen) + w) / 2, stored)
-    impulse = model.unexplained_impulse(now.t, computer.seen, seen, applied, dt_before)
-    memory = observer.update(matrix, computer.memory, impulse, now.t, dt_before)
-    memory = _kept(dt_before > 0.0, memory, computer.memory)
-    d_hat = observer.estimate(memory)
-    flown = period.length > 0.0
-    # a length that one may divide by, also in a period that is none
-    sample = Sample(now.t, now.hold, jnp.where(flown, period.length, parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
-    u, s, kept = law.command(computer.law, sample, seen, target, d_hat, k2(now.t))
-    kept = _kept(flown, kept, computer.law)
-    return Decision(target, d_hat, u, s, w), Computer(sensing, seen, memory, kept, computer.told)
+    target = parts.reference(period.now.t)
+    seen, sensing = measure(parts, period, computer, x)
+    d_hat, memory = estimate(parts, period, computer, seen)
+    u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
+    decision = Decision(target, d_hat, u, s, parts.plant.velocity(seen))
+    return decision, Computer(sensing, seen, memory, law, computer.applied)
 
 
 def _kept(flown: Array, new: Any, old: Any) -> Any:
@@ -111,7 +129,7 @@ def _kept(flown: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda one, other: jnp.where(flown, one, other), new, old)
 
 
-def told(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
+def applied(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
     """What the flight software knows of what its actuators did in a period."""
     push = actuators.over(drive, jnp.zeros_like(dt), dt)
     return push.mean, push.middle

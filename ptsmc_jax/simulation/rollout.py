@@ -20,13 +20,13 @@ from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.clock import Graded
-from ptsmc_jax.simulation.computer import Computer, boot, decide, schedule, told
+from ptsmc_jax.simulation.computer import Computer, applied, boot, decide, schedule
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
 
 Scalar = Float[Array, ""]
 
-OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED = range(6)
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
@@ -35,6 +35,7 @@ STATUS = {
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
     UNBOUNDED: ("diverged", "a metric is not finite"),
+    UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples for these"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
 SINGULAR_CLEARANCE = 1e-3
@@ -84,7 +85,8 @@ class _Course(NamedTuple):
     x0: Any
     first: Any  # the reference at t = 0
     arrival: Any  # and at t_f
-    whole: Array  # what clearances from the law's singularity are counted in
+    clearance: Array  # from the law's singularity at t = 0, which others are counted in: at least so far is 1
+    gap: Array  # first time without samples [s]; NaN: they go from t = 0 to t_end
 
 
 class _World(NamedTuple):
@@ -104,10 +106,18 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
-    whole = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
-    course = _Course(criteria, x0, target, parts.reference(criteria.t_f), jax.lax.stop_gradient(whole))
+    clearance = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
+    arrival = parts.reference(criteria.t_f)
+    course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(clearance), _gap(ticks, parts.t_end))
     loop = _continuous if isinstance(parts.clock, Graded) else _sampled
     return loop(parts, ticks, course, seed, trial, record)
+
+
+def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
+    """First time without samples [s], where the clock was made for shorter t_f or delta than it got; NaN: none."""
+    first, last = ticks.t[0], ticks.t_next[-1]
+    ends = jnp.where(last < t_end * (1.0 - 1e-9), last, jnp.nan)  # not by rounding
+    return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
 # One compiled program for all parts of the same structure.
@@ -116,43 +126,32 @@ simulate_jit = programs.jit(simulate, static_argnames="record")
 
 def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
     """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
-    observer: Observer = parts.observer
     actuators = Actuators() if parts.actuators is None else parts.actuators
-    k2 = observer.error_bound()
+    k2 = parts.observer.error_bound()
     listed, about, started = schedule(parts, ticks)
     walk = draws.stream(seed, trial, DISTURBANCE_WALK)
 
-    def fly(x: Any, t: Scalar, drive: Any, pushed: Array | None, dt: Scalar) -> Any:
-        return over_period(parts, t, x, drive, pushed, dt)
-
     def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
         (now, *_), (state, world) = tick, carry
-        dt = now.t_next - now.t
-        computer = world.computer._replace(told=(state.u, None)) if actuators.holds else world.computer
+        dt, pushed = now.t_next - now.t, world.pushed
+        computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, state.x)
         drive, queue = actuators.command(world.acting, u, w, dt, now.noise_weight)
-        pushed = world.pushed
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
-        zero, stored = jnp.zeros_like(dt), None
-        delivered = actuators.torque(drive, zero)
-        wheels = None if actuators.wheels is None else actuators.wheels_at(drive, zero)
-        row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels) if record else None
+        torques = _torques(actuators, drive, u, dt)
+        row = None
+        if record:
+            wheels = None if actuators.wheels is None else actuators.wheels_at(drive, jnp.zeros_like(dt))
+            delivered = torques.delivered[0]
+            row = _row(parts, now.t, state.x, target, d_hat, delivered, u, s, dt > 0.0, pushed, wheels)
         start = state.x
-        x = fly(start, now.t, drive, pushed, dt)
-        weights, acting = (1.0,), (delivered,)
-        if actuators.moves:
-            weights = (1 / 6, 4 / 6, 1 / 6)
-            acting = (delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
-        if wheels is not None:  # in the middle too: a lag may turn the torque around within the period
-            stored = jnp.stack([actuators.wheels_at(drive, s)[0] for s in (dt / 2, dt)])
-        torques = _Torques((u,) * len(acting), acting, weights, drive.limited, stored)
 
         def until(t: Scalar) -> Any:
-            return fly(start, now.t, drive, pushed, t - now.t)
+            return over_period(parts, now.t, start, drive, pushed, t - now.t)
 
-        state = _advance(parts, course, state, now, target, x, torques, until, dt / parts.substeps)
-        computer = computer._replace(told=None if actuators.holds else told(actuators, drive, dt))
+        state = _advance(parts, course, state, now, target, until(now.t_next), torques, until, dt / parts.substeps)
+        computer = computer._replace(applied=None if actuators.holds else applied(actuators, drive, dt))
         return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
 
     acting = actuators.begin(parts.plant.inputs)
@@ -161,10 +160,21 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
     computer = boot(parts, seed, trial, course.x0, started)
     if actuators.holds:  # the state has it
-        computer = computer._replace(told=None)
+        computer = computer._replace(applied=None)
     world = _World(computer, acting, pushed)
     (state, world), rows = jax.lax.scan(period, (state, world), listed)
     return _finish(parts, course, first, state, world.computer.memory, k2, rows, world)
+
+
+def _torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> "_Torques":
+    """Commanded and delivered torques of a control period, and the momentum of the wheels in it."""
+    weights, delivered, stored = (1.0,), (actuators.torque(drive, jnp.zeros_like(dt)),), None
+    if actuators.moves:
+        weights = (1 / 6, 4 / 6, 1 / 6)
+        delivered = (*delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
+    if actuators.wheels is not None:  # in the middle too: a lag may turn the torque around within the period
+        stored = jnp.stack([actuators.wheels_at(drive, time)[0] for time in (dt / 2, dt)])
+    return _Torques((u,) * len(delivered), delivered, weights, drive.limited, stored)
 
 
 def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | None, dt: Scalar) -> Any:
@@ -303,8 +313,11 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
     start = Start(first, parts.plant.inputs, None if acting is None else acting.h)
     unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * criteria.settling_angle))
-    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status)).astype(jnp.int32)
+    cut = (state.status == OK) & ~jnp.isnan(course.gap)
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
+    status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
+    bad_time = jnp.where(cut, course.gap, bad_time)
     return Result(found, status, bad_time, log)
 
 
@@ -319,7 +332,7 @@ def _watch(
     """Status and first bad time of the state at t; the first thing that goes wrong stays."""
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
     fast = parts.plant.too_fast(state.x, dt)
-    near = ~(parts.controller.clearance(state.x, target) / course.whole >= SINGULAR_CLEARANCE)
+    near = ~(parts.controller.clearance(state.x, target) / course.clearance >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (state.status == OK) & (code != OK)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)

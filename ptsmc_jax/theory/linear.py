@@ -29,7 +29,7 @@ from ptsmc_jax.devices.sensors import Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import Computer, Decision, Period, boot, decide, schedule, told
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, applied, boot, decide, schedule
 
 Scalar = Float[Array, ""]
 
@@ -131,7 +131,7 @@ def _computed(
     actuators, dt = _actuators(parts), period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     drive, queue = actuators.command(carry.model, decision.u, decision.w, dt, period.now.noise_weight)
-    computer = computer._replace(told=told(actuators, drive, dt))
+    computer = computer._replace(applied=applied(actuators, drive, dt))
     return decision, computer, actuators.end(carry.model, drive, queue, dt)
 
 
@@ -169,7 +169,7 @@ class _Local:
     def _rest(self, carry: Carry) -> Any:
         computer = carry.computer
         kept = None if self._turned else _numbers(computer.sensing)
-        return carry.acting, computer.memory, computer.told, carry.model, kept, _numbers(computer.law)
+        return carry.acting, computer.memory, computer.applied, carry.model, kept, _numbers(computer.law)
 
     def moved(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])

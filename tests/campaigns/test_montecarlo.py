@@ -174,12 +174,12 @@ def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
     wide = replace(SPREAD, attitude=attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
     near = replace(wide, attitude=attitudes.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
     failed = montecarlo.run(run, near, 5, np.arange(8))
-    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": 8, "missed": 0}
+    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": 8, "missed": 0, "unfinished": 0}
     assert np.all(failed.bad_time >= 0.0)
     mixed = montecarlo.run(run, wide, 5, np.arange(256))
     assert sum(mixed.counts().values()) == 256
     assert np.all(np.isfinite(mixed.metrics.window_error[mixed.ok]))
-    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "missed": 0}
+    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "missed": 0, "unfinished": 0}
 
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), TABLE)

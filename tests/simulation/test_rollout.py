@@ -303,3 +303,22 @@ def test_observer_and_controller_hold_a_model_of_their_own():
     np.testing.assert_array_equal(same.metrics.window_error, fly(run).metrics.window_error)
     assert abs(float(off.metrics.window_error / same.metrics.window_error) - 1.0) > 0.05
     np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)
+
+
+def test_gains_that_the_clock_has_no_samples_for_are_said():
+    """A clock of 20 s before and 10.5 s after the hand-over: a longer t_f begins late, a longer delta ends early."""
+    run = parts(20.0, 3.0, 0.5, period=0.25, noise=(2e-4, 1e-5))
+    codes = {}
+    for name, t_f, delta in (
+        ("as made", 20.0, 0.5),
+        ("shorter", 19.0, 0.25),
+        ("late", 22.0, 0.5),
+        ("early", 20.0, 3.0),
+    ):
+        other = with_controller(run.with_t_f(vector(t_f)), delta=vector(delta))
+        found = rollout.simulate_jit(other, np.uint32(1), np.uint32(4), record=True)
+        codes[name] = (int(found.status), float(found.bad_time))
+    assert codes["as made"][0] == codes["shorter"][0] == rollout.OK
+    assert codes["late"] == (rollout.UNFINISHED, 0.0)
+    assert codes["early"] == (rollout.UNFINISHED, 27.75)
+    assert rollout.UNFINISHED not in rollout.FINISHED
