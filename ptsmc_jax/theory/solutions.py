@@ -14,7 +14,7 @@ from ptsmc_jax.laws.base import SecondOrder
 from ptsmc_jax.laws.prescribed_time import expansion
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.plants.integrator_chain import Chain
-from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.simulation.assembly import Setup
 
 Scalar = Float[Array, ""]
 
@@ -134,25 +134,25 @@ def _from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambd
     ]
 
 
-def _start(parts: Parts) -> tuple[Array, Array]:
+def _start(parts: Setup) -> tuple[Array, Array]:
     """The errors and their derivatives at t = 0, (m,) each."""
     target = parts.reference(jnp.zeros_like(parts.t_end))
     return parts.controller.errors(parts.controller.align(parts.initial, target), target)
 
 
-def starts(parts: Parts) -> Float[Array, "m n"]:
+def starts(parts: Setup) -> Float[Array, "m n"]:
     """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
     return parts.initial[None] if isinstance(parts.plant, Chain) else jnp.stack(_start(parts), axis=1)
 
 
-def exact_sizes(parts: Parts, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
     error, s = _exact_sizes(parts, jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
 
 @programs.jit
-def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
+def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
     law = parts.controller
 
     def sizes(time: Scalar) -> tuple[Scalar, Scalar]:
@@ -165,7 +165,7 @@ def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
     return jax.vmap(sizes)(t)
 
 
-def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
+def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     """Input (m,) [N m] along the exact motion at t [s] before the hand-over, and the law's clearance then [-].
 
     For attitudes 1 - |v|^2, the square of the scalar part, stands for the clearance; at or below 0 there is no path.
@@ -183,7 +183,7 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
 
 
 @programs.jit(static_argnames="points")
-def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
+def visited(parts: Setup, points: int = 64) -> tuple[Array, Any]:
     """Targets and states of a second-order run, (2 points,) each: along the exact motion, then on the target.
 
     States in the states' own units; half of the times close in on the hand-over.
@@ -204,7 +204,7 @@ def visited(parts: Parts, points: int = 64) -> tuple[Array, Any]:
 
 
 @programs.jit(static_argnames="points")
-def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
+def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
     """Times before the hand-over [s], (points,), inputs (points, m) and clearance (points,) along the exact motion.
 
     See `exact_input`.
@@ -215,7 +215,7 @@ def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
     return t, u, clearance
 
 
-def exact_peak(parts: Parts, points: int = 400) -> Scalar:
+def exact_peak(parts: Setup, points: int = 400) -> Scalar:
     """Largest input along the exact motion before the hand-over [N m]: rule 3.5 for any start, reference and order."""
     _, u, _ = exact_path(parts, points)
     return jnp.max(jnp.abs(u))
