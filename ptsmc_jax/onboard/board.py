@@ -18,7 +18,7 @@ from ptsmc_jax.devices.actuators import Actuators, ActuatorState
 from ptsmc_jax.devices.attitude_filter import Estimate
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Observer
-from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE
 
@@ -97,7 +97,7 @@ def board(parts: Parts) -> Board:
         "actuators": device,
         "period": period,
     }
-    made = Board(parameters, isinstance(observer.model, Spacecraft))
+    made = Board(parameters, observer.model.attitude)
     made.about["period"] = "of the control loop [s]"
     made.about["observer_matrix"] = _said(type(observer).update_matrix)
     if not made.spacecraft:

@@ -13,9 +13,8 @@ from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.board import Board
-from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import boot, decide, schedule, told
+from ptsmc_jax.simulation.computer import boot, brought_about, decide, schedule
 from ptsmc_jax.simulation.rollout import DISTURBANCE_WALK, SINGULAR_CLEARANCE, over_period
 
 
@@ -66,13 +65,13 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             read = sensors.sample if isinstance(sensors, Sensors) else sensors.measure
             measured, _ = read(sensing, x, now, dt_before)
         before = getattr(sensing, "estimate", None)
-        applied = computer.told[0]
+        applied = computer.applied[0]
         (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, x)
         drive, queue = actuators.command(acting, u, w, dt, now.noise_weight)
         if pushed is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         x_next = over_period(parts, now.t, x, drive, pushed, dt)
-        known = (drive.c, None) if actuators.holds else told(actuators, drive, dt)
+        known = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.whole_clearance(distance), unit)
         row = Samples(
@@ -86,11 +85,11 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
         )  # fmt: skip
-        return (x_next, computer._replace(told=known), actuators.end(acting, drive, queue, dt), pushed, unit), row
+        return (x_next, computer._replace(applied=known), actuators.end(acting, drive, queue, dt), pushed, unit), row
 
     computer = boot(parts, seed, trial, x0, started)
     if actuators.holds:
-        computer = computer._replace(told=(jnp.zeros(parts.plant.inputs), None))
+        computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
     start = x0, computer, actuators.begin(parts.plant.inputs), pushed, jnp.full_like(parts.t_end, jnp.nan)
     return jax.lax.scan(period, start, listed)[1]
@@ -127,7 +126,7 @@ def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.nda
     kept = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
             "wheel_momentum": samples.momentum, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
-    if isinstance(samples.seen, AttitudeState):
+    if board.spacecraft:
         given |= {"attitude": samples.measured.q, "rate": samples.measured.w}
         kept |= {"attitude": samples.seen.q, "rate": samples.seen.w}
     if samples.estimate is not None:

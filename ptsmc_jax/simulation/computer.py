@@ -129,7 +129,7 @@ def _kept(flown: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda one, other: jnp.where(flown, one, other), new, old)
 
 
-def applied(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
+def brought_about(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
     """What the flight software knows of what its actuators did in a period."""
     push = actuators.over(drive, jnp.zeros_like(dt), dt)
     return push.mean, push.middle

@@ -20,7 +20,7 @@ from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.clock import Graded
-from ptsmc_jax.simulation.computer import Computer, applied, boot, decide, schedule
+from ptsmc_jax.simulation.computer import Computer, boot, brought_about, decide, schedule
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
 
@@ -151,7 +151,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
             return over_period(parts, now.t, start, drive, pushed, t - now.t)
 
         state = _advance(parts, course, state, now, target, until(now.t_next), torques, until, dt / parts.substeps)
-        computer = computer._replace(applied=None if actuators.holds else applied(actuators, drive, dt))
+        computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, dt))
         return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
 
     acting = actuators.begin(parts.plant.inputs)

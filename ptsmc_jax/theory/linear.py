@@ -29,7 +29,7 @@ from ptsmc_jax.devices.sensors import Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import Computer, Decision, Period, applied, boot, decide, schedule
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, boot, brought_about, decide, schedule
 
 Scalar = Float[Array, ""]
 
@@ -131,7 +131,7 @@ def _computed(
     actuators, dt = _actuators(parts), period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     drive, queue = actuators.command(carry.model, decision.u, decision.w, dt, period.now.noise_weight)
-    computer = computer._replace(applied=applied(actuators, drive, dt))
+    computer = computer._replace(applied=brought_about(actuators, drive, dt))
     return decision, computer, actuators.end(carry.model, drive, queue, dt)
 
 
