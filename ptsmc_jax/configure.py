@@ -9,7 +9,7 @@ import sys
 import warnings
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 # Compiler options for loops on a CPU, no stable interface. The first lets all outputs of a loop's body share their
 # common work, the second compiles the whole loop into one kernel, the third lets that kernel's loops over the trials
@@ -69,13 +69,37 @@ def configure(
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        # entries appear byte by byte: what another process is still writing is compiled here
-        warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
+        _tell_of_rejected_once(folder)
     if device == "gpu":
         try:
             jax.devices()  # starts the backend
         except RuntimeError:
             raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
+
+
+_REJECTED = "Error reading persistent compilation cache"
+SEVERAL = 3  # entries
+
+
+def _tell_of_rejected_once(folder: Path) -> None:
+    """JAX warns of every entry of its cache that it cannot read; say it once, when there are several.
+
+    One or two may be entries that another process is still writing, which appear byte by byte. Some processors' caches
+    reject all of their own.
+    """
+    rejected, show = list[str](), warnings.showwarning
+
+    def showing(message: Any, category: Any, *where: Any, **more: Any) -> None:
+        if not str(message).startswith(_REJECTED):
+            show(message, category, *where, **more)
+            return
+        rejected.append(str(message))
+        if len(rejected) == SEVERAL:
+            text = f"the compile cache {folder} rejects its own entries, so programs are compiled anew in every process"
+            show(f"{text}: {rejected[0]}", RuntimeWarning, *where, **more)
+
+    warnings.showwarning = showing
+    warnings.filterwarnings("always", _REJECTED)
 
 
 def _cores() -> int:

@@ -60,27 +60,30 @@ class Program:
             return self._jitted(*args, **kwargs)
         key, said, given = known
         ready = self._ready.get(key)
-        if ready is None:
-            found = _read(_path(said), said, jax.tree.structure(((given,), {})))
-            if found is not None:
+        if ready is None or isinstance(ready, Future):
+            ready, loaded = self._begun(key, said, given) if ready is None else ready.result()
+            if loaded:
                 try:
-                    result = jax.block_until_ready(found(given))
+                    result = jax.block_until_ready(ready(given))
                 except Exception:  # it was whole, and yet does not run here
                     _path(said).unlink(missing_ok=True)
+                    ready = self._compiled(key, said, given)
                 else:
-                    self._ready[key] = found
+                    self._ready[key] = ready
                     return result
-            ready = self._ready[key] = self._compiled(key, said, given)
-        elif isinstance(ready, Future):
-            ready = self._ready[key] = ready.result()
+            self._ready[key] = ready
         return ready(given)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Begin to compile what such a call will need, beside what is being done; nothing where nothing is kept."""
+        """Begin to load or compile what such a call will need, beside what is done; nothing where nothing is kept."""
         known = self._known(args, kwargs)
-        if known is None or known[0] in self._ready or _path(known[1]).exists():
-            return
-        self._ready[known[0]] = _beside().submit(self._compiled, *known)
+        if known is not None and known[0] not in self._ready:
+            self._ready[known[0]] = _beside().submit(self._begun, *known)
+
+    def _begun(self, key: tuple, said: str, given: dict) -> tuple[Callable, bool]:
+        """The program, and whether it was loaded."""
+        found = _read(_path(said), said, jax.tree.structure(((given,), {})))
+        return (self._compiled(key, said, given), False) if found is None else (found, True)
 
     def _known(self, args: tuple, kwargs: dict) -> tuple[tuple, str, dict] | None:
         """What a program is known by here, in words too until it is ready, and the arguments that are not static.
@@ -95,7 +98,8 @@ class Program:
         leaves, structure = jax.tree.flatten(given)
         try:
             key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed)
-            said = "" if key in self._ready else self._said(key)
+            known = self._ready.get(key)
+            said = self._said(key) if known is None or isinstance(known, Future) else ""
         except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
             return None
         return key, said, given

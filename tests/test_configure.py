@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 
 import pytest
 
@@ -105,3 +106,17 @@ def test_bits_and_device_are_set():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "float32 cpu\n"
+
+
+def test_a_cache_that_rejects_its_own_entries_is_told_of_once(capsys, tmp_path):
+    """Of the first ones nothing: another process may be writing them. Other warnings are shown as ever."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = lambda message, *where, **more: print(message, file=sys.stderr)
+        setup._tell_of_rejected_once(tmp_path)
+        for k in range(10):
+            told = capsys.readouterr().err
+            assert ("rejects its own entries" in told) == (k == setup.SEVERAL)
+            warnings.warn(f"{setup._REJECTED} entry for 'jit_{k}': machine types differ", stacklevel=1)
+        warnings.warn("something else", stacklevel=1)
+    assert "something else" in capsys.readouterr().err

@@ -19,7 +19,7 @@ HOUSE = {
     "ptsmc_jax": {
         ".": "configure formulas | programs",
         "numerics": "elementary guards pytrees statistics | attitude draws matrices | integrators",
-        "batching": "components | lanes | kernel",
+        "batching": "components dependence | lanes | kernel",
         "plants": "base | integrator_chain rigid_body second_order",
         "signals": "disturbances references",
         "laws": """
@@ -67,7 +67,7 @@ HOUSE = {
         ".": "errors",
         "search": """
             abreast gains journal own_parts
-            design shares
+            design flights shares
             margin_rows
             objective
             confirm evaluate worst

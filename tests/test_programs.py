@@ -134,6 +134,40 @@ def test_a_file_that_is_not_as_we_left_it_is_not_loaded(folder, damage, tmp_path
     assert len(traced) == 1
 
 
+def test_what_several_write_at_once_is_whole_at_any_time(folder):
+    """Writers that get in each other's way, and readers: each finds nothing yet, or all of it."""
+    program, _ = spied()
+    program(X)
+    (kept,) = folder.iterdir()
+    (ready,) = program._ready.values()
+    known = program._known((X,), {})
+    assert known is not None
+    said, inside = program._said(known[0]), jax.tree.structure(((known[2],), {}))
+    assert programs._path(said) == kept
+    kept.unlink()
+    with ThreadPoolExecutor(6) as pool:
+        writing = [pool.submit(programs._write, kept, said, ready) for _ in range(40)]
+        found = [pool.submit(lambda: kept.exists() and programs._read(kept, said, inside)) for _ in range(40)]
+        assert all(one.result() is not None for one in found)
+        for one in writing:
+            one.result()
+    assert list(folder.iterdir()) == [kept]
+    loaded = programs._read(kept, said, inside)
+    assert loaded is not None
+    np.testing.assert_array_equal(loaded(known[2])["both"], program(X)["both"])
+
+
+def test_what_is_prepared_is_loaded_too(folder):
+    spied()[0](X)
+    again, traced = spied()
+    again.prepare(X)
+    np.testing.assert_allclose(again(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
+    other, traced_other = spied("other", factor=3.0)
+    other.prepare(X)
+    np.testing.assert_allclose(other(X)["both"], np.sin(3 * X) + 5.0, rtol=1e-15)
+    assert (len(traced), len(traced_other)) == (0, 1)
+
+
 def test_a_program_that_does_not_run_is_compiled_again(folder, monkeypatch):
     program, _ = spied()
     program(X)

@@ -10,10 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend import core
 from jaxtyping import Array
 
 # Larger arrays (tables over time, say) are not taken apart.
 LARGEST = 64
+
+# What a lane differs over, added up: from trial to trial, from direction to direction.
+TRIAL, DIRECTION = 1, 2
 
 
 def small(shape: tuple[int, ...]) -> bool:
@@ -22,31 +26,37 @@ def small(shape: tuple[int, ...]) -> bool:
 
 
 class Lane:
-    """A value that differs from trial to trial: as components, or dense as (trial, *shape), or both."""
+    """A value that differs from trial to trial: as components, or dense as (*lead, *shape), or both.
 
-    def __init__(self, shape: tuple[int, ...], parts: np.ndarray | None = None, dense: Array | None = None):
-        self.shape, self._parts, self._dense = shape, parts, dense
+    Its lead is (trials,); of a slope (directions, trials), or (directions, 1) where it is equal in all trials.
+    """
+
+    def __init__(
+        self, shape: tuple[int, ...], parts: np.ndarray | None = None, dense: Array | None = None, differs: int = TRIAL
+    ):
+        self.shape, self.differs, self._parts, self._dense = shape, differs, parts, dense
 
     # What is computed here is not kept: inside a loop's body it belongs to that body alone.
 
     @property
     def parts(self) -> np.ndarray:
-        """Object array of the value's shape, each entry (trial,) or, where equal in all trials, ()."""
+        """Object array of the value's shape, each entry of the lead's shape, or of one that is spread to it."""
         if self._parts is not None:
             return self._parts
         assert self._dense is not None
-        return entries(self._dense, 1)
+        return entries(self._dense, self._dense.ndim - len(self.shape))
 
     def apart(self) -> "Lane":
         """The same value taken apart now, unless it is too large for that."""
-        return Lane(self.shape, self.parts, self._dense) if self._parts is None and small(self.shape) else self
+        whole = self._parts is not None or not small(self.shape)
+        return self if whole else Lane(self.shape, self.parts, self._dense, self.differs)
 
-    def dense(self, trials: int) -> Array:
-        """(trial, *shape) array."""
+    def dense(self, lead: tuple[int, ...]) -> Array:
+        """(*lead, *shape) array."""
         if self._dense is not None:
-            return self._dense
-        flat = [jnp.broadcast_to(part, (trials,)) for part in self.parts.flat]
-        return jnp.stack(flat, axis=-1).reshape((trials, *self.shape)) if self.shape else flat[0]
+            return jnp.broadcast_to(self._dense, (*lead, *self.shape))
+        flat = [jnp.broadcast_to(part, lead) for part in self.parts.flat]
+        return jnp.stack(flat, axis=-1).reshape((*lead, *self.shape)) if self.shape else flat[0]
 
 
 class Shared:
@@ -64,8 +74,15 @@ def object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
     return flat.reshape(shape)
 
 
+def zero(part: Any) -> bool:
+    """Whether a component is known to be zero while the trace is evaluated."""
+    return isinstance(part, np.ndarray | np.generic) and part.ndim == 0 and part == 0
+
+
 def entries(array: Any, leading: int = 0) -> np.ndarray:
     """The entries of an array over all axes but the first `leading` ones, as an object array of arrays."""
+    if isinstance(array, np.ndarray) and not leading:  # known
+        return object_array(array.shape, array.reshape(-1))
     kept, shape = array.shape[:leading], array.shape[leading:]
     if not shape:
         return object_array((), [array])
@@ -77,7 +94,7 @@ def parts_of(value: Any) -> np.ndarray:
     """Components of a value, lane or not."""
     if isinstance(value, Lane | Shared):
         return value.parts
-    return entries(jnp.asarray(value))
+    return entries(value if isinstance(value, np.ndarray) else jnp.asarray(value))
 
 
 def plain(value: Any) -> Any:
@@ -85,18 +102,33 @@ def plain(value: Any) -> Any:
     return value.array if isinstance(value, Shared) else value
 
 
-def dense_of(value: Any, trials: int) -> Array:
-    """(trial, *shape) array of a value, lane or not."""
+def dense_of(value: Any, lead: tuple[int, ...]) -> Array:
+    """(*lead, *shape) array of a value, lane or not."""
     if isinstance(value, Lane):
-        return value.dense(trials)
+        return value.dense(lead)
     value = jnp.asarray(plain(value))
-    return jnp.broadcast_to(value, (trials, *value.shape))
+    return jnp.broadcast_to(value, (*lead, *value.shape))
+
+
+def joined(shapes: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+    """The shape that all of these are spread to."""
+    some = set(shapes)
+    longest = max(some, key=len, default=())
+    return longest if some <= {(), longest} else np.broadcast_shapes(*some)
 
 
 def bind(eqn: Any, values: Sequence) -> Sequence:
     """A primitive on arrays: its outputs."""
     out = eqn.primitive.bind(*map(plain, values), **eqn.primitive.get_bind_params(eqn.params))
     return out if eqn.primitive.multiple_results else [out]
+
+
+def known(eqn: Any) -> list | None:
+    """Zeros, as jvp makes of what has no slope; None: the equation makes something else."""
+    if eqn.primitive.name != "broadcast_in_dim" or not isinstance(eqn.invars[0], core.Literal):
+        return None
+    out = eqn.outvars[0].aval
+    return [np.zeros(out.shape, out.dtype)] if eqn.invars[0].val == 0 and small(out.shape) else None
 
 
 def apply(eqn: Any, values: Sequence) -> list[Lane] | None:
@@ -113,10 +145,14 @@ def covers(name: str) -> bool:
 
 
 def _alike(parts: Sequence) -> list:
-    """Components spread over the trials if any of them differs from trial to trial."""
+    """Components spread over the trials if any of them differs from trial to trial, over directions likewise."""
     shapes = [np.shape(part) for part in parts]
-    shape = max(shapes, key=len)
-    return [part if own == shape else lax.broadcast(part, shape) for part, own in zip(parts, shapes, strict=True)]
+    shape = joined(shapes)
+    return [part if own == shape else _spread(part, own, shape) for part, own in zip(parts, shapes, strict=True)]
+
+
+def _spread(part: Any, own: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+    return lax.broadcast_in_dim(part, shape, range(len(shape) - len(own), len(shape)))
 
 
 def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
@@ -124,8 +160,35 @@ def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
     parts, size = [parts_of(value) for value in values], math.prod(shape)
     flat = [p.reshape(-1) if p.size == size else np.broadcast_to(p, shape).reshape(-1) for p in parts]
     params = eqn.primitive.get_bind_params(eqn.params)
-    items = (eqn.primitive.bind(*_alike(entry), **params) for entry in zip(*flat, strict=True))
-    return [Lane(shape, object_array(shape, items))]
+    simpler = _WITH_ZERO.get(eqn.primitive.name) if sloped(values) else None
+
+    def item(entry: tuple) -> Any:
+        found = simpler(*entry) if simpler is not None else None
+        return eqn.primitive.bind(*_alike(entry), **params) if found is None else found
+
+    return [Lane(shape, object_array(shape, map(item, zip(*flat, strict=True))))]
+
+
+def sloped(values: Sequence) -> bool:
+    """Whether a slope is among these values. One that is known to be zero stays out of sums and products."""
+    return any(isinstance(value, Lane) and value.differs & DIRECTION for value in values)
+
+
+def _product(a: Any, b: Any) -> Any:
+    return next((part for part in (a, b) if zero(part)), None)
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return b if zero(a) else a if zero(b) else None
+
+
+_WITH_ZERO: dict[str, Callable] = {
+    "mul": _product,
+    "add": _sum,
+    "add_any": _sum,
+    "sub": lambda a, b: a if zero(b) else None,
+    "neg": lambda a: a if zero(a) else None,
+}
 
 
 def _bitcast(eqn: Any, values: Sequence) -> list[Lane] | None:
@@ -205,8 +268,15 @@ def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
     kinds = [v.aval.dtype for v in eqn.invars]
     left, right = (rows(*row) for row in zip(values, kinds, contracted, batched, strict=True))
     shape = eqn.outvars[0].aval.shape
+    skip = sloped(values)
+
+    def inner(row: np.ndarray, column: np.ndarray) -> Any:
+        pairs = list(zip(row, column, strict=True))
+        some = [pair for pair in pairs if not (skip and any(map(zero, pair)))]
+        return _fold(lax.add, [lax.mul(*_alike(pair)) for pair in some]) if some else kind.type(0)
+
     items = (
-        _fold(lax.add, [lax.mul(*_alike(pair)) for pair in zip(left[k, i], right[k, j], strict=True)])
+        inner(left[k, i], right[k, j])
         for k in range(left.shape[0])
         for i in range(left.shape[1])
         for j in range(right.shape[1])

@@ -25,6 +25,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.batching import components, lanes
 from ptsmc_jax.batching.components import Lane, object_array
+from ptsmc_jax.batching.dependence import called, dependence, settle
 
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
@@ -230,7 +231,7 @@ class _Inside:
             return [*state, *(_stacked(part) for part in zip(*rows, strict=True))]
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
-        differs = lanes.settle(body.jaxpr, _varies(consts), _varies(state), _varies(xs))
+        differs = settle(body.jaxpr, _varies(consts), _varies(state), _varies(xs))
         shapes = [v.aval.shape for v in body.jaxpr.invars[constants : constants + carried]]
 
         def step(k: Any, packed: tuple) -> tuple:
@@ -243,7 +244,7 @@ class _Inside:
         """A branch where all trials agree, else all of them and a choice for each trial."""
         (index,), operands = values[0].parts.reshape(1), values[1:]
         shapes = [v.shape for v in branches[0].out_avals]
-        depends = [lanes.dependence(branch.jaxpr, _varies(operands)) for branch in branches]
+        depends = [dependence(branch.jaxpr, _varies(operands)) for branch in branches]
         differs = [np.ndim(index) > 0 or any(each) for each in zip(*depends, strict=True)]
         cases = [lambda branch=branch: self.pack(self.evaluate(branch, operands), differs) for branch in branches]
         if np.ndim(index) == 0:
@@ -253,7 +254,7 @@ class _Inside:
             chosen = jax.tree.map(lambda *each: lax.select_n(which, *each), *(case() for case in cases))
         return _unpacked(chosen, shapes)
 
-    def pack(self, values: Sequence, differs: Sequence[bool]) -> tuple:
+    def pack(self, values: Sequence, differs: Sequence[int]) -> tuple:
         """Components as loops and branches carry them: numbers where all trials agree, vectors elsewhere."""
         return tuple(
             tuple(jnp.broadcast_to(part, (self.block,) if each else ()) for part in value.parts.flat)
@@ -267,7 +268,7 @@ def _unpacked(packed: Sequence, shapes: Sequence) -> list[Lane]:
 
 
 def _called(eqn: Any) -> Any:
-    return eqn.params["call_jaxpr"] if eqn.primitive.name in _CUSTOM else lanes.called(eqn)
+    return eqn.params["call_jaxpr"] if eqn.primitive.name in _CUSTOM else called(eqn)
 
 
 def _constant(value: Any) -> Lane:

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend import core
+from jax.interpreters import partial_eval
 from jaxtyping import Array
 
 from ptsmc_jax.batching import components
-from ptsmc_jax.batching.components import Lane, Shared, dense_of, object_array, parts_of, plain
-
-_CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
+from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, parts_of, plain
+from ptsmc_jax.batching.dependence import called, dependence, either, settle
 
 
 class LanesWarning(UserWarning):
@@ -40,31 +40,78 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Calla
     """
 
     def mapped(*args: Any) -> Any:
-        axes = (in_axes,) * len(args) if in_axes is None or isinstance(in_axes, int) else tuple(in_axes)
-        mapped_over = jax.tree.leaves(
-            jax.tree.map(_spread, axes, args, is_leaf=lambda axis: axis is None or isinstance(axis, int))
-        )
-        leaves, tree = jax.tree.flatten(args)
-        leaves = [jnp.asarray(leaf) for leaf in leaves]
-        if any(on and not leaf.shape for leaf, on in zip(leaves, mapped_over, strict=True)):
-            raise ValueError("a number has no axis to map over")
-        sizes = {leaf.shape[0] for leaf, on in zip(leaves, mapped_over, strict=True) if on}
-        if len(sizes) != 1:
-            raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
-        one = [
-            jax.ShapeDtypeStruct(leaf.shape[1:] if on else leaf.shape, leaf.dtype, weak_type=leaf.weak_type)
-            for leaf, on in zip(leaves, mapped_over, strict=True)
-        ]
-        closed, out = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, one))
-        values = [
-            Lane(leaf.shape[1:], dense=leaf).apart() if on else leaf
-            for leaf, on in zip(leaves, mapped_over, strict=True)
-        ]
-        lanes = _Lanes(sizes.pop(), strict)
-        results = lanes.evaluate(closed, values)
-        return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, lanes.trials) for value in results])
+        trials, one, values = _mapped(args, in_axes)
+        closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
+        results = _Lanes(trials, strict).evaluate(closed, values)
+        return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, (trials,)) for value in results])
 
     return mapped
+
+
+def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callable:
+    """(arguments, directions) -> (values, slopes): `vmap(function)`, and its derivatives along several directions.
+
+    directions: a tree like each argument, or None for one that stays, its leaves with an axis over the directions
+    before all others. The slopes have that axis first, then that of the trials. The derivative is taken of the trace
+    of one trial, which is many times shorter than that of its components, and what no output hangs on is left out.
+
+    >>> square, slope = jvp(lambda x: x**2)((jnp.array([3.0, 4.0]),), (jnp.ones((1, 2)),))
+    >>> square.tolist(), slope.tolist()
+    ([9.0, 16.0], [[6.0, 8.0]])
+    """
+
+    def mapped(args: tuple, directions: tuple) -> tuple[Any, Any]:
+        trials, one, values = _mapped(args, in_axes)
+        moves = [k for k, along in enumerate(directions) if along is not None]
+
+        def both(one: tuple, slopes: tuple) -> tuple[Any, Any]:
+            def of(*some: Any) -> Any:
+                every = dict(enumerate(one)) | dict(zip(moves, some, strict=True))
+                return function(*every.values())
+
+            return jax.jvp(of, tuple(one[k] for k in moves), slopes)
+
+        along = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tuple(directions[k] for k in moves))]
+        closed, out = jax.make_jaxpr(both, return_shape=True)(one, tuple(one[k] for k in moves))
+        # an argument that stays has a place among the values, but none here
+        inner = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
+        slopes = [_slope(leaf, shape) for leaf, shape in zip(along, inner, strict=True)]
+        used, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+        lanes = _Lanes(trials, strict, directions=along[0].shape[0])
+        results = lanes.evaluate(core.ClosedJaxpr(used, closed.consts), [*values, *slopes])
+        half = len(results) // 2
+        leads = [(trials,)] * half + [(lanes.directions, trials)] * half
+        return jax.tree.unflatten(jax.tree.structure(out), [*map(dense_of, results, leads)])
+
+    return mapped
+
+
+def _mapped(args: tuple, in_axes: Any) -> tuple[int, tuple, list]:
+    """How many trials there are; the arguments of one, as shapes; and their leaves as values."""
+    axes = (in_axes,) * len(args) if in_axes is None or isinstance(in_axes, int) else tuple(in_axes)
+    over = jax.tree.leaves(
+        jax.tree.map(_spread, axes, args, is_leaf=lambda axis: axis is None or isinstance(axis, int))
+    )
+    leaves, tree = jax.tree.flatten(args)
+    leaves = [jnp.asarray(leaf) for leaf in leaves]
+    if any(on and not leaf.shape for leaf, on in zip(leaves, over, strict=True)):
+        raise ValueError("a number has no axis to map over")
+    sizes = {leaf.shape[0] for leaf, on in zip(leaves, over, strict=True) if on}
+    if len(sizes) != 1:
+        raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
+    one = [
+        jax.ShapeDtypeStruct(leaf.shape[1:] if on else leaf.shape, leaf.dtype, weak_type=leaf.weak_type)
+        for leaf, on in zip(leaves, over, strict=True)
+    ]
+    values = [Lane(v.shape[1:], dense=v).apart() if on else v for v, on in zip(leaves, over, strict=True)]
+    return sizes.pop(), jax.tree.unflatten(tree, one), values
+
+
+def _slope(along: Array, shape: tuple[int, ...]) -> Lane:
+    """Directions of a value of this shape, (directions, [trials,] *shape)."""
+    equal = along.ndim == len(shape) + 1  # in all trials
+    dense, differs = (along[:, None], DIRECTION) if equal else (along, TRIAL | DIRECTION)
+    return Lane(shape, dense=dense, differs=differs).apart()
 
 
 def _spread(axis: int | None, tree: Any) -> Any:
@@ -77,33 +124,41 @@ def _spread(axis: int | None, tree: Any) -> Any:
 class _Packed:
     """How values are handed through JAX's loops and branches: lanes as tuples of components, large ones dense."""
 
-    def __init__(self, variables: Sequence, differs: Sequence[bool], trials: int):
-        self.shapes, self.differs, self.trials = [v.aval.shape for v in variables], differs, trials
+    def __init__(self, variables: Sequence, differs: Sequence[int], leads: Sequence[tuple[int, ...]]):
+        self.shapes, self.differs, self.leads = [v.aval.shape for v in variables], differs, leads
 
     def pack(self, values: Sequence) -> tuple:
         return tuple(self._pack(*item) for item in zip(values, self.shapes, self.differs, strict=True))
 
-    def _pack(self, value: Any, shape: tuple[int, ...], differs: bool) -> Any:
+    def _pack(self, value: Any, shape: tuple[int, ...], differs: int) -> Any:
         if not differs:
             return plain(value)
-        if not components.small(shape):
-            return dense_of(value, self.trials)
-        return tuple(jnp.broadcast_to(part, (self.trials,)) for part in parts_of(value).flat)
+        lead = self.leads[differs]
+        if not self.apart(shape, differs):
+            return dense_of(value, lead)
+        return tuple(jnp.broadcast_to(part, lead) for part in parts_of(value).flat)
 
     def unpack(self, packed: Sequence) -> list:
         return [self._unpack(*item) for item in zip(packed, self.shapes, self.differs, strict=True)]
 
-    def _unpack(self, value: Any, shape: tuple[int, ...], differs: bool) -> Any:
+    def _unpack(self, value: Any, shape: tuple[int, ...], differs: int) -> Any:
         if not differs:
             return value
-        return Lane(shape, object_array(shape, value)) if components.small(shape) else Lane(shape, dense=value)
+        parts, dense = (object_array(shape, value), None) if self.apart(shape, differs) else (None, value)
+        return Lane(shape, parts, dense, differs)
+
+    @staticmethod
+    def apart(shape: tuple[int, ...], differs: int) -> bool:
+        """Whether a value is taken apart: one that is equal in all trials would gain nothing."""
+        return components.small(shape) and differs != DIRECTION
 
 
 class _Lanes:
-    """Evaluation of traces for so many trials."""
+    """Evaluation of traces for so many trials; with slopes, along so many directions."""
 
-    def __init__(self, trials: int, strict: bool):
-        self.trials, self.strict = trials, strict
+    def __init__(self, trials: int, strict: bool, directions: int = 0):
+        self.trials, self.directions, self.strict = trials, directions, strict
+        self.leads = ((), (trials,), (directions, 1), (directions, trials))  # by what differs
 
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
@@ -122,7 +177,12 @@ class _Lanes:
         for eqn in jaxpr.eqns:
             values = [read(atom) for atom in eqn.invars]
             laned = any(isinstance(value, Lane) for value in values)
-            write(eqn.outvars, self.apply(eqn, values) if laned else components.bind(eqn, values))
+            if laned:
+                results = self.apply(eqn, values)
+            else:
+                results = components.known(eqn) if self.directions else None
+                results = components.bind(eqn, values) if results is None else results
+            write(eqn.outvars, results)
         return [read(atom) for atom in jaxpr.outvars]
 
     def apply(self, eqn: Any, values: list) -> Sequence:
@@ -130,18 +190,43 @@ class _Lanes:
         name, inner = eqn.primitive.name, called(eqn)
         if inner is not None:
             return self.evaluate(inner, values)
+        differs = _which(values)
+        every = either(differs)
         if name in _CONTROL:
             return _CONTROL[name](self, eqn, values)
+        if every == DIRECTION:  # equal in all trials: there is nothing to gain by components
+            return self.densely(eqn, values)
         if components.covers(name):
             results = components.apply(eqn, values)
             if results is not None:
+                for lane in results:
+                    lane.differs = every
                 return results
         else:
             self.without_rule(eqn)
-        mapped = [0 if isinstance(v, Lane) else None for v in values]
-        operands = [v.dense(self.trials) if isinstance(v, Lane) else plain(v) for v in values]
-        dense = jax.vmap(lambda *v: components.bind(eqn, v), mapped)(*operands)
-        return [Lane(out.shape[1:], dense=out) for out in dense]
+        return self.densely(eqn, values)
+
+    def densely(self, eqn: Any, values: list) -> list[Lane]:
+        """One primitive by `jax.vmap`."""
+        differs = _which(values)
+        operands, every = [self._dense(*pair) for pair in zip(values, differs, strict=True)], either(differs)
+
+        def one(*operands: Any) -> Any:
+            return components.bind(eqn, operands)
+
+        function = one
+        for axis in (TRIAL, DIRECTION):
+            if every & axis:
+                function = jax.vmap(function, [0 if on & axis else None for on in differs])
+        dense = [out[:, None] if every == DIRECTION else out for out in function(*operands)]
+        return [Lane(out.shape[len(self.leads[every]) :], dense=out, differs=every) for out in dense]
+
+    def _dense(self, value: Any, differs: int) -> Array:
+        """An array with an axis for each of what a value differs over, first the directions."""
+        if not differs:
+            return plain(value)
+        dense = value.dense(self.leads[differs])
+        return dense[:, 0] if differs == DIRECTION else dense
 
     def without_rule(self, eqn: Any) -> None:
         told = f"lanes have no rule for the primitive `{eqn.primitive.name}`{place(eqn)}"
@@ -157,17 +242,18 @@ class _Lanes:
         fixed, rowed = _which(consts), _which(xs)
         differs = settle(body.jaxpr, fixed, _which(init), rowed)
         outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
-        state = _Packed(body.jaxpr.invars[constants : constants + carried], differs, self.trials)
-        row = _Packed(body.jaxpr.invars[constants + carried :], rowed, self.trials)
-        out = _Packed(body.jaxpr.outvars[carried:], outputs, self.trials)
+        state = _Packed(body.jaxpr.invars[constants : constants + carried], differs, self.leads)
+        row = _Packed(body.jaxpr.invars[constants + carried :], rowed, self.leads)
+        out = _Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
 
-        def rows(value: Any, shape: tuple[int, ...]) -> Any:
+        def rows(value: Any, shape: tuple[int, ...], differs: int) -> Any:
             if not isinstance(value, Lane):
                 return plain(value)
-            dense = jnp.moveaxis(value.dense(self.trials), 0, 1)  # (time, trial, *shape)
-            if not components.small(shape):
+            lead = self.leads[differs]
+            dense = jnp.moveaxis(value.dense(lead), len(lead), 0)  # (time, *lead, *shape)
+            if not row.apart(shape, differs):
                 return dense
-            return tuple(components.entries(dense, 2).flat)
+            return tuple(components.entries(dense, 1 + len(lead)).flat)
 
         def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
             results = self.evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
@@ -176,24 +262,24 @@ class _Lanes:
         last, ys = lax.scan(
             step,
             state.pack(init),
-            tuple(rows(value, shape) for value, shape in zip(xs, row.shapes, strict=True)),
+            tuple(rows(*item) for item in zip(xs, row.shapes, rowed, strict=True)),
             params["length"],
             params["reverse"],
             params["unroll"],
         )
         results = state.unpack(last)
         for y, shape, laned in zip(ys, out.shapes, outputs, strict=True):
-            if laned:  # components of (time, trial), or (time, trial, *shape) -> (trial, time, *shape)
-                whole = (params["length"], *shape)
+            if laned:  # components of (time, *lead), or (time, *lead, *shape) -> (*lead, time, *shape)
+                whole, lead = (params["length"], *shape), self.leads[laned]
                 if 0 in whole:
-                    y = Lane(whole, np.empty(whole, dtype=object))
-                elif components.small(whole):
+                    y = Lane(whole, np.empty(whole, dtype=object), differs=laned)
+                elif components.small(whole) and out.apart(shape, laned):
                     steps = range(params["length"])
                     rows_of = (lax.index_in_dim(part, k, 0, keepdims=False) for k in steps for part in y)
-                    y = Lane(whole, object_array(whole, rows_of))
+                    y = Lane(whole, object_array(whole, rows_of), differs=laned)
                 else:
-                    stacked = jnp.stack(y, axis=-1) if components.small(shape) else y
-                    y = Lane(whole, dense=jnp.moveaxis(stacked, 0, 1).reshape((self.trials, *whole)))
+                    stacked = jnp.stack(y, axis=-1) if out.apart(shape, laned) else y
+                    y = Lane(whole, dense=jnp.moveaxis(stacked, 0, len(lead)).reshape((*lead, *whole)), differs=laned)
             results.append(y)
         return results
 
@@ -206,37 +292,56 @@ class _Lanes:
         test_consts, body_consts, init = values[:first], values[first:second], values[second:]
         differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
         (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])
-        if each:
-            differs = [True] * len(init)
-        state = _Packed(body.jaxpr.outvars, differs, self.trials)
+        differs = [own | each for own in differs]
+        state = _Packed(body.jaxpr.outvars, differs, self.leads)
 
         def going(carry: tuple) -> Any:
             (test_value,) = self.evaluate(test, [*test_consts, *state.unpack(carry)])
-            return dense_of(test_value, self.trials) if each else test_value
+            return dense_of(test_value, self.leads[each]) if each else test_value
 
         def step(carry: tuple) -> tuple:
             after = state.pack(self.evaluate(body, [*body_consts, *state.unpack(carry)]))
             if not each:
                 return after
             on = going(carry)
-            return jax.tree.map(lambda new, old: jnp.where(_along(on, new), new, old), after, carry)
+            return tuple(
+                jax.tree.map(lambda new, old, own=own: jnp.where(self._along(on, new, own), new, old), *both)
+                for *both, own in zip(after, carry, differs, strict=True)
+            )
 
         proceed = (lambda carry: jnp.any(going(carry))) if each else going
         return state.unpack(lax.while_loop(proceed, step, state.pack(init)))
+
+    def _along(self, on: Array, value: Array, differs: int) -> Array:
+        """A condition (trials,) or (directions, trials) shaped for an array whose leading axes are of `differs`."""
+        return on.reshape(on.shape + (1,) * (value.ndim - len(self.leads[differs])))
 
     def branch(self, eqn: Any, values: list) -> list:
         """lax.cond and lax.switch: a branch where all trials agree, else all of them and a choice for each trial."""
         index, *operands = values
         branches = eqn.params["branches"]
         if isinstance(index, Lane):
-            each = _Packed(eqn.outvars, [True] * len(eqn.outvars), self.trials)
+            (chosen,), given = _which([index]), _which(operands)
+            found = [dependence(branch.jaxpr, given) for branch in branches]
+            differs = [either(some) | chosen for some in zip(*found, strict=True)]
+            each = _Packed(eqn.outvars, differs, self.leads)
             cases = [each.pack(self.evaluate(branch, operands)) for branch in branches]
-            which = index.dense(self.trials)
+            which = index.dense(self.leads[chosen])
             which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
-            return each.unpack(jax.tree.map(lambda *c: lax.select_n(_along(which, c[0], full=True), *c), *cases))
+            return each.unpack(
+                tuple(
+                    jax.tree.map(
+                        lambda *c, own=own: lax.select_n(
+                            jnp.broadcast_to(self._along(which, c[0], own), c[0].shape), *c
+                        ),
+                        *one,
+                    )
+                    for *one, own in zip(*cases, differs, strict=True)
+                )
+            )
         operands = [_apart(value) for value in operands]
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
-        one = _Packed(eqn.outvars, [any(d) for d in zip(*depends, strict=True)], self.trials)
+        one = _Packed(eqn.outvars, [either(d) for d in zip(*depends, strict=True)], self.leads)
         choices = [lambda branch=branch: one.pack(self.evaluate(branch, operands)) for branch in branches]
         return one.unpack(lax.switch(plain(index), choices))
 
@@ -244,8 +349,8 @@ class _Lanes:
         """A function with a derivative rule of its own (custom_jvp), which is kept."""
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         smooth = [k for k, aval in enumerate(avals) if jnp.issubdtype(aval.dtype, jnp.inexact)]
-        takes = _Packed(eqn.invars, _which(values), self.trials)
-        gives = _Packed(eqn.outvars, [True] * len(eqn.outvars), self.trials)
+        takes = _Packed(eqn.invars, _which(values), self.leads)
+        gives = _Packed(eqn.outvars, [either(takes.differs)] * len(eqn.outvars), self.leads)
 
         @jax.custom_jvp
         def function(packed: tuple) -> tuple:
@@ -272,12 +377,15 @@ class _Lanes:
 _CONTROL = {"scan": _Lanes.scan, "while": _Lanes.loop, "cond": _Lanes.branch, "custom_jvp_call": _Lanes.custom}
 
 
-def _which(values: Sequence) -> list[bool]:
-    return [isinstance(value, Lane) for value in values]
+def _which(values: Sequence) -> list[int]:
+    """What each value differs over."""
+    return [value.differs if isinstance(value, Lane) else 0 for value in values]
 
 
 def _apart(value: Any) -> Any:
     """A value taken apart before the loop or the branch that uses it, if it is small."""
+    if isinstance(value, Lane) and value.differs == DIRECTION:
+        return value
     if isinstance(value, Lane):
         return value.apart()
     if isinstance(value, Shared) or np.ndim(value) == 0 or not components.small(np.shape(value)):
@@ -285,51 +393,8 @@ def _apart(value: Any) -> Any:
     return Shared(jnp.asarray(value))
 
 
-def _along(on: Array, value: Array, full: bool = False) -> Array:
-    """(trial,) condition shaped for an array (trial, ...)."""
-    shaped = on.reshape(on.shape + (1,) * (value.ndim - 1))
-    return jnp.broadcast_to(shaped, value.shape) if full else shaped
-
-
-def called(eqn: Any) -> Any:
-    """The trace that a call stands for; None where an equation is no call."""
-    params = eqn.params
-    return params.get("jaxpr", params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
-
-
 def place(eqn: Any) -> str:
     """Where in the user's files an equation stands, as far as JAX knows."""
     trace = eqn.source_info.traceback
     frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
     return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""
-
-
-def settle(jaxpr: core.Jaxpr, before: list[bool], carried: list[bool], after: list[bool]) -> list[bool]:
-    """Which carries of a loop depend on the trial: those that start so, and those that its body makes so.
-
-    before, after: the same for what stands before and after the carries among the body's inputs.
-    """
-    while True:
-        outputs = dependence(jaxpr, [*before, *carried, *after])
-        wider = [a or b for a, b in zip(carried, outputs, strict=False)]
-        if wider == carried:
-            return carried
-        carried = wider
-
-
-def dependence(jaxpr: core.Jaxpr, inputs: Sequence[bool]) -> list[bool]:
-    """Which outputs of a trace depend on the trial, given which inputs do: on any operand that does."""
-    known = dict(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> bool:
-        return not isinstance(atom, core.Literal) and known.get(atom, False)
-
-    for eqn in jaxpr.eqns:
-        depends = [read(atom) for atom in eqn.invars]
-        inner = called(eqn)
-        if inner is not None and any(depends):
-            results = dependence(getattr(inner, "jaxpr", inner), depends)
-        else:
-            results = [any(depends)] * len(eqn.outvars)
-        known.update(zip(eqn.outvars, results, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]

@@ -48,14 +48,18 @@ def value_at(ordered: np.ndarray, quantile: float) -> float:
     return float(ordered[max(0, int(np.ceil(quantile * ordered.size - 1e-9)) - 1)])
 
 
-def drivers(inputs: Mapping[str, np.ndarray], metric: np.ndarray) -> dict[str, dict[str, float]]:
+def drivers(
+    inputs: Mapping[str, np.ndarray], metric: np.ndarray, known: dict[str, tuple] | None = None
+) -> dict[str, dict[str, float]]:
     """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
 
     The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
     Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,
     over its variance, less what bins of unrelated numbers would show. Of ranks, so that a long tail does not decide.
-    (trials,) each; empty where the metric or every input has one value only.
+    (trials,) each; empty where the metric or every input has one value only. known: what the inputs are ranked to is
+    kept there, for other metrics of the same trials.
     """
+    known = {} if known is None else known
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
         return {}
     rank = stats.rankdata(metric)
@@ -64,9 +68,11 @@ def drivers(inputs: Mapping[str, np.ndarray], metric: np.ndarray) -> dict[str, d
     for name, values in inputs.items():
         if np.ptp(values) == 0.0:
             continue
-        own = stats.rankdata(values)
-        correlation = float(np.mean((own - own.mean()) / own.std() * rank))
-        order = np.argsort(own, kind="stable")
+        if name not in known:
+            own = stats.rankdata(values)
+            known[name] = (own - own.mean()) / own.std(), np.argsort(own, kind="stable")
+        own, order = known[name]
+        correlation = float(np.mean(own * rank))
         bins = np.array_split(rank[order], SOBOL_BINS)
         between = sum(part.size * part.mean() ** 2 for part in bins) / rank.size
         within = 1.0 - between

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics import integrators
+from ptsmc_jax.numerics import integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf
 from ptsmc_jax.plants.base import Plant
 
@@ -157,7 +157,7 @@ class Linear(Observer):
         """
         root = jnp.sqrt(self.gain)
         scaled = root[:, None] * self.model.inertia_inverse * root[None, :]
-        slowest = scaled[0, 0] if self.model.inputs == 1 else jnp.linalg.eigvalsh(scaled)[0]
+        slowest = matrices.smallest_eigenvalue(scaled)
         factor = jnp.sqrt(jnp.max(self.gain) / jnp.min(self.gain))
         floor = factor * jnp.sqrt(float(self.model.inputs)) * self.disturbance_rate_bound / slowest
         return ErrorBound(slowest, factor * self.initial_error, floor)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.batching.lanes import dependence
+from ptsmc_jax.batching.dependence import dependence
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState
 from ptsmc_jax.devices.attitude_filter import Estimate
 from ptsmc_jax.laws.base import Law, Sample
@@ -281,7 +281,7 @@ def _begin(given: Any) -> dict[str, Any]:
 def _depends(function: Callable, *args: Any) -> list[bool]:
     """Which outputs of a function depend on its arguments."""
     traced = jax.make_jaxpr(function)(*args)
-    return dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))
+    return [bool(found) for found in dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))]
 
 
 def _acting(made: Board, device: Actuators, m: int) -> None:

@@ -15,7 +15,7 @@ from jax.extend import core
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.lanes import called
+from ptsmc_jax.batching.dependence import called
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, Node, Pool, Title, kind_of

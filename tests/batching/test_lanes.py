@@ -1,4 +1,4 @@
-"""`lanes.vmap` against `jax.vmap`, over a table of functions: one row for each kind of primitive and of structure."""
+"""`lanes.vmap` and `lanes.jvp` against JAX, over a table of functions: a row for each kind of them."""
 
 from contextlib import nullcontext
 from functools import partial
@@ -388,6 +388,56 @@ def test_lanes_compute_what_vmap_does(name):
     function, *args = CASES[name]
     with pytest.warns(lanes.LanesWarning, match="no rule") if name in WITHOUT_RULE else nullcontext():
         check(function, *args)
+
+
+def smooth(tree):
+    return all(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in jax.tree.leaves(tree))
+
+
+# Every argument of a row moves on its own in each trial; the second time the first argument is one for all trials, and
+# so are its directions: what hangs on it alone differs from direction to direction only.
+SLOPED = [
+    name
+    for name, (_, *args) in CASES.items()
+    if any(map(smooth, args)) and not any(none in name for none in ("vjp", "nextafter"))
+]
+SHARED = [name for name in SLOPED if len(CASES[name]) > 2 and smooth(CASES[name][1])]
+
+
+@pytest.mark.parametrize(("name", "shared"), [*((name, False) for name in SLOPED), *((name, True) for name in SHARED)])
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
+def test_slopes_by_lanes_are_those_that_jax_finds(name, shared):
+    """To 1e-12 of the largest: both differentiate the same operations, and add up in another order."""
+    function, *args = CASES[name]
+    args = [jax.tree.map(lambda v: v[0], args[0]), *args[1:]] if shared else args
+    axes = (None, *(0 for _ in args[1:])) if shared else tuple(0 for _ in args)
+
+    def numbers(*args):
+        return [leaf for leaf in jax.tree.leaves(function(*args)) if smooth(leaf)]
+
+    def direction(leaf):
+        rng = np.random.default_rng([3, *leaf.shape])
+        return jnp.asarray(rng.uniform(-1, 1, (2, *leaf.shape)), leaf.dtype)
+
+    directions = tuple(jax.tree.map(direction, arg) if smooth(arg) else None for arg in args)
+    moves = [k for k, along in enumerate(directions) if along is not None]
+
+    def one(along, *one):
+        def of(*some):
+            return numbers(*(dict(enumerate(one)) | dict(zip(moves, some, strict=True))).values())
+
+        return jax.jvp(of, tuple(one[k] for k in moves), along)
+
+    some = tuple(directions[k] for k in moves)
+    over = (tuple(None if shared and k == 0 else 0 for k in moves), *axes)
+    expected = jax.vmap(lambda along: jax.vmap(one, over)(along, *args), out_axes=(None, 0))(some)
+    got = jax.jit(lanes.jvp(numbers, axes))(tuple(args), directions)
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        unit = 1e-12 if b.dtype == np.float64 else 1e-5
+        np.testing.assert_allclose(
+            a, b, rtol=0, atol=unit * np.abs(np.nan_to_num(np.asarray(b), posinf=0, neginf=0)).max(initial=0)
+        )
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -412,3 +412,31 @@ def test_signed_root(width):
     slope = jax.vmap(jax.grad(lambda v: guards.signed_root(v, vector(width))))(x)
     assert np.all(np.isfinite(slope))
     np.testing.assert_allclose(slope[2], 0.0 if width == 0.0 else width**-0.5, rtol=4 * EPS)
+
+
+TURN = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
+
+
+@pytest.mark.parametrize(
+    "a",
+    [
+        np.diag([3.0, 1.0, 2.0]),
+        TURN @ np.diag([1.0, 1.0, 3.0]) @ TURN.T,
+        TURN @ np.diag([2.0, 2.0 + 1e-9, 2.0 - 1e-9]) @ TURN.T,
+        TURN @ np.diag([1e-6, 1.0, 1e6]) @ TURN.T,
+        2.0 * np.eye(3),
+        np.array([[2.0, -1.0], [-1.0, 2.0]]),
+        np.array([[0.7]]),
+        np.cov(np.random.default_rng(9).normal(size=(6, 40))),
+    ],
+)
+def test_the_smallest_eigenvalue_is_lapacks(a):
+    """To eps of the largest: what the entries are known to, and both add up about n products of them, n^2 times."""
+    a = (a + a.T) / 2
+    expected, vectors = np.linalg.eigh(a)
+    found, slope = jax.jit(lambda a: jax.value_and_grad(matrices.smallest_eigenvalue)(a))(vector(a))
+    np.testing.assert_allclose(found, expected[0], rtol=0, atol=4 * len(a) ** 2 * EPS * expected[-1])
+    gap = expected[1] - expected[0] if len(a) > 1 else 1.0
+    if gap > 1e-6 * expected[-1]:  # else it has no slope, or none that the entries tell
+        exact, slope = np.outer(vectors[:, 0], vectors[:, 0]), np.asarray(slope)
+        np.testing.assert_allclose((slope + slope.T) / 2, exact, atol=1e3 * EPS * expected[-1] / gap + 1e-9)

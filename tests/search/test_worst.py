@@ -86,21 +86,20 @@ def test_slopes_of_the_ascent_agree_with_central_differences():
         rate=numbers.Uniform(vector([1e-2, 1e-2, 1e-2])),
         phase=numbers.UniformPhase(3),
     )
-    problem, _ = posed(spread)
+    problem, _ = posed(spread, Requirement("effort", 3.0))
     sine = disturbances.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
-    run = replace(problem.parts, disturbance=sine)
-    chosen = np.arange(3, dtype=np.uint32)
-    coordinates = objective.coordinates_of(spread, 5, chosen)
-    moved = tuple(coordinates)
-    posed_again = replace(problem, parts=run)
-    y = np.concatenate([worst._charted(posed_again, name, np.asarray(coordinates[name])) for name in moved], axis=1)
-    case = (run, spread, problem.seed, jnp.asarray(chosen), coordinates, vector([0.5, 3.0]))
-    names = ("peak_torque", "effort")
+    problem = replace(problem, parts=replace(problem.parts, disturbance=sine))
+    fleet = problem.others(np.arange(3))
+    y = np.concatenate([worst._charted(problem, name, v) for name, v in fleet.coordinates.items()], axis=1)
+    at, limits = np.array([ETA, 1.0]), {"peak_torque": 0.5, "effort": 3.0}
+
+    def climb(y):
+        return worst.climb(fleet, at, y, objective.watched(problem), limits)
 
     def value(y):
-        return np.asarray(worst._climb(*case, jnp.asarray(y), moved, names)[0])
+        return climb(y)[0]
 
-    slope = np.asarray(worst._climb(*case, jnp.asarray(y), moved, names)[1])
+    slope = climb(y)[1]
     assert slope.shape == (3, 9)
     for k in range(9):
         step = 1e-5 * np.eye(9)[k]

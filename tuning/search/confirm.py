@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within
-from tuning.search.gains import with_gains
+from tuning.search import flights
 from tuning.search.objective import Problem
 
 FRESH = 1000  # trials on which gains are judged, at least
@@ -71,10 +70,9 @@ def count(
 ) -> list[Count]:
     """Fly gains (gains,) on trials from number `first` on, others each turn, and count those beyond each limit."""
     fresh = fresh_trials(requirements)
-    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     many = max(FEWEST, TIMES * fresh)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
-    flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), numbers)
+    flown = flights.trials(problem.others(numbers), gains)
     found = []
     for requirement in requirements:
         values = np.where(flown.finished, getattr(flown.metrics, requirement.metric), np.inf)

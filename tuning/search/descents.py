@@ -135,7 +135,7 @@ class Descents:
 
     def prepare(self, problem: Problem) -> None:
         """Begin to compile what a search will need later, beside its first steps."""
-        self._evaluate.prepare(_few_trials(problem), problem)
+        self._evaluate.prepare(problem)
 
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
         """From the scenario's own gains, (gains,), on a few trials."""

@@ -1,19 +1,21 @@
-"""Evaluates tuning problems at many gains: compiled once for each problem's shape, shared over devices, journaled."""
+"""Evaluates tuning problems at many gains: flown by `flights`, judged by the problem, journaled."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
-from ptsmc_jax.campaigns import montecarlo
-from tuning.search import margin_rows
+from tuning.search import flights, margin_rows
 from tuning.search.journal import Journal
-from tuning.search.objective import Problem, ended, measure
+from tuning.search.objective import Problem, Rules, ended, judge, watched
 from tuning.search.shares import Bounds
 
-FLOWN = 16  # points without slopes in one call of the compiled program
+TOGETHER = 16  # points that are judged in one call
 
 
 M = TypeVar("M", bound="Measured")
@@ -63,25 +65,22 @@ class Evaluator:
         """Without slopes."""
         self.rollouts += len(share) * problem.trials.size
         asked = _question(b"fly", problem, share)
-        return Measured(**self._journal.get(asked, lambda: self._measured(_fly, problem, share, FLOWN)))
+        return Measured(**self._journal.get(asked, lambda: self._measured(self._fly, problem, share)))
 
     def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
         """With slopes."""
         self.gradients += len(share) * problem.trials.size
-        # one point for each device a call
-        most = len(jax.local_devices())
         asked = _question(b"slopes", problem, share)
-        return Sloped(**self._journal.get(asked, lambda: self._measured(_slopes, problem, share, most)))
+        return Sloped(**self._journal.get(asked, lambda: self._measured(self._slopes, problem, share)))
 
-    def prepare(self, few: Problem, whole: Problem) -> None:
-        """Begin to compile what a search needs after its first steps, in that order, beside what is being done."""
-        devices, gains = len(jax.local_devices()), len(self.bounds.names)
-        for compiled, problem, size in ((_fly, few, FLOWN), (_slopes, whole, devices), (_fly, whole, FLOWN)):
-            shared = max(d for d in range(1, devices + 1) if size % d == 0)
-            compiled.prepare(replace(problem, margins=None), self.bounds, np.zeros((size, gains)), shared)
+    def prepare(self, problem: Problem) -> None:
+        """Begin to compile what a search needs after its first steps, beside what is being done."""
+        flights.prepare(problem.fleet)
 
-    def _measured(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
-        found = self._in_calls(compiled, replace(problem, margins=None), share, size)
+    def _measured(
+        self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, share: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        found = way(problem, share)
         if problem.margins is None:
             return found
         # slopes or not, by the one program: another takes longer to compile than most searches would save by it
@@ -99,15 +98,34 @@ class Evaluator:
             for name, kept in both.items()
         }
 
-    def _in_calls(self, compiled, problem: Problem, share: np.ndarray, size: int) -> dict[str, np.ndarray]:
-        devices = max(d for d in range(1, len(jax.local_devices()) + 1) if size % d == 0)
-        padded = np.resize(share, (-(-len(share) // size) * size, share.shape[1]))
-        # plain arrays in and out: what came back spread over the devices would be compiled for anew
-        calls = [
-            {name: np.asarray(v) for name, v in compiled(problem, self.bounds, padded[k : k + size], devices).items()}
-            for k in range(0, len(padded), size)
-        ]
-        return {name: np.concatenate([call[name] for call in calls])[: len(share)] for name in calls[0]}
+    def _fly(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
+        gains = self._gains(share)[0]
+        flown = flights.fly(problem.fleet, gains)
+        metrics = np.stack([getattr(flown.metrics, name) for name in watched(problem)], axis=-1)
+        found = _in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(flown.status))
+        return {"gains": gains, **found}
+
+    def _slopes(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
+        gains, along = self._gains(share)
+        seen = flights.sloped(problem.fleet, gains, along, watched(problem))
+        found = _in_calls(partial(_judged_slopes, problem.rules), gains, along, *seen)
+        return {"gains": gains, **found}
+
+    def _gains(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gains of shares, (points, gains), and what a share of each more makes of them, (points, gains, gains)."""
+        found = _in_calls(partial(_gains, bounds=self.bounds), share)
+        return found["gains"], found["along"]
+
+
+def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
+    """What a program of `TOGETHER` points finds for these, arrays over the points first."""
+    count = len(arrays[0])
+    padded = [np.resize(v, (-(-count // TOGETHER) * TOGETHER, *v.shape[1:])) for v in arrays]
+    calls = [
+        {name: np.asarray(v) for name, v in program(*(v[k : k + TOGETHER] for v in padded)).items()}
+        for k in range(0, len(padded[0]), TOGETHER)
+    ]
+    return {name: np.concatenate([call[name] for call in calls])[:count] for name in calls[0]}
 
 
 def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
@@ -115,27 +133,32 @@ def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
     return b"|".join([kind, share.tobytes(), str(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
-@programs.jit(static_argnames=("bounds", "devices"))
-def _fly(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
-    def one(share: jax.Array) -> dict[str, jax.Array]:
-        gains = bounds.gains(share)
-        f, c, value = measure(problem, gains)
-        return {"gains": gains, "f": f, "c": c, "value": value}
-
-    return montecarlo.spread(lambda share: jax.lax.map(one, share), share, devices)
+@programs.jit(static_argnames="bounds", compiler_options=programs.QUICKLY)
+def _gains(share: jax.Array, bounds: Bounds) -> dict[str, jax.Array]:
+    slopes = jax.vmap(jax.jacfwd(bounds.gains))(share)
+    return {"gains": jax.vmap(bounds.gains)(share), "along": jnp.swapaxes(slopes, 1, 2)}
 
 
-@programs.jit(static_argnames=("bounds", "devices"))
-def _slopes(problem: Problem, bounds: Bounds, share: jax.Array, devices: int) -> dict[str, jax.Array]:
-    """Tangents forward, as one more batch axis; point after point, so that a branch on the time stays a branch."""
+@programs.jit(compiler_options=programs.QUICKLY)
+def _judged(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Array) -> dict[str, jax.Array]:
+    return dict(zip(("f", "c", "value"), jax.vmap(partial(judge, rules))(gains, metrics, status), strict=True))
 
-    def one(share: jax.Array) -> dict[str, jax.Array]:
-        def twice(share: jax.Array) -> tuple:
-            gains = bounds.gains(share)
-            f, c, value = measure(problem, gains)
-            return (f, c), {"gains": gains, "f": f, "c": c, "value": value}
 
-        (f_slope, c_slope), measured = jax.jacfwd(twice, has_aux=True)(share)
-        return {**measured, "f_slope": f_slope, "c_slope": c_slope}
+@programs.jit(compiler_options=programs.QUICKLY)
+def _judged_slopes(
+    rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array
+) -> dict[str, jax.Array]:
+    """The same with slopes, from those of the gains and of the metrics along each share."""
 
-    return montecarlo.spread(lambda share: jax.lax.map(one, share), share, devices)
+    def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array) -> dict:
+        def of(gains: jax.Array, metrics: jax.Array) -> tuple:
+            f, c, value = judge(rules, gains, metrics, status)
+            return (f, c), value
+
+        (f, c), value = of(gains, metrics)
+        f_slope, c_slope = jax.vmap(
+            lambda by, slope: jax.jvp(of, (gains, metrics), (by, slope), has_aux=True)[1], in_axes=(0, 1), out_axes=-1
+        )(along, slopes)
+        return {"f": f, "c": c, "value": value, "f_slope": f_slope, "c_slope": c_slope}
+
+    return jax.vmap(one)(gains, along, metrics, status, slopes)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,28 @@ from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.simulation.rollout import Parts
+from tuning.search.flights import Fleet
 from tuning.search.gains import with_gains
 from tuning.search.margin_rows import Asked
 
 FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
 T_F = "t_f"
+DRAWN = 128  # trials whose coordinates are drawn in one call
+
+
+@pytree
+@dataclass(frozen=True)
+class Rules:
+    """By what metrics are judged, see `Problem`."""
+
+    limits: Leaf
+    counted: Leaf
+    averaged: int = field(metadata={"static": True})
+    names: tuple[str, ...] = field(metadata={"static": True})
+    least: tuple[int | None, ...] = field(metadata={"static": True})
+    goal: str = field(metadata={"static": True})
+    tail: int | None = field(metadata={"static": True})
+    torque_weight: float = field(metadata={"static": True})
 
 
 @pytree
@@ -50,6 +67,22 @@ class Problem:
     def rows(self) -> tuple[str, ...]:
         """What the rows of c are of."""
         return self.metrics + (() if self.margins is None else self.margins.metrics)
+
+    @property
+    def rules(self) -> Rules:
+        """By what it is judged, without what flies."""
+        return Rules(**{one.name: getattr(self, one.name) for one in fields(Rules)})
+
+    @property
+    def fleet(self) -> Fleet:
+        """What is flown of it."""
+        trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
+        return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates)
+
+    def others(self, trials: np.ndarray) -> Fleet:
+        """The same with other trials, of its seed."""
+        coordinates = jax.tree.map(np.asarray, coordinates_of(self.dispersion, int(self.seed), trials))
+        return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 
     def tightened(self, factor: float) -> "Problem":
         """The problem with limits so many times as large."""
@@ -84,9 +117,13 @@ def problem(
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
-    """Coordinates of these trials, arrays over the trials first."""
-    numbers = jnp.asarray(trials, dtype=jnp.uint32)
-    return _coordinates(dispersion, jnp.uint32(seed), numbers)
+    """Coordinates of these trials, arrays over the trials first; drawn so many at a time, by one program."""
+    numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // DRAWN)) * DRAWN)
+    calls = [
+        _coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
+        for k in range(0, numbers.size, DRAWN)
+    ]
+    return jax.tree.map(lambda *many: jnp.concatenate(many)[: len(trials)], *calls)
 
 
 @programs.jit
@@ -137,8 +174,30 @@ def whole_rows(problem: Problem) -> np.ndarray:
     return np.asarray([least is None for least in problem.least], dtype=bool)
 
 
+def watched(problem: Problem) -> tuple[str, ...]:
+    """Metrics that a problem is judged by: that of the goal, the peak torque, those of its requirements."""
+    return ("window_error" if problem.goal == T_F else problem.goal, "peak_torque", *problem.metrics)
+
+
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
     """F that is minimised, c = metric / limit - 1, (requirements, trials), met where c <= 0, and ln of the goal.
+
+    See `judge`; pure, for any transformation.
+    """
+    parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), watched(problem)
+
+    def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
+        trial, coordinates = case
+        metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
+        return jnp.stack([getattr(metrics, name) for name in names]), status
+
+    return judge(problem.rules, gains, *montecarlo.blocks(fly, (problem.trials, problem.coordinates)))
+
+
+def judge(
+    rules: Rules, gains: Float[Array, " gains"], metrics: Float[Array, "trials watched"], status: Array
+) -> tuple[Array, Array, Array]:
+    """F, c and ln of the goal, see `measure`, from the metrics that are `watched`, and the statuses, of all trials.
 
     The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
     worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
@@ -146,33 +205,20 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     fails, or has no value, c is `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to
     F.
     """
-    named = dict(zip(problem.names, gains, strict=True))
-    parts = with_gains(problem.parts, named)
-
-    def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array, Array]:
-        trial, coordinates = case
-        metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
-        over = [
-            judged(getattr(metrics, name) / limit, status) - 1.0
-            for name, limit in zip(problem.metrics, problem.limits, strict=True)
-        ]
-        goal = metrics.window_error if problem.goal == T_F else getattr(metrics, problem.goal)
-        square, torque = (judged(v, status) ** 2 for v in (goal, metrics.peak_torque))
-        return square, torque, jnp.stack(over) if over else jnp.zeros(0)
-
-    squares, torques, over = montecarlo.blocks(fly, (problem.trials, problem.coordinates))
+    goal, torque, *limited = metrics.T
+    squares, torques = (judged(v, status) ** 2 for v in (goal, torque))
     value = weighted = (
-        jnp.log(named[T_F]) if problem.goal == T_F else _log_rms(squares[: problem.averaged], problem.tail)
+        jnp.log(gains[rules.names.index(T_F)]) if rules.goal == T_F else _log_rms(squares[: rules.averaged], rules.tail)
     )
-    if problem.goal != T_F:
-        weighted = value + jnp.sum(squares[: problem.averaged] >= FAILED**2) * math.log(FAILED)
-    if problem.torque_weight:
-        weighted = weighted + problem.torque_weight * _log_rms(torques[: problem.averaged], problem.tail)
+    if rules.goal != T_F:
+        weighted = value + jnp.sum(squares[: rules.averaged] >= FAILED**2) * math.log(FAILED)
+    if rules.torque_weight:
+        weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
     rows = [
-        _asked(row, least, problem.averaged, counted[problem.averaged :])
-        for row, least, counted in zip(over.T, problem.least, problem.counted, strict=True)
+        _asked(judged(one / limit, status) - 1.0, least, rules.averaged, counted[rules.averaged :])
+        for one, limit, least, counted in zip(limited, rules.limits, rules.least, rules.counted, strict=True)
     ]
-    constraints = jnp.stack(rows) if rows else jnp.zeros((0, problem.trials.shape[0]))
+    constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
     return weighted, constraints, value
 
 

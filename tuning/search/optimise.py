@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, margin_rows
 from tuning.search import worst as worst_case
@@ -102,8 +101,6 @@ def search(
 
     try:
         if sloped:
-            if sure:
-                montecarlo.prepare(problem.parts, problem.dispersion)
             run.prepare(problem)
             prepare()
             run.set_out(problem, own)

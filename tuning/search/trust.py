@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation import rollout
+from tuning.search import flights
 from tuning.search.evaluate import Evaluator
-from tuning.search.gains import with_gains
 from tuning.search.objective import Problem
 from tuning.search.shares import TIMES, Bounds
 
@@ -76,19 +76,15 @@ def sensitivities(
     compiled for takes longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is
     left out.
     """
-    trials = np.asarray(problem.trials)[: problem.averaged]
-
-    def statistics(gains: np.ndarray) -> np.ndarray:
-        parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
-        flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
-        return np.asarray([rms(getattr(flown.metrics, name)[flown.finished]) for name in names])
-
     less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
+    trials = problem.others(np.asarray(problem.trials)[: problem.averaged])
+    flown = flights.fly(trials, np.concatenate([less, more]))
+    finished = np.isin(flown.status, rollout.FINISHED)
+    metrics = (getattr(flown.metrics, name) for name in names)
     with np.errstate(divide="ignore", invalid="ignore"):
-        rows = [
-            np.log(statistics(more[k]) / statistics(less[k])) / np.log(more[k, k] / less[k, k])
-            for k in range(gains.size)
-        ]
+        found = [[rms(one[ended]) for one, ended in zip(metric, finished, strict=True)] for metric in metrics]
+        below, above = np.split(np.transpose(found), 2)
+        rows = np.log(above / below) / np.log(np.diag(more) / np.diag(less))[:, None]
     return {
         metric: dict(zip(problem.names, row.tolist(), strict=True))
         for metric, row in zip(names, np.transpose(rows), strict=True)

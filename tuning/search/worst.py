@@ -1,6 +1,6 @@
 """The hardest trials: screened among many draws, then by gradient ascent inside what the dispersions can draw."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -10,13 +10,12 @@ import optax
 from scipy.stats import chi2
 
 from ptsmc_jax import programs
-from ptsmc_jax.batching import lanes
-from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions.base import INERTIA, Coordinates
+from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.search.gains import with_gains
-from tuning.search.objective import Problem, coordinates_of, judged
+from tuning.search import flights
+from tuning.search.flights import Fleet
+from tuning.search.objective import FAILED, Problem, judged, watched
 
 SCREENED = 4096  # trials looked through
 CLIMBERS = 8  # of the hardest ones, from which is climbed
@@ -54,9 +53,8 @@ Screened = tuple[np.ndarray, np.ndarray]  # trials, (trials,) metric / limit
 
 def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Screened:
     """Trials that no search has averaged, and how near each comes to its limits, (trials,) metric / limit."""
-    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
-    flown = montecarlo.run(parts, problem.dispersion, int(problem.seed), trials)
+    flown = flights.trials(problem.others(trials), gains)
     ratios = np.stack([getattr(flown.metrics, r.metric) / r.limit for r in requirements])
     return trials, np.max(np.where(flown.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
@@ -71,17 +69,15 @@ def hardest(
     """
     trials, ratio = screened or screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
-    names, limits = tuple(r.metric for r in requirements), jnp.asarray([r.limit for r in requirements])
-    coordinates = coordinates_of(problem.dispersion, int(problem.seed), chosen)
-    moved = tuple(name for name in coordinates if name != INERTIA)
-    parts = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True)))
-    charted = [_charted(problem, name, np.asarray(coordinates[name])) for name in moved]
+    names, limits = tuple(r.metric for r in requirements), np.asarray([r.limit for r in requirements])
+    fleet = problem.others(chosen)
+    moved = flights.movable(problem.dispersion)
+    charted = [_charted(problem, name, fleet.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)
-    case = (parts, problem.dispersion, problem.seed, jnp.asarray(chosen), coordinates, limits)
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
     state, best, best_y = optimiser.init(jnp.asarray(y)), np.full(len(y), -np.inf), y.copy()
     for _ in range(STEPS + 1 if moved else 0):
-        value, slope = (np.asarray(v) for v in _climb(*case, jnp.asarray(y), moved, names))
+        value, slope = climb(fleet, gains, y, watched(problem), dict(zip(names, limits, strict=True)))
         better = value > best
         best[better], best_y[better] = value[better], y[better]
         size = np.linalg.norm(slope, axis=1, keepdims=True)
@@ -89,9 +85,9 @@ def hardest(
         updates, state = optimiser.update(jnp.nan_to_num(-slope / size), state)
         y = np.asarray(optax.apply_updates(jnp.asarray(y), updates))
     first = int(np.argmax(best))
-    found = {**coordinates, **_moved(problem.dispersion, coordinates, jnp.asarray(best_y), moved)}
-    one = {name: v[first] for name, v in found.items()}
-    metrics, code, _, values, _ = _fly(parts, problem.dispersion, problem.seed, jnp.uint32(chosen[first]), one)
+    reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
+    one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
+    metrics, code, _, values, _ = jax.tree.map(lambda v: v[0, 0], flights.fly(one, gains[None]))
     reached = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
     ratios = [np.inf if np.isnan(one) else one for one in reached]  # it has no value: it never settles, say
     worst = int(np.argmax(ratios))
@@ -101,7 +97,7 @@ def hardest(
         screened=float(ratio.max()),
         status=rollout.STATUS[int(code)][0],
         trial=int(chosen[first]),
-        coordinates={name: np.asarray(v).tolist() for name, v in one.items()},
+        coordinates={name: v[0].tolist() for name, v in reached_at.items()},
         start={name: float(v) for name, v in values.items()},
         moved=moved,
     )
@@ -113,40 +109,58 @@ def _charted(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
 
 
-def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str, ...]) -> Coordinates:
-    """Coordinates of free reals, both (cases, count)."""
-    found, used = {}, 0
-    for name in moved:
-        count = coordinates[name].shape[1]
-        part, used = y[:, used : used + count], used + count
-        if dispersion.kinds[name].drawn == "uniform":
-            found[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
-        else:
-            farthest = float(np.sqrt(chi2.ppf(HELD, count)))
-            size = jnp.linalg.norm(part, axis=1, keepdims=True)
-            found[name] = part * jnp.minimum(1.0, farthest / jnp.maximum(size, 1e-12))
-    return found
+def climb(
+    fleet: Fleet, gains: np.ndarray, y: np.ndarray, metrics: tuple[str, ...], limits: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Largest metric / limit of each case, (cases,), and its slopes by the free reals y, (cases, reals).
+
+    metrics: those of the search, `limits` among them: its program finds the slopes, along as many reals at a time as
+    there are gains.
+    """
+    coordinates, shifts = _moved_to(fleet, y)
+    fleet, count, width = fleet._replace(coordinates=coordinates), y.shape[1], len(fleet.names)
+    columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()])
+    value, slopes = np.zeros(len(y)), list[np.ndarray]()
+    for k in range(0, count, width):
+        some = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
+        seen = jax.tree.map(
+            lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, some)
+        )
+        found = jnp.asarray(seen.metrics[:, columns] / limit), jnp.asarray(seen.status[:, None])
+        ratios = np.asarray(judged(*found))
+        nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
+        slope = np.take_along_axis(seen.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
+        slopes.append(np.where(value[:, None] < FAILED, slope / limit[nearest][:, None], 0.0))
+    return value, np.concatenate(slopes, axis=1)[:, :count]
 
 
-@programs.jit
-def _fly(parts, dispersion, seed, trial, coordinates) -> montecarlo.Flown:
-    return montecarlo.one(parts, dispersion, seed, trial, coordinates)
+def _filled(v: np.ndarray, width: int) -> np.ndarray:
+    """With zeros for directions that there are not, (cases, directions, ..)."""
+    return np.concatenate([v, np.zeros((v.shape[0], width - v.shape[1], *v.shape[2:]))], axis=1)
 
 
-@programs.jit(static_argnames=("moved", "names"))
-def _climb(parts, dispersion, seed, trials, coordinates, limits, y, moved, names) -> tuple[jax.Array, jax.Array]:
-    """Largest metric / limit of each case, (cases,), and its slopes by the free reals, (cases, reals)."""
+def _moved_to(fleet: Fleet, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Coordinates of free reals, and by what each real moves them, (cases, reals, numbers) of each that moves."""
+    moved = flights.movable(fleet.dispersion)
+    found, shifts = jax.tree.map(np.asarray, _moved(fleet.dispersion, dict(fleet.coordinates), y, moved))
+    return {**fleet.coordinates, **found}, shifts
 
-    def values(y: jax.Array) -> jax.Array:
-        def fly(case: tuple) -> jax.Array:
-            trial, own = case
-            metrics, status, *_ = montecarlo.one(parts, dispersion, seed, trial, own)
-            ratios = jnp.stack([judged(getattr(metrics, name) / limits[k], status) for k, name in enumerate(names)])
-            return jnp.max(ratios)
 
-        return lanes.vmap(fly)((trials, {**coordinates, **_moved(dispersion, coordinates, y, moved)}))
+@programs.jit(static_argnames="moved", compiler_options=programs.QUICKLY)
+def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str, ...]) -> tuple[dict, dict]:
+    """Coordinates of free reals y (cases, reals), and their derivatives by each of them."""
 
-    # cases do not depend on each other: one tangent along a real moves it in all of them at once
-    along = jnp.broadcast_to(jnp.eye(y.shape[1])[:, None, :], (y.shape[1], *y.shape))
-    value, slopes = jax.vmap(lambda e: jax.jvp(values, (y,), (e,)), out_axes=(None, -1))(along)
-    return value, slopes
+    def of(y: jax.Array) -> Coordinates:
+        found, used = {}, 0
+        for name in moved:
+            count = coordinates[name].shape[1]
+            part, used = y[used : used + count], used + count
+            if dispersion.kinds[name].drawn == "uniform":
+                found[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
+            else:
+                farthest = float(np.sqrt(chi2.ppf(HELD, count)))
+                found[name] = part * jnp.minimum(1.0, farthest / jnp.maximum(jnp.linalg.norm(part), 1e-12))
+        return found
+
+    slopes = jax.vmap(jax.jacfwd(of))(y)
+    return jax.vmap(of)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in slopes.items()}

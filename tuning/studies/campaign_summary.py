@@ -79,7 +79,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
     ]
-    found, drivers = {}, {}
+    found, drivers, ranked = {}, {}, dict[bytes, dict[str, tuple]]()
     names = list(pl.read_parquet_schema(parts[0].path))
     drawn = names[names.index("initial_angle") :]
     own = folder.own_names
@@ -90,7 +90,8 @@ def summarise(folder: Folder) -> dict[str, Any]:
         found[name] = _of_metric(values, finished)
         driven = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
         of = {key: inputs[key].to_numpy()[driven] for key in drawn}
-        drivers[name] = statistics.drivers(of, values[:SEARCHED][driven]) if driven.sum() > 1 else {}
+        known = ranked.setdefault(driven.tobytes(), {})  # by the trials
+        drivers[name] = statistics.drivers(of, values[:SEARCHED][driven], known) if driven.sum() > 1 else {}
     done = int(head.height)
     met = all(v["met"] for v in told) if told else counts["ok"] == done
     return {
@@ -196,11 +197,10 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     if finished.any():
         if folder.ready is not None:  # its histories are not kept, but flown for it
             flown = folder.flights
-            t, error = flying.history(flown, shown.astype(np.uint32))
             hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-            _, course = flying.history(flown, np.asarray([frame["trial"][hardest]], dtype=np.uint32))
+            t, error = flying.history(flown, np.append(shown, frame["trial"][hardest]).astype(np.uint32))
             made["fan"] = plots.fan(
-                t, error[finished[: shown.size]], (hardest, course[0]), folder.scenario.controller.t_f, kind
+                t, error[:-1][finished[: shown.size]], (hardest, error[-1]), folder.scenario.controller.t_f, kind
             )
         units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
         made["distributions"] = plots.distributions(

@@ -18,7 +18,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, least_within
 from ptsmc_jax.theory import margins
-from tuning.search import confirm, evolution, gains, margin_rows, objective, trust
+from tuning.search import confirm, evolution, flights, gains, margin_rows, objective, trust
 from tuning.search import shares as gain_bounds
 from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.evaluate import Evaluator
@@ -121,8 +121,7 @@ def tune(
     report("judging on fresh trials", 0, 0, found.value, 0.0)
     named = evaluate.bounds.rounded(found.gains, DIGITS)
     tuned = as_flown(gains.in_scenario(scenario, named))
-    trained = gains.with_gains(found.problem.parts, named)
-    training = montecarlo.run(trained, ready.dispersion, seed, np.arange(problem.averaged))
+    training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*named.values()]))
     fresh_seed = seed_of_judge(seed)
     fresh, judged_gains, floors = {}, {}, {}
     for name, candidate in {"tuned": tuned, **others}.items():
