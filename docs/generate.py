@@ -40,7 +40,8 @@ t_end. One that is `missed`, far from the reference at t_f, counts with its metr
 ERRORS = """\
 The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
 part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and
-input. `peak_wheel_momentum` is there with `[wheels]` only. Numbers of one's own: `ptsmc montecarlo --metrics`."""
+input. `peak_wheel_momentum` and `peak_wheel_torque` are there with `[wheels]` only.
+Numbers of one's own: `ptsmc montecarlo --metrics`."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. And, of the sampled loop, any

@@ -37,6 +37,7 @@ HOUSE = {
             errors systems values
             attitude_keys dispersion_tables gain_record keys scales
             device_tables gain_bounds own start_checks
+            disturbance_bounds
             disturbance_tables law_record observer_tables reference_tables
             baseline_tables
             own_laws
@@ -46,7 +47,7 @@ HOUSE = {
             layouts
             checks parsing
             free_gains timing
-            build own_checks reading
+            build cautions own_checks reading
             flyable
         """,
         "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
@@ -82,7 +83,13 @@ HOUSE = {
             campaign_summary tuner
             compare pareto tune_files
         """,
-        "output": "cells page_charts | margin_sentences | sentences | page terminal | campaign_terminal",
+        "output": """
+            cells page_captions page_charts
+            margin_sentences
+            search_sentences sentences
+            page terminal
+            campaign_terminal
+        """,
         "cli": "options | campaign_commands flight_commands convert new | writing_commands | main",
     },
 }

@@ -25,8 +25,8 @@ def readme(code: Code, about: About) -> str:
     delay = (
         f"\n\nThe scenario has a delay of {about.delay} control periods between measuring and acting. `command` is "
         "what the law asks for now, `torque` and the wheels' torques are what acts from this sample on, by the "
-        f"command of {about.delay} samples ago. Send those where this program is to make the delay, and `command` where "
-        "computer and bus make it."
+        f"command of {about.delay} samples ago. Send those where this program is to make the delay, and `command` "
+        "where computer and bus make it."
     )
     motors = " and `ArrayMotorTorqueMsg` (the torque on a wheel is minus `wheel_torque`)"
     return filled(

@@ -21,14 +21,14 @@ class BaselineTable(LawTable, frozen=True):
 
     Attributes:
         t_f: when the law is judged [s]
-        disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
+        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
+        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
     t_f: Positive = 30.0
-    disturbance_rate_bound: NotNegative = 1e-3
-    disturbance_bound: NotNegative = 0.01
+    disturbance_rate_bound: NotNegative | None = None
+    disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
     def law(self) -> Any:

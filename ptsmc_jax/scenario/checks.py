@@ -15,12 +15,17 @@ SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell ap
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs."""
+    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds.
+
+    Raises ScenarioError where the body is none, from whose inertia some follow.
+    """
+    scenario.check_body()
     loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
-    observer, disturbance = scenario.observer.filled(scenario, m), scenario.disturbance.filled(scenario, m)
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
-    return msgspec.structs.replace(scenario, observer=observer, disturbance=disturbance, loop=loop).resolved()
+    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)
+    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario, m))
+    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario, m)).resolved()
 
 
 def check(scenario: Scenario) -> None:

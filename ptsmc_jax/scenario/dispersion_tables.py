@@ -13,6 +13,7 @@ class Numbers(Table, frozen=True):
 
     width: ClassVar[str] = "std"  # the key that says how far
     widest: ClassVar[float] = 0.0  # how far a vector of three goes, in times that: all but one in 10 000
+    farthest: ClassVar[float] = 3.0  # how far a number goes that bounds are to hold for, in times that: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
         """The width of so many numbers, of which a single one of the table stands for all."""
@@ -46,6 +47,7 @@ class Uniform(Numbers, frozen=True):
 
     width: ClassVar[str] = "half_width"
     widest: ClassVar[float] = float(np.sqrt(3.0))
+    farthest: ClassVar[float] = 1.0
 
     def physics(self) -> Any:
         """`numbers.Uniform`."""

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ptsmc_jax.scenario import attitude_keys
+from ptsmc_jax.scenario import attitude_keys, disturbance_bounds
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.disturbance_bounds import Bounds
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import (
@@ -44,6 +45,10 @@ class DisturbanceTable(Kind, frozen=True):
         """What it adds up to at most until `end` [s], in N m s; nothing of what stays small however long it acts."""
         return 0.0
 
+    def bounds(self, scenario: Any, inputs: int) -> Bounds | None:
+        """Largest size and rate of each component, also where it is drawn; None: not known before its code is run."""
+        return Bounds(np.zeros(inputs), np.zeros(inputs))
+
     def check(self, name: str) -> None:
         """Raise ScenarioError where its keys contradict each other; name: of its table."""
 
@@ -73,6 +78,11 @@ class ConstantDisturbance(DisturbanceTable, frozen=True):
     def impulse(self, end: float) -> float:
         """All of it."""
         return float(np.linalg.norm(np.abs(self.amplitude) * end))
+
+    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+        """Its size; it does not change."""
+        size = np.abs(self.amplitude) * disturbance_bounds.drawn_factor(scenario)
+        return Bounds(size, np.zeros_like(size))
 
     def build(self, inertia: Any) -> Any:
         """`disturbances.Constant`."""
@@ -107,6 +117,13 @@ class SinusoidDisturbance(DisturbanceTable, frozen=True):
         lasting = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
         return float(np.linalg.norm(np.abs(self.amplitude) * lasting) + np.linalg.norm(self.bias) * end)
 
+    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+        """|bias| + |amplitude|, and |amplitude frequency|: of any phase."""
+        swing = np.abs(self.amplitude) * disturbance_bounds.drawn_factor(scenario)
+        if not len(swing) == len(self.frequency) == len(self.bias):
+            return Bounds(np.zeros(0), np.zeros(0))  # which `checks` refuses
+        return Bounds(np.abs(self.bias) + swing, swing * np.abs(self.frequency))
+
     def build(self, inertia: Any) -> Any:
         """`disturbances.Sinusoid`."""
         from ptsmc_jax.numerics.pytrees import vector
@@ -137,6 +154,10 @@ class GravityGradient(Attitude, DisturbanceTable, frozen=True):
         elif self.sequence is not None:
             raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
 
+    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+        """See `disturbance_bounds.gravity_gradient`."""
+        return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)
+
     def build(self, inertia: Any) -> Any:
         """`disturbances.GravityGradient`; the orbit's frame is the inertial one where no attitude is given."""
         from ptsmc_jax.numerics.pytrees import vector
@@ -157,6 +178,12 @@ class RandomWalk(DisturbanceTable, frozen=True):
     kind: Literal["random_walk"] = "random_walk"
     density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
     sampled_only: ClassVar[bool] = True
+
+    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+        """Three sigma at the end of the run, and `disturbance_bounds.walk_rate`."""
+        density = np.asarray(self.density)
+        wandered = disturbance_bounds.SIGMAS * density * np.sqrt(scenario.loop.t_end)
+        return Bounds(wandered, disturbance_bounds.walk_rate(scenario, density))
 
     def walk(self, period: float) -> Any:
         """Steps of white noise, held over a period."""
@@ -253,6 +280,10 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
     def quickest(self) -> float:
         """As it says itself; nothing is known before its code is run."""
         return 0.0 if self.waits else float(build(self).fastest())
+
+    def bounds(self, scenario: Any, inputs: int) -> Bounds | None:
+        """See `disturbance_bounds.along_the_run`."""
+        return None if self.waits else disturbance_bounds.along_the_run(scenario, build(self), inputs)
 
     def build(self, inertia: Any) -> Any:
         """What the code names."""

@@ -142,6 +142,26 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
     return words if reached else None
 
 
+def beyond(scenario: Scenario, name: str, side: str) -> float | None:
+    """A gain a tenth of its interval beyond a bound, or half as far as it may go; None: what lies there is known.
+
+    Of an interval that is searched on a log scale a tenth of its logarithm.
+    """
+    tune = scenario.tune
+    assert tune is not None
+    low, high = tune.bounds[name]
+    if border(scenario, name, side, low if side == "lower" else high) is not None:
+        return None
+    least, most, _ = _gain(scenario, name).allowed(Choice(scenario, tune.free or (), tune.bounds))
+    if high > 10.0 * low:
+        step = (high / low) ** 0.1
+        value = low / step if side == "lower" else high * step
+    else:
+        value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
+    value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
+    return float(f"{value:.4g}")
+
+
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """The default bounds of a free gain, before they reach out to the scenario's own."""
     tune = scenario.search

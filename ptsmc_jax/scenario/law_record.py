@@ -4,12 +4,14 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from ptsmc_jax.scenario import gain_bounds
+import msgspec
+
+from ptsmc_jax.scenario import disturbance_bounds, gain_bounds
 from ptsmc_jax.scenario.gain_record import GainBounds
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Kind
 
 
-class LawTable(Table, frozen=True):
+class LawTable(Kind, frozen=True):
     """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
 
     gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
@@ -26,6 +28,14 @@ class LawTable(Table, frozen=True):
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Its gains that are free where a scenario does not say, those before and those after the observer's."""
         return self.free_by_default, self.free_if_sampled if sampled else ()
+
+    def filled(self, scenario: Any, inputs: int) -> Any:
+        """With the bounds of Assumption 1 where they are absent and what the disturbance reaches is known."""
+        found = disturbance_bounds.of(scenario, inputs)
+        if found is None:
+            return self
+        follows = dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True))
+        return msgspec.structs.replace(self, **{k: v for k, v in follows.items() if getattr(self, k) is None})
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """How fast it turns the body [rad/s], at most, and the key that says so."""

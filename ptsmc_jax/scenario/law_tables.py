@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 from msgspec import Meta
 
 from ptsmc_jax import formulas
@@ -56,6 +57,12 @@ class PrescribedTable(LawTable, frozen=True):
             mode = scenario.loop.mode
             raise ScenarioError(f'controller.sampling = "implicit" needs the sampled loop, but loop.mode is "{mode}"')
 
+    def filled(self, scenario: Any, inputs: int) -> Any:
+        """With a hand-over that is one, too."""
+        made, loop = super().filled(scenario, inputs), scenario.loop
+        shortest = max(0.05, loop.period) if loop.mode == "sampled" else 0.05
+        return msgspec.structs.replace(made, delta=shortest) if made.delta is None else made
+
     def build(self, scenario: Any, model: Any) -> Any:
         """The law of a plant's model."""
         return dataclasses.replace(super().build(scenario, model), implicit=self.implicit)
@@ -72,13 +79,13 @@ class SpacecraftController(PrescribedTable, frozen=True):
         error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
         t_f: the prescribed time [s]
         eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
-        delta: hand-over to constant gains so long before t_f (Remark 1) [s]
+        delta: hand-over to constant gains so long before t_f (Remark 1); default: 0.05, or a period if longer [s]
         k1: K1, rate of s from the hand-over on, halved by (60) [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
-        disturbance_rate_bound: c of Assumption 1, bound on each component of d' [N m/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [N m]
+        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
+        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
@@ -86,13 +93,13 @@ class SpacecraftController(PrescribedTable, frozen=True):
     error: Literal["additive", "multiplicative"] = "additive"
     t_f: Positive = 30.0
     eta: Eta = 3.0
-    delta: Positive = 0.05
+    delta: Positive | None = None
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
     surface_rate: Positive = 1.0
     sampling: Literal["explicit", "implicit"] = "explicit"
-    disturbance_rate_bound: NotNegative = 1e-3
-    disturbance_bound: NotNegative = 0.01
+    disturbance_rate_bound: NotNegative | None = None
+    disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
     def physics(self, motion: str) -> Any:
@@ -108,26 +115,26 @@ class SystemController(PrescribedTable, frozen=True):
     Attributes:
         t_f: the prescribed time [s]
         eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
-        delta: hand-over to constant gains so long before t_f (Remark 1) [s]
+        delta: hand-over to constant gains so long before t_f (Remark 1); default: 0.05, or a period if longer [s]
         k1: K1, rate of s from the hand-over on [1/s]
         sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
-        disturbance_rate_bound: c of Assumption 1, bound on each component of d' [unit of d/s]
-        disturbance_bound: K of Assumption 1, bound on each component of d, used without an observer [unit of d]
+        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] [unit of d/s]
+        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [unit of d]
         initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
     """
 
     kind: Literal["prescribed_time"] = "prescribed_time"
     t_f: Positive = 5.0
     eta: Eta = 3.0
-    delta: Positive = 0.05
+    delta: Positive | None = None
     k1: Positive = 1.0
     sign_width: NotNegative = 1e-3
     surface_rate: Positive = 1.0
     sampling: Literal["explicit", "implicit"] = "explicit"
-    disturbance_rate_bound: NotNegative = 0.01
-    disturbance_bound: NotNegative = 0.01
+    disturbance_rate_bound: NotNegative | None = None
+    disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
     def physics(self, motion: str) -> Any:

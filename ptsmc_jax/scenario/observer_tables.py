@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
+from ptsmc_jax.scenario import disturbance_bounds
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import dead_beat
+from ptsmc_jax.scenario.gain_bounds import dead_beat, size
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
@@ -58,12 +59,18 @@ class NonlinearObserver(ObserverTable, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
-        gain: diagonal of l(w) [N m s]
+        gain: diagonal of l(w); default: 10 times the mean moment over the paper's 12 kg m^2, to one digit, and at most
+            12 times that share over a period [N m s]
     """
 
     kind: Literal["nonlinear"] = "nonlinear"
-    gain: ThreePositive = (10.0, 10.0, 10.0)
+    gain: ThreePositive | None = None
+    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
     gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
+
+    def scale(self, scenario: Any) -> float:
+        """By the body's inertia, or the period."""
+        return disturbance_bounds.observer_gain(scenario)
 
     def build(self, scenario: Any, model: Any) -> Any:
         """`observers.nonlinear`."""
@@ -76,11 +83,10 @@ class EachNonlinearObserver(NonlinearObserver, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
-        gain: one number for each input; default: 10 each [1/s]
+        gain: one number for each input; default: 10 each, at most 1 over a period [1/s]
     """
 
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    each: ClassVar[Mapping[str, float]] = {"gain": 10.0}
 
 
 class PrescribedTimeObserver(ObserverTable, frozen=True):
@@ -90,15 +96,20 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
         mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
         t_o: time by which it has converged; default: a third of t_f [s]
         delta_o: mu/(t_o - t) is off from so long before t_o; default: 0.05, or a period, at most t_o/4 [s]
-        gain: diagonal of the constant part of l [N m s]
+        gain: diagonal of the constant part of l; default: that of the nonlinear one [N m s]
     """
 
     kind: Literal["prescribed_time"] = "prescribed_time"
     mu: Annotated[float, Meta(gt=1, description="a number greater than 1")] = 2.0
     t_o: Positive | None = None
     delta_o: Positive | None = None
-    gain: ThreePositive = (10.0, 10.0, 10.0)
+    gain: ThreePositive | None = None
+    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
     gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
+
+    def scale(self, scenario: Any) -> float:
+        """By the body's inertia, or the period."""
+        return disturbance_bounds.observer_gain(scenario)
 
     def times(self, scenario: Any) -> tuple[float, float]:
         """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
@@ -128,11 +139,10 @@ class EachPrescribedTimeObserver(PrescribedTimeObserver, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
-        gain: constant part, one number for each input; default: 10 each [1/s]
+        gain: constant part, one number for each input; default: 10 each, at most 1 over a period [1/s]
     """
 
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    each: ClassVar[Mapping[str, float]] = {"gain": 10.0}
 
 
 def _usual_bound(choice: Choice) -> tuple[float, float]:
@@ -163,12 +173,12 @@ class FiniteTimeObserver(ObserverTable, frozen=True):
 
     def scale(self, scenario: Any) -> float:
         """The bound on the disturbance's rate."""
-        return scenario.controller.disturbance_rate_bound or 1e-3
+        return scenario.controller.disturbance_rate_bound or 1e-3 * size(scenario)
 
     def check(self, scenario: Any) -> None:
         """Its gain is a bound on the disturbance's rate."""
         assert self.gain is not None  # `filled`
-        least = scenario.controller.disturbance_rate_bound
+        least = scenario.controller.disturbance_rate_bound or 0.0  # not known yet where code of one's own says it
         if min(self.gain) < least or min(self.gain) <= 0.0:
             raise wrong("observer.gain", self.gain, f"at least controller.disturbance_rate_bound, {least}, each")
 

@@ -9,7 +9,7 @@ import os
 import re
 import tomllib
 import typing
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
-from ptsmc_jax.scenario.values import Kinds, Positive, Table, Truth
+from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table, Truth
 from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
@@ -164,6 +164,31 @@ def dump(scenario: Scenario) -> dict[str, Any]:
     return {name: found[name] for name in (*tables, "requirements", "tune") if name in found}
 
 
+def stated(scenario: Scenario) -> dict[str, Any]:
+    """The same without what the scenario's file did not say, and nobody changed since."""
+    tables = dump(scenario)
+    for (*place, key), value in scenario.defaulted.items():
+        table: Any = tables
+        for name in place:
+            table = table.get(name, {})
+        if key in table and table[key] == value:
+            del table[key]
+    return tables
+
+
+def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
+    """What tables hold and raw ones do not, by the path of its key."""
+    found: dict[tuple[str, ...], Any] = {}
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            within = raw.get(key, {})
+            inside = not_said(within if isinstance(within, Mapping) else {}, value)
+            found |= {(key, *path): one for path, one in inside.items()}
+        elif key not in raw:
+            found[(key,)] = value
+    return found
+
+
 def plain(table: Table) -> dict[str, Any]:
     """A table as a scenario file would have it; what is None is left out."""
     return typing.cast(dict, _without_none(table))
@@ -244,7 +269,7 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
     return struct(**found)
 
 
-def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | Limit:
+def _requirement(metric: str, value: Any, metrics: Mapping[str, Any]) -> float | Limit:
     key = f"requirements.{metric}"
     if metric not in metrics and metric not in catalogues.MARGINS:
         raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *catalogues.MARGINS))}")
@@ -253,8 +278,27 @@ def _requirement(metric: str, value: Any, metrics: Collection[str]) -> float | L
             raise wrong(key, value, "a number greater than 0, which every loop must keep")
         if "limit" not in value:
             raise wrong(key, value, "a number greater than 0 or a table with `limit`")
+        value = {**value, "limit": _limit(f"{key}.limit", value["limit"], metric, metrics)}
         return typing.cast(Limit, _fields(key, value, Limit))
-    return _value(key, value, Positive)
+    return _limit(key, value, metric, metrics)
+
+
+def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> float:
+    """A limit as a number in the metric's unit, also from one in words: "0.05 deg"."""
+    allowed = NotNegative if metric in catalogues.MAY_BE_ZERO else Positive
+    if not isinstance(value, str):
+        return _value(key, value, allowed)
+    unit = {**metrics, **catalogues.MARGINS}[metric][0]
+    units = catalogues.UNITS.get(unit, {})
+    number, _, name = " ".join(value.split()).partition(" ")
+    try:
+        size = float(number)
+    except ValueError:
+        size = math.nan
+    if name not in units or not math.isfinite(size):
+        example = f', or in words such as "0.05 {list(units)[1]}", in {", ".join(units)}' if units else ""
+        raise wrong(key, value, keys.allowed(allowed) + (f" [{unit}]" if unit != "-" else "") + example)
+    return _value(key, size * units[name], allowed)
 
 
 def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:

@@ -22,29 +22,35 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     """
     scenario = checks.resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
-    if scenario.tune is None or own.waits(scenario):
-        return scenario
-    return msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+    if scenario.tune is not None and not own.waits(scenario):
+        scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+    return msgspec.structs.replace(scenario, defaulted=parsing.not_said(raw, parsing.dump(scenario)))
 
 
 def complete(scenario: Scenario) -> Scenario:
     """The scenario with the keys and gains of parts of one's own, whose files are run; raises ScenarioError."""
-    return from_tables(parsing.dump(scenario), run=True) if own.waits(scenario) else scenario
+    return from_tables(parsing.stated(scenario), run=True) if own.waits(scenario) else scenario
+
+
+def settled(scenario: Scenario) -> Scenario:
+    """The scenario with its defaults as if they were said: what is replaced in it moves no others."""
+    return msgspec.structs.replace(scenario, defaulted={})
 
 
 def replace(scenario: Scenario, **changes: Any) -> Scenario:
     """The scenario with other values, keys written table__key, checked again: replace(s, controller__eta=4.0).
 
-    None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one.
+    None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one. What
+    the scenario does not say stays the default, which may follow what is changed.
 
     >>> faster = replace(from_tables({}), controller__t_f=20.0)
     >>> faster.controller.t_f, faster.loop.t_end
-    (20.0, 40.0)
+    (20.0, 30.0)
     >>> replace(faster, controller__eta=1.0)
     Traceback (most recent call last):
     ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
-    tables = parsing.dump(scenario)
+    tables = parsing.stated(scenario)
     for name, value in changes.items():
         table, _, key = name.partition("__")
         if value is None and _is_known(scenario, table, key):
@@ -52,7 +58,7 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
             removed.pop(key or table, None)
         elif not key:
             tables[table] = value
-        elif key == "kind" and tables.get(table, {}).get("kind") != value:
+        elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != value:
             tables[table] = {"kind": value}
         else:
             tables[table] = {**tables.get(table, {}), key: value}
@@ -61,7 +67,8 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
 
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:
     """Whether there is such a table or key; one that is not known is handed on, and refused as in a file."""
-    now = getattr(scenario, table) if table in scenario.__struct_fields__ else None
+    tables = set(scenario.__struct_fields__) - {"defaulted"}
+    now = getattr(scenario, table) if table in tables else None
     if not key or now is None:
-        return table in scenario.__struct_fields__
+        return table in tables
     return key in now.__struct_fields__ if isinstance(now, msgspec.Struct) else True

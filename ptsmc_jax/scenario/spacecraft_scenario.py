@@ -106,8 +106,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             return float(np.mean(values)), float(values.max())
         return float(np.mean(np.diag(values))), float(np.linalg.eigvalsh(values).max())
 
-    def check_plant(self) -> None:
-        """A body that can be, attitudes that are given once, and devices that fit."""
+    def check_body(self) -> None:
+        """A body that can be."""
         for key in ("inertia", "true_inertia"):
             value = getattr(self.spacecraft, key)
             if value is not None:
@@ -115,6 +115,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                     formulas.check_inertia(value)
                 except ValueError as error:
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
+
+    def check_plant(self) -> None:
+        """Attitudes that are given once, and devices that fit."""
         attitude_keys.quaternion(self.initial, "initial")
         self.reference.check()
         several = len(self.terms) > 1 or self.disturbance.kind == "sum"

@@ -39,12 +39,12 @@ class Limit(Table, frozen=True):
     """A requirement in full: metric <= limit in a share of the trials.
 
     Attributes:
-        limit: the largest value allowed
+        limit: the largest value allowed, a number or with its unit, "0.05 deg"
         quantile: the share of the trials in which it must hold; default: all that are flown
         confidence: of the one-sided bound (Clopper and Pearson) by which that share must be shown; default: none asked
     """
 
-    limit: Positive
+    limit: NotNegative
     quantile: Quantile | None = None
     confidence: Quantile | None = None
 
@@ -84,12 +84,14 @@ class Tune(Table, frozen=True):
     steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
 
 
-class Scenario(Table, frozen=True, kw_only=True):
+class Scenario(Table, frozen=True, kw_only=True, eq=False):
     """A scenario as its file says it, every key resolved: the tables that all plants have; optional ones may be off.
 
-    Each kind of plant has its own type, see `layouts.SCENARIOS`, which says what depends on the plant.
+    Each kind of plant has its own type, see `layouts.SCENARIOS`, which says what depends on the plant. `defaulted`
+    holds what the file does not say, by the path of its key: `replace` returns such keys to their defaults.
     """
 
+    defaulted: dict[tuple[str, ...], Any] = {}  # noqa: RUF012
     plant: Any
     # the tables of their kinds, see `TABLES`
     disturbance: Any  # `disturbance_tables.DisturbanceTable`, or several
@@ -168,6 +170,9 @@ class Scenario(Table, frozen=True, kw_only=True):
         """With the defaults of its plant that depend on other keys."""
         return self
 
+    def check_body(self) -> None:
+        """Raise ScenarioError where there is no such body: before defaults follow from it."""
+
     def check_plant(self) -> None:
         """Raise ScenarioError where keys of the plant contradict each other."""
         raise NotImplementedError
@@ -198,3 +203,8 @@ class Scenario(Table, frozen=True, kw_only=True):
     def spread(self, parts: Any) -> dict[str, Any]:
         """What the plant has drawn for each trial, a part of `dispersions` each, by what `Dispersion` calls it."""
         raise NotImplementedError
+
+    def __eq__(self, other: object) -> bool:
+        """The same values, said or not."""
+        names = [name for name in self.__struct_fields__ if name != "defaulted"]
+        return isinstance(other, Scenario) and all(getattr(self, name) == getattr(other, name) for name in names)

@@ -207,6 +207,8 @@ def _grid(
         by_key |= {f"controller.{key}": steps(rate=value) for key, value in rates.items()}
         by_key["controller.sign_width"] = steps(layer=layer)
         worst = max(by_key, key=lambda key: by_key[key])
+        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # whose rate the switching follows too
+            worst = "disturbance.frequency"
         if by_key[worst] <= steps() * 1.5:
             raise wrong("loop.t_end", t_end, f"earlier: {asks}")
         if worst == "controller.sign_width":

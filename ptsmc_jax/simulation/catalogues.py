@@ -3,6 +3,7 @@
 How each comes about is in `metric_rows`; here is what can be said without JAX.
 """
 
+import math
 from typing import NamedTuple
 
 
@@ -19,6 +20,8 @@ CATALOGUE = {
     "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
     "window_error": Entry("-", "RMS of that 2-norm over the window after t_f"),
     "hold_error": Entry("-", "largest of that 2-norm from t_f to t_end"),
+    "window_angle": Entry("rad", "RMS of the angle to the reference attitude over the window after t_f"),
+    "hold_angle": Entry("rad", "largest angle to the reference attitude from t_f to t_end"),
     "peak_torque": Entry("N m", "largest commanded torque about one axis, before the actuator"),
     "peak_torque_delivered": Entry("N m", "largest delivered torque about one axis"),
     "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
@@ -28,6 +31,7 @@ CATALOGUE = {
     "peak_rate": Entry("rad/s", "largest 2-norm of the body rate"),
     "peak_momentum": Entry("N m s", "largest 2-norm of the body's angular momentum"),
     "peak_wheel_momentum": Entry("N m s", "largest momentum stored in one reaction wheel", "wheels"),
+    "peak_wheel_torque": Entry("N m", "largest torque of one reaction wheel", "wheels"),
 }
 # The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
 STATE_CATALOGUE = {
@@ -42,6 +46,17 @@ STATE_CATALOGUE = {
     "chattering": Entry("u/s", "total variation of the delivered input per second after t_f, largest component"),
     "peak_rate": Entry("x2", "largest |x_2|"),
 }
+MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
+# what a limit in words may be in, by the unit of its metric: name of the unit -> how much that is
+UNITS: dict[str, dict[str, float]] = {
+    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
+            "arcsec": math.pi / 648_000},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "arcsec/s": math.pi / 648_000},
+    "N m": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6},
+    "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6},
+    "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6},
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+}  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 
 # margins of the loop, see `margins`: name: (unit, what it is, whether a requirement is the least that is allowed)

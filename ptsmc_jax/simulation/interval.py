@@ -66,6 +66,7 @@ class Interval(NamedTuple):
     weights: tuple[float, ...]  # sum to 1
     limited: Array  # bool: a limit of the actuators cuts the command
     wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
+    wheel_torque: Array | None = None  # (times, wheels) at both ends [N m]
 
     @property
     def length(self) -> Array:

@@ -90,6 +90,22 @@ def _wheels_at_start(start: Start, criteria: Criteria) -> Array:
     return jnp.full_like(zero, jnp.nan) if stored is None else jnp.max(jnp.abs(stored))
 
 
+def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    """Integral of angle^2 over the window so far; an angle has a kink where it is zero: by the mean of both ends."""
+    start, end = interval.start.angle, interval.end.angle
+    squares = (start * start, (0.5 * (start + end)) ** 2, end * end)
+    return square + integral_in_window(interval.t, interval.t_next, squares, criteria)
+
+
+def _hold_angle(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, interval.end.angle), largest)
+
+
+def _wheel_torque(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+    torque = interval.wheel_torque
+    return largest if torque is None else jnp.maximum(largest, jnp.max(jnp.abs(torque)))
+
+
 def _wheels(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     stored = interval.wheel_momentum
     return largest if stored is None else jnp.maximum(largest, jnp.max(jnp.abs(stored)))
@@ -104,6 +120,12 @@ METRICS = {
     "hold_error": Metric(
         update_late=_hold_error,
         value=lambda largest, run, criteria: jnp.maximum(largest, guards.norm(run.arrival.error)),
+    ),
+    "window_angle": Metric(
+        update_late=_square_angle, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
+    ),
+    "hold_angle": Metric(
+        update_late=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
     ),
     "peak_torque": Metric(
         update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.commanded))
@@ -136,4 +158,7 @@ METRICS = {
         update=lambda largest, interval, criteria: jnp.maximum(largest, interval.end.momentum),
     ),
     "peak_wheel_momentum": Metric(begin=_wheels_at_start, update=_wheels),
+    "peak_wheel_torque": Metric(
+        begin=lambda start, criteria: 0.0 * _wheels_at_start(start, criteria), update=_wheel_torque
+    ),
 }

@@ -46,9 +46,12 @@ def fewest_trials(quantile: float, confidence: float) -> int:
 def over(values: Any, limit: Any, *, at_least: bool) -> Any:
     """How near arrays, NumPy's or JAX's, come to a limit, which is 1: as a share of it, or 2 less that.
 
-    The latter where they are to be larger; one that is infinite is then as far from the limit as there is: 0.
+    The latter where they are to be larger; one that is infinite is then as far from the limit as there is: 0. Of a
+    limit of zero: 0 where it is kept, beyond 1 where it is not.
     """
-    share = values / limit
+    none = limit == 0.0
+    with np.errstate(over="ignore"):
+        share = (values + none * (values > 0.0)) / (limit + none)
     return 2.0 - share.clip(max=2.0) if at_least else share
 
 

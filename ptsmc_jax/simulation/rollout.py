@@ -168,13 +168,15 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
 
 def _torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> "_Torques":
     """Commanded and delivered torques of a control period, and the momentum of the wheels in it."""
-    weights, delivered, stored = (1.0,), (actuators.torque(drive, jnp.zeros_like(dt)),), None
+    weights, delivered, stored, turned = (1.0,), (actuators.torque(drive, jnp.zeros_like(dt)),), None, None
     if actuators.moves:
         weights = (1 / 6, 4 / 6, 1 / 6)
         delivered = (*delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
     if actuators.wheels is not None:  # in the middle too: a lag may turn the torque around within the period
         stored = jnp.stack([actuators.wheels_at(drive, time)[0] for time in (dt / 2, dt)])
-    return _Torques((u,) * len(delivered), delivered, weights, drive.limited, stored)
+        # which goes one way in between
+        turned = jnp.stack([actuators.wheels_at(drive, time)[1] for time in (jnp.zeros_like(dt), dt)])
+    return _Torques((u,) * len(delivered), delivered, weights, drive.limited, stored, turned)
 
 
 def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | None, dt: Scalar) -> Any:
@@ -262,6 +264,7 @@ class _Torques(NamedTuple):
     weights: tuple[float, ...]
     limited: Array
     wheel_momentum: Array | None
+    wheel_torque: Array | None = None
 
 
 def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step) -> _State:

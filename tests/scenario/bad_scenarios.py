@@ -72,7 +72,11 @@ BAD = [
     ("loop.mode = 'discrete'", 'loop.mode is "discrete"', '"continuous" or "sampled"'),
     ("loop.clock = 'wall'", 'loop.clock is "wall"', '"anchored" or "flight"'),
     (SAMPLED + "controller.delta = 0.04", "controller.delta is 0.04", "one control period, loop.period = 0.05"),
-    (SAMPLED + "loop.period = 0.1", "controller.delta is 0.05", "one control period, loop.period = 0.1"),
+    (
+        SAMPLED + "loop.period = 0.1\ncontroller.delta = 0.05",
+        "controller.delta is 0.05",
+        "one control period, loop.period = 0.1",
+    ),
     (SAMPLED + "loop.window = 1e-16", "loop.window is 1e-16", "at least one control period, loop.period = 0.05"),
     ("loop.window = 1e-16", "loop.window is 1e-16", "at least 0.0003, controller.t_f times 1e-05"),
     (
@@ -309,6 +313,18 @@ BAD = [
     ("requirements.window_error = 0.0", "requirements.window_error is 0.0", "greater than 0"),
     ("requirements.window_error = inf", "requirements.window_error is inf", "a number greater than 0, and inf"),
     ("requirements.window_error = '1e-4'", 'requirements.window_error is "1e-4"', "a number greater than 0"),
+    (
+        "requirements.hold_angle = '3 furlong'",
+        'requirements.hold_angle is "3 furlong"',
+        "in rad, mrad, urad, deg",
+    ),
+    ("requirements.peak_torque = '5 deg'", 'requirements.peak_torque is "5 deg"', 'such as "0.05 mN m"'),
+    ("requirements.hold_angle = '-1 deg'", "requirements.hold_angle is -0.017", "greater than 0"),
+    ("requirements.hold_angle = 'nan deg'", 'requirements.hold_angle is "nan deg"', "greater than 0"),
+    ("requirements.hold_angle = { limit = '1 N' }", 'requirements.hold_angle.limit is "1 N"', "greater than 0"),
+    ("requirements.saturated = -0.1", "requirements.saturated is -0.1", "at least 0"),
+    ("requirements.effort = { limit = 0 }", "requirements.effort.limit is 0", "greater than 0"),
+    (SAMPLED + "requirements.peak_wheel_torque = 1", "requirements.peak_wheel_torque needs", "no [wheels] table"),
     ("requirements.window_error = { quantile = 0.9 }", "requirements.window_error is { quantile = 0.9 }", "`limit`"),
     ("requirements.window_error = { limit = 1, quantile = 1.0 }", ".quantile is 1.0", "a number between 0 and 1"),
     # tuning

@@ -17,7 +17,7 @@ from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, parts, vector
-from tuning.output import sentences
+from tuning.output import search_sentences
 from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, shares, starts, worst
 from tuning.search.evaluate import Evaluator, Sloped
 from tuning.studies import tune_files, tuner
@@ -502,5 +502,5 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
 def test_what_breaks_a_limit_in_training_is_said(ratio, said):
     """Infinite in a result, absent from the file it is read from."""
     found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
-    (line,) = sentences.search({"search": found})
+    (line,) = search_sentences.search({"search": found})
     assert said in line

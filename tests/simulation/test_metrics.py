@@ -121,6 +121,25 @@ def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
     np.testing.assert_allclose(found.chattering, 2.0 / 3.0)  # the jump at t_f itself does not count
 
 
+def test_angles_after_t_f_are_the_largest_and_the_rms_of_the_parabola_through_their_squares():
+    """From t_f = 1 s on, over a window of 1 s: 0.3 to 0.1 rad, whose square in between is that of the line."""
+    found = judge([interval(0, 1, (1.0, 0.3)), interval(1, 2, (0.3, 0.1)), interval(2, 4, (0.1, 0.25))])
+    np.testing.assert_allclose(found.hold_angle, 0.3)
+    np.testing.assert_allclose(found.window_angle, np.sqrt((0.09 + 0.03 + 0.01) / 3), rtol=1e-14)
+    later = judge([interval(0, 1, (1.0, 0.1)), interval(1, 2, (0.1, 0.2)), interval(2, 4, (0.2, 0.4))])
+    np.testing.assert_allclose(later.hold_angle, 0.4)  # to the end of the run, not of the window
+
+
+def test_the_torque_of_wheels_is_the_largest_of_any():
+    wheels = jnp.asarray([[0.1, -0.2], [0.05, 0.3]])
+    one = interval(0, 4, (1.0, 1.0))._replace(wheel_momentum=wheels, wheel_torque=-2.0 * wheels)
+    criteria = Criteria(vector(1.0), vector(4.0), vector(1.0), vector(0.1))
+    running = metrics.begin(Start(one.start, 3, jnp.zeros(2)), criteria)
+    found = metrics.finish(metrics.update(running, one, criteria), criteria)
+    assert (float(found.peak_wheel_momentum), float(found.peak_wheel_torque)) == (0.3, 0.6)
+    assert np.isnan(judge([interval(0, 4, (1.0, 1.0))]).peak_wheel_torque)
+
+
 def test_an_interval_of_length_zero_changes_nothing():
     plain = [interval(0, 1, (1.0, 0.5), 1.0), interval(1, 4, (0.5, 0.2), 0.5)]
     with_empty = [plain[0], interval(1, 1, (9.0, 9.0), 99.0), plain[1]]

@@ -79,7 +79,7 @@ def simulate(
     run = runs.fly(ready, key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
     if not quiet:
-        terminal.run(single.summary(run), loaded.plant.kind, folder)
+        terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
     return 0 if run.met else 1
 
 

@@ -133,7 +133,8 @@ class _File:
         catalogue, live = self.resolved.metrics, self.live.get("requirements")
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
-            f"The metrics are {', '.join(catalogue)}. "
+            f"A limit may be given with its unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
+            f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(catalogue)}. '
             f"Of the sampled loop also {', '.join(catalogues.MARGINS)}: the least allowed, but for the last, which is "
             "the largest sensitivity."
         )

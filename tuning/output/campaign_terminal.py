@@ -54,6 +54,7 @@ def campaign(found: dict[str, Any], folder: Path) -> None:
         *sentences.campaign_error(found),
         *map(sentences.verdict, found["verdicts"]),
         *sentences.campaign_drivers(found),
+        *sentences.cautions(found),
         f"results in {folder}",
     )
 

@@ -20,7 +20,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
-from tuning.output import margin_sentences, page_charts, sentences
+from tuning.output import margin_sentences, page_captions, page_charts, search_sentences, sentences
 
 HERE = Path(__file__).parent
 
@@ -177,8 +177,9 @@ def _verdict(summary: dict[str, Any], lines: Iterable[str], requirements: bool) 
         "unfinished": "NOT finished",
         "ok": "Done",
     }.get(status, f"The run failed: {status}")
+    lines = [*lines, *sentences.cautions(summary)]
     mood = {"met": "good", "ok": "calm"}.get(status, "bad")
-    return Heading(mood if requirements or mood == "bad" else "calm", headline, list(lines))
+    return Heading(mood if requirements or mood == "bad" else "calm", headline, lines)
 
 
 def _simulate(result: Result) -> tuple[Heading, list[Section]]:
@@ -220,7 +221,16 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
         Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
         Section(
             "Can it be trusted?",
-            [_text([*sentences.search(summary), *sentences.trust(summary), *sentences.shortest(summary)])],
+            [
+                _text(
+                    [
+                        *search_sentences.advice(summary),
+                        *search_sentences.search(summary),
+                        *search_sentences.trust(summary),
+                        *search_sentences.shortest(summary),
+                    ]
+                )
+            ],
         ),
         Section("Search", [result.chart("search", page_charts.search(rows, goal), caption)]),
     ]
@@ -232,8 +242,13 @@ def _value(known: float | None) -> float:
 
 
 def _distance(verdict: dict[str, Any]) -> str:
+    """How far what decides a verdict is from its limit: the largest value, or that of the share that is asked for."""
     margin = _value(verdict["margin"])
-    return "" if np.isnan(margin) or verdict.get("at_least") else f", {100 * margin:.3g} % of the limit"
+    if np.isnan(margin) or verdict.get("at_least") or verdict["limit"] == 0.0:
+        return ""
+    if verdict.get("quantile") is None or verdict["trials"] == 1:
+        return f", {100 * margin:.3g} % of the limit"
+    return f"; the trial that decides is at {margin * verdict['limit']:.4g}, {100 * margin:.3g} % of the limit"
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -276,6 +291,7 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
     meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}
     mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
     headline = meets.get(summary["status"], "Interrupted: the best so far")
+    lines += sentences.cautions(summary)
     blocks = [_table(sentences.comparison(summary)), _text(sentences.comparison_lines(summary))]
     return Heading(mood, headline, lines), [Section("Laws side by side", blocks)]
 
@@ -343,28 +359,6 @@ SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
 
 # kept in `versions.json`
 OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "metrics", "seed", "global_check")
-CAPTIONS = {
-    "history": "Gains and goal of every start over the steps of the descent.",
-    "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",
-    "sensitivities": "Percent by which each metric moves for a percent of each gain.",
-    "profiles": "The goal along each gain between its bounds, the others as found; what breaks a limit is marked.",
-    "front": "The same front as a picture.",
-    "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
-    "nichols": "The loop opened at each axis of the plant's input, the others closed.",
-    "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",
-    "margins": "Margins of the frozen loop on the way to the hand-over.",
-    "fan": "How the error goes with time: the share of trials inside each band.",
-    "distributions": "The share of the trials up to each value; the scale stretches both ends.",
-    "inputs": "What was drawn against what came of it.",
-    "torque_by_angle": "Peak torque by the angle that a trial starts from.",
-    "settling": "Time to settle by the angle that a trial starts from.",
-    "error": "Attitude error, or the first state, over time.",
-    "sliding": "Sliding variable over time.",
-    "torque": "Delivered torque over time.",
-    "attitude": "Attitude over time.",
-    "rate": "Body rate over time.",
-    "states": "States over time.",
-}
 
 
 def _pictures(result: Result) -> Iterator[Section]:
@@ -373,7 +367,7 @@ def _pictures(result: Result) -> Iterator[Section]:
     for path in sorted((result.folder / "figures").glob("*.png")):
         source = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
         name = path.stem.replace("_", " ")
-        blocks.append(Block("picture", alt=name, source=source, caption=CAPTIONS.get(path.stem, "")))
+        blocks.append(Block("picture", alt=name, source=source, caption=page_captions.CAPTIONS.get(path.stem, "")))
     if blocks:
         yield Section("Figures", blocks)
 

@@ -5,10 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
-from tuning.output import margin_sentences
 from tuning.output.cells import Summary, Table
 
-AGREE = 0.01  # slopes off from differences by more than this share say little
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
 
@@ -122,6 +120,11 @@ def accuracy(summary: Summary) -> Iterator[str]:
         yield f"RMS window error: {', '.join(both)}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
 
 
+def cautions(summary: Summary) -> Iterator[str]:
+    """What is odd about the scenario, said loudly."""
+    yield from (f"CAUTION: {said}" for said in summary.get("cautions", ()))
+
+
 def floor(error: float | None, least: float | None) -> str:
     """How many times the error is what no controller can beat; nothing where there is no such floor."""
     times = over_floor(error, least)
@@ -146,90 +149,6 @@ def paper_refused(summary: Summary) -> Iterator[str]:
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
     return "" if interval is None else f" (95 %: {interval[0]:{digits}} to {interval[1]:{digits}})"
-
-
-def search(summary: Summary) -> Iterator[str]:
-    """How the search went."""
-    found = summary["search"]
-    for metric, ratio in found.get("largest_over_limit", {}).items():
-        if ratio is None or ratio > 1.0:
-            lost = ratio is None or math.isinf(ratio)
-            far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
-            yield f"no gains found within the bounds keep every limit: with these {far} in training"
-    for one in found.get("confirmed", []):
-        most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
-        yield (
-            f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
-            f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
-            f"probability of {100 * one['probability']:.3g} %"
-        )
-    hardest = found.get("hardest")
-    if hardest is not None and hardest["unbounded"]:
-        moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
-        reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
-        yield (
-            f"worst case: {hardest['metric']} has none over {moved}, which {reach}; "
-            f"ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
-        )
-    elif hardest is not None:
-        far = "has no value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
-        advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
-        yield f"worst case inside the dispersions: {hardest['metric']} {far}{advice}"
-    if "rollouts" in found:
-        yield (
-            f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
-            f"{found['seconds']:.0f} s"
-            + "".join(
-                f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
-            )
-        )
-    checked = summary.get("differential_evolution")
-    if checked is not None:
-        kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
-        beside = {
-            (True, True): f"the search is {100 * checked['distance']:+.2f} % from it",
-            (True, False): "breaks a limit, which the search keeps",
-            (False, True): "keeps every limit, unlike the search",
-            (False, False): "keeps not every limit either",
-        }[kept, checked["kept"]]
-        yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
-
-
-def trust(summary: Summary) -> Iterator[str]:
-    """What the gains do, and whether the slopes are right."""
-    believed = summary.get("trust")
-    influence = {} if believed is None else believed["influence"]
-    for gain, side in summary["at_bound"].items():
-        if influence.get(gain) == "none":
-            continue
-        yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
-    for gain, how in influence.items():
-        if how == "none":
-            yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
-    if believed is None:
-        return
-    yield from margin_sentences.tuned(believed.get("margins"))
-    if believed["slopes_off_central_differences"] is None:
-        yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
-        return
-    off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
-    shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
-    if max(off.values(), default=0.0) <= AGREE:
-        yield f"slopes by automatic differentiation agree with differences to {shown}"
-    else:
-        yield (
-            f"slopes by automatic differentiation are off from differences by {shown}: the loop chatters or breaks off "
-            "there, and the descent had little to go by; trust the global check (--global-check) instead"
-        )
-
-
-def shortest(summary: Summary) -> Iterator[str]:
-    """The t_f that the limit on the torque would allow."""
-    from tuning.search import design
-
-    found = summary.get("shortest_t_f")
-    if found is not None:
-        yield design.text(found["limit"], found["theory"], found["simulated"])
 
 
 def comparison(summary: Summary) -> Table:

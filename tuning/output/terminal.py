@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from tuning.output import margin_sentences, sentences
+from tuning.output import margin_sentences, search_sentences, sentences
 
 
 class Progress:
@@ -83,18 +83,26 @@ def run(summary: dict[str, Any], kind: str, folder: Path) -> None:
     """Metrics and verdicts of one run, as its `summary.json` says; kind: of its plant."""
     say(*sentences.run_lines(summary))
     table(sentences.run(summary, kind))
-    say(*map(sentences.verdict, sentences.run_verdicts(summary, kind)), f"results in {folder}")
+    say(
+        *map(sentences.verdict, sentences.run_verdicts(summary, kind)),
+        *sentences.cautions(summary),
+        f"results in {folder}",
+    )
 
 
 def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
     """What a tuning run found, as its `summary.json` says."""
     say(f"tuning {how}; {sentences.tuning_heading(summary)}:")
     table(sentences.tuning(summary))
-    say(*sentences.accuracy(summary), *sentences.search(summary), *sentences.trust(summary))
-    say(*map(sentences.verdict, summary["verdicts"]), *sentences.shortest(summary))
+    say(*sentences.accuracy(summary), *search_sentences.search(summary), *search_sentences.trust(summary))
+    say(
+        *map(sentences.verdict, summary["verdicts"]),
+        *search_sentences.advice(summary),
+        *search_sentences.shortest(summary),
+    )
     if summary["status"] == "interrupted":
         say("interrupted: these are the best gains so far; the same command goes on from here")
-    say(f"results in {folder}")
+    say(*sentences.cautions(summary), f"results in {folder}")
 
 
 def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
@@ -102,14 +110,14 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
     table(sentences.comparison(summary))
-    say(*sentences.comparison_lines(summary), f"results in {folder}")
+    say(*sentences.comparison_lines(summary), *sentences.cautions(summary), f"results in {folder}")
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
     """A front of accuracy against torque, as its `summary.json` says."""
     say(f"front {how}: {sentences.front_heading(summary)}")
     table(sentences.front(summary))
-    say(*sentences.front_lines(summary), f"results in {folder}")
+    say(*sentences.front_lines(summary), *sentences.cautions(summary), f"results in {folder}")
 
 
 def say(*lines: str) -> None:

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within, over
 from tuning.search import flights
 from tuning.search.objective import Problem
 
 FRESH = 1000  # trials on which gains are judged, at least
 FEWEST, TIMES = 4096, 8  # trials to count on: this many, and so many times what the gains are judged on
+SHOWN = 2  # times the fewest trials that can show a quantile: some may then break its limit
 SURE = 0.98  # probability that gains which are confirmed are met by the verdict
 
 
@@ -34,13 +35,16 @@ class Count:
 def fresh_trials(requirements: Sequence[Requirement]) -> int:
     """Trials to judge on: enough to show every quantile that is asked for, with some beyond the limit."""
     needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([FRESH, *(2 * count for count in needed)])
+    return max([FRESH, *(SHOWN * count for count in needed)])
 
 
 def training_trials(requirements: Sequence[Requirement], wanted: int) -> int:
-    """Trials to tune on: those wanted, or the fewest that can show every quantile that is asked for."""
+    """Trials to tune on: those wanted, or as many as show every quantile that is asked for with some beyond the limit.
+
+    With the fewest that can show it every single one would have to keep the limit: 99 % with 95 % takes 299.
+    """
     needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([wanted, *needed])
+    return max([wanted, *(SHOWN * count for count in needed)])
 
 
 def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) -> float:
@@ -76,7 +80,7 @@ def count(
     found = []
     for requirement in requirements:
         values = np.where(flown.finished, getattr(flown.metrics, requirement.metric), np.inf)
-        ratio = np.where(np.isnan(values), np.inf, values) / requirement.limit
+        ratio = over(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
         order = np.argsort(-ratio, kind="stable")
         beyond = int(np.sum(ratio > 1.0))
         most = allowed(requirement, fresh, numbers.size)

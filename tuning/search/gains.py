@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
-from ptsmc_jax.scenario import keys
+from ptsmc_jax.scenario import disturbance_bounds, keys, reading
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.layouts import SCENARIOS
@@ -144,7 +144,7 @@ def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
 
 
 def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
-    """The scenario with other gains, checked; with another t_f the time after it is kept, unless it was free."""
+    """The scenario with other gains, checked; all else stays, defaults too, and with another t_f the time after it."""
     changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
     changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
     each = _each(gains, list(getattr(scenario.observer, "gain", ())))
@@ -155,20 +155,21 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
     if "t_f" in gains:
         assert scenario.loop.t_end is not None
         changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)
-    return scenarios.replace(scenario, **changes)
+    return scenarios.replace(reading.settled(scenario), **changes)
 
 
 def of_paper(scenario: Scenario) -> dict[str, float]:
     """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; a smooth sign 1e-3 wide.
 
-    delta is a period or more, and half of t_f or less where a period is.
+    delta is a period or more, and half of t_f or less where a period is; the observer's gain is that of this body.
     """
     shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
     delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
     gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
     if scenario.motion == "chain":
         gains["eta"] = scenario.order + 1.0
-    return {**gains, "observer_gain": 10.0} if isinstance(scenario.observer, NonlinearObserver) else gains
+    gain = {"observer_gain": disturbance_bounds.observer_gain(scenario)}
+    return {**gains, **gain} if isinstance(scenario.observer, NonlinearObserver) else gains
 
 
 def papers(scenario: Scenario) -> Scenario:

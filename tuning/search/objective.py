@@ -16,6 +16,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
+from ptsmc_jax.simulation.requirements import over as near
 from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.flights import Fleet
 from tuning.search.gains import with_gains
@@ -215,7 +216,7 @@ def judge(
     if rules.torque_weight:
         weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
     rows = [
-        _asked(judged(one / limit, status) - 1.0, least, rules.averaged, counted[rules.averaged :])
+        _asked(judged(near(one, limit, at_least=False), status) - 1.0, least, rules.averaged, counted[rules.averaged :])
         for one, limit, least, counted in zip(limited, rules.limits, rules.least, rules.counted, strict=True)
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.simulation.requirements import Requirement
+from ptsmc_jax.simulation.requirements import Requirement, over
 from tuning.search import flights
 from tuning.search.flights import Fleet
 from tuning.search.objective import FAILED, Problem, judged, watched
@@ -55,7 +55,7 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
     """Trials that no search has averaged, and how near each comes to its limits, (trials,) metric / limit."""
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
     flown = flights.trials(problem.others(trials), gains)
-    ratios = np.stack([getattr(flown.metrics, r.metric) / r.limit for r in requirements])
+    ratios = np.stack([over(getattr(flown.metrics, r.metric), r.limit, at_least=False) for r in requirements])
     return trials, np.max(np.where(flown.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
 
@@ -88,7 +88,9 @@ def hardest(
     reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
     one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
     metrics, code, _, values, _ = jax.tree.map(lambda v: v[0, 0], flights.fly(one, gains[None]))
-    reached = [float(getattr(metrics, name)) / float(limit) for name, limit in zip(names, limits, strict=True)]
+    reached = [
+        float(over(getattr(metrics, name), limit, at_least=False)) for name, limit in zip(names, limits, strict=True)
+    ]
     ratios = [np.inf if np.isnan(one) else one for one in reached]  # it has no value: it never settles, say
     worst = int(np.argmax(ratios))
     return Hardest(
@@ -126,11 +128,11 @@ def climb(
         seen = jax.tree.map(
             lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, some)
         )
-        found = jnp.asarray(seen.metrics[:, columns] / limit), jnp.asarray(seen.status[:, None])
+        found = jnp.asarray(over(seen.metrics[:, columns], limit, at_least=False)), jnp.asarray(seen.status[:, None])
         ratios = np.asarray(judged(*found))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
         slope = np.take_along_axis(seen.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
-        slopes.append(np.where(value[:, None] < FAILED, slope / limit[nearest][:, None], 0.0))
+        slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
     return value, np.concatenate(slopes, axis=1)[:, :count]
 
 

@@ -16,7 +16,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import STATUS
@@ -108,6 +108,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "verdicts": told,
         "quantiles": found,
         "drivers": drivers,
+        "cautions": cautions.of(folder.scenario),
     }
 
 

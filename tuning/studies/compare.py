@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import errors, own, parsing, replace, study, systems, tables
+from ptsmc_jax.scenario import cautions, errors, own, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -238,6 +238,7 @@ def summary(made: Comparison) -> dict[str, Any]:
         "judged_on": tuner.judged_on(made.contenders.get(OURS, first).flown),
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(one) for law, one in made.contenders.items()},
+        "cautions": list(dict.fromkeys(said for one in made.contenders.values() for said in cautions.of(one.flown))),
     }
 
 

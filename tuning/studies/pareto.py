@@ -17,7 +17,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.scenario import own, parsing, study
+from ptsmc_jax.scenario import cautions, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Limit, Scenario
@@ -281,6 +281,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "points": [said(point) for point in front.points],
         **{name: said(point) for name, point in front.others.items()},
         "paper_refused": front.paper_refused,
+        "cautions": cautions.of(scenario),
     }
 
 

@@ -7,11 +7,11 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.scenario import own, parsing
+from ptsmc_jax.scenario import cautions, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
 
-def summary(run: Run) -> dict[str, Any]:
+def summary(run: Run, scenario: Scenario) -> dict[str, Any]:
     """What `summary.json` says."""
     verdicts = {
         v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least}
@@ -19,7 +19,7 @@ def summary(run: Run) -> dict[str, Any]:
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     floor = None if run.floor is None else run.floor.window_error
-    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts}
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": cautions.of(scenario)}
 
 
 def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool) -> None:
@@ -27,7 +27,7 @@ def write(folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | No
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     source = own.digests(scenario)
     store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
-    store.write_json(folder / "summary.json", summary(run))
+    store.write_json(folder / "summary.json", summary(run, scenario))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:

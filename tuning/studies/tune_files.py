@@ -12,13 +12,13 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import free_gains, own, parsing
+from ptsmc_jax.scenario import cautions, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
 from tuning.search import trust
 from tuning.search.descents import Step
-from tuning.studies.tuner import GOALS, Trust, Tuning, judged_on
+from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning, judged_on
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 
@@ -71,6 +71,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
         "judged_on": judged_on(tuning.tuned),
+        "cautions": cautions.of(tuning.tuned),
         "search": {
             "objective": tuning.tuned.tune.objective,
             "goal": found.value,
@@ -86,6 +87,8 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             if found.hardest is None
             else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
             "trials": np.asarray(found.problem.trials).tolist(),
+            "averaged": found.problem.averaged,
+            "asked": tuning.tuned.tune.trials,
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
@@ -122,7 +125,8 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]
             bound = tuning.tuned.tune.bounds[gain][side == "upper"]
-            influence[name] = free_gains.border(tuning.tuned, gain, side, bound) or "better beyond its bound"
+            known = free_gains.border(tuning.tuned, gain, side, bound)
+            influence[name] = known or _beyond(tuning.beyond.get(name), bound)
     slopes = believed.slope_error
     return {
         "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
@@ -131,6 +135,16 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
         "margins": believed.margins,
         "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
     }
+
+
+def _beyond(seen: Beyond | None, bound: float) -> str:
+    """What was measured beyond a bound, in words."""
+    if seen is None:
+        return f"on its bound {bound:g}; what lies beyond it was not flown"
+    if seen.better:
+        return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
+    why = "a requirement is broken" if not seen.met else f"{seen.times:.3g} times the error"
+    return f"no better beyond its bound: {why} at {seen.value:g}"
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:

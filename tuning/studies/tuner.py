@@ -12,7 +12,7 @@ from ptsmc_jax.campaigns import margin_verdicts, montecarlo, runs
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.numerics import draws
-from ptsmc_jax.scenario import Study, replace, study, tables
+from ptsmc_jax.scenario import Study, free_gains, replace, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
@@ -46,6 +46,20 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class Beyond:
+    """What the fresh trials say of a gain that ended on its bound, a step beyond it, the others as they were found."""
+
+    value: float
+    times: float | None  # RMS window error there over that of the tuned gains; None: it has none
+    met: bool  # every requirement met there, and no trial failed
+
+    @property
+    def better(self) -> bool:
+        """More accurate there by more than what counts as nothing, with every requirement kept."""
+        return self.met and self.times is not None and self.times < 1.0 - trust.FLAT
+
+
+@dataclass(frozen=True)
 class Tuning:
     """A finished tuning run."""
 
@@ -63,6 +77,7 @@ class Tuning:
     verdicts: list[Verdict]  # of the tuned gains on the fresh trials
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
+    beyond: dict[str, Beyond]  # gains on a bound beyond which nothing is known, and what is there
     check: Check | None  # of a global search, if it was asked for
     rollouts: int  # trials flown in the search without slopes
     gradients: int  # and with
@@ -133,7 +148,8 @@ def tune(
     shortest = None
     if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
         shortest = shortest_time(tuned, limit, fresh_seed, fresh["tuned"].trial)
-    believed = None
+    believed, beyond = None, {}
+    at_bound = evaluate.bounds.at_bound(found.gains)
     if trusted and not found.interrupted:
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
         believed = Trust(
@@ -147,11 +163,13 @@ def tune(
             sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, wanted),
             margins=stability.worst(study(tuned)),
         )
+        beyond = _beyond(tuned, {name: side for name, side in at_bound.items() if not believed.profiles[name].flat},
+                         named, fresh["tuned"], fresh_seed)  # fmt: skip
     return Tuning(
         tuned=tuned,
         gains=named,
         search=found,
-        at_bound=evaluate.bounds.at_bound(found.gains),
+        at_bound=at_bound,
         training=training,
         fresh=fresh,
         paper_refused=refused,
@@ -162,11 +180,41 @@ def tune(
         verdicts=verdicts,
         shortest=shortest,
         trust=believed,
+        beyond=beyond,
         check=check,
         rollouts=rollouts,
         gradients=gradients,
         seconds=seconds,
     )
+
+
+def _beyond(
+    tuned: Scenario, at_bound: dict[str, str], named: dict[str, float], judged: Trials, fresh_seed: int
+) -> dict[str, Beyond]:
+    """Each gain on a bound that nothing is known of, a step beyond it on the fresh trials, where it may go there.
+
+    Of the sampled loop, where what is minimised is an error.
+    """
+    found = {}
+    assert tuned.tune is not None
+    if tuned.loop.mode != "sampled" or tuned.tune.objective == T_F:
+        return found
+    for name, side in at_bound.items():
+        gain = gains.base(name)
+        value = free_gains.beyond(tuned, gain, side)
+        if value is None:
+            continue
+        try:
+            other = gains.in_scenario(tuned, {**named, name: value})
+            study(as_flown(other))
+        except ScenarioError:  # it may not
+            continue
+        trials = judge(other, fresh_seed, study(as_flown(other)).requirements)
+        both = trials.finished & judged.finished
+        there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged))
+        met = all(v.met for v in verdicts_of(other, trials, fresh_seed)) and bool(np.all(trials.ok))
+        found[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, met)
+    return found
 
 
 def _prepare(scenario: Scenario) -> None:

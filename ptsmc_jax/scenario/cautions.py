@@ -1,0 +1,66 @@
+"""What is odd about a scenario though it flies: bounds far off its disturbance, an estimate that is mostly noise."""
+
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.scenario import disturbance_bounds, errors
+from ptsmc_jax.scenario.tables import Scenario
+
+FAR = 10.0  # times off, from which on a stated bound is said to be
+
+
+def of(scenario: Scenario) -> list[str]:
+    """Sentences, none where nothing is odd or code of one's own was not run yet."""
+    found = disturbance_bounds.of(scenario, scenario.inputs)
+    return [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
+
+
+def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
+    """Stated bounds that are more than ten times off what the disturbance reaches; only that which the law uses."""
+    name, follows = ("disturbance_rate_bound", fastest)
+    if scenario.observer.kind in ("none", "own"):
+        name, follows = ("disturbance_bound", largest)
+    stated = getattr(scenario.controller, name)
+    if stated is None or max(stated, follows) <= FAR * min(stated, follows):
+        return []
+    what = f"controller.{name} is {stated:g}, but [disturbance] as it is drawn reaches {follows:g}"
+    if stated > follows:
+        return [f"{what}: the law switches against what is not there, and chatters; leave the key out"]
+    return [f"{what}: the law need not hold it; leave the key out"]
+
+
+def _noisy(scenario: Scenario, largest: float) -> list[str]:
+    """An estimate whose noise is larger than what it is to estimate."""
+    noise = estimate_noise(scenario)
+    if not noise > largest > 0.0:
+        return []
+    gain = scenario.observer.gain
+    shown = errors.brief(gain[0] if len(set(gain)) == 1 else gain)
+    return [
+        f"observer.gain is {shown}, with which the estimate has {noise:.2g} of noise (1 sigma), more than the "
+        f"disturbance that it estimates, at most {largest:g}: look at a smaller gain"
+    ]
+
+
+def estimate_noise(scenario: Scenario) -> float:
+    """Noise of the estimate of an observer with a constant gain l [N m, 1 sigma], on the noisiest axis; 0: none known.
+
+    A sample says d + J (n_k+1 - n_k) / h, n the noise of the rate, of sigma; what is left of an estimate after a period
+    is E = e^(-l h / J). Of that first-order filter of a difference is left J sigma / h (1 - E) (2 / (1 + E))^(1/2).
+    """
+    gains, loop = getattr(scenario.observer, "gain", None), scenario.loop
+    if scenario.observer.kind not in ("nonlinear", "prescribed_time") or gains is None or loop.mode != "sampled":
+        return 0.0
+    known: Any = scenario
+    if scenario.motion == "spacecraft":
+        inertia = np.asarray(known.spacecraft.inertia, dtype=float)
+        moments = inertia if inertia.ndim == 1 else np.diag(inertia)
+        sigmas = np.full(3, scenario.devices.gyro_noise(loop.period))
+    else:
+        noise = getattr(scenario.hardware, "state_noise", None)
+        if noise is None or scenario.plant.kind != "chain":  # the matrix M of a system of one's own is not known here
+            return 0.0
+        moments, sigmas = np.ones(1), np.asarray(noise[-1:])
+    left = np.exp(-np.asarray(gains) * loop.period / moments)
+    return float(np.max(moments * sigmas / loop.period * (1.0 - left) * np.sqrt(2.0 / (1.0 + left))))

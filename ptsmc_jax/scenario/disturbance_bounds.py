@@ -1,0 +1,132 @@
+"""The bounds of Assumption 1 that follow from a scenario's disturbance and from what is drawn of it.
+
+K bounds each component of d, c each component of d'. The paper's own, 0.01 N m and 1e-3 N m/s, are those of its Case I:
+0.01 sin(0.1 t). Each disturbance says its own in its table; they add up over a sum.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ptsmc_jax.scenario.gain_bounds import rounded, size
+
+RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
+SIGMAS = 3.0  # of what is normal, and has no largest value
+POINTS = 2001  # of the run along which a disturbance of one's own is looked at
+
+
+class Bounds(NamedTuple):
+    """Largest size and rate of a disturbance, component by component."""
+
+    size: np.ndarray  # (m,) of d [N m, or unit of d]
+    rate: np.ndarray  # (m,) of d' [the same per second]
+
+
+def of(scenario: Any, inputs: int) -> tuple[float, float] | None:
+    """K and c of the disturbance of a plant with so many inputs; None: it is one's own, and its code was not run."""
+    found = [term.bounds(scenario, inputs) for term in scenario.terms]
+    if any(one is None or one.size.shape != (inputs,) for one in found):  # of another length: `checks` refuses it
+        return None
+    largest = sum((one.size for one in found), np.zeros(inputs)) + _drawn_bias(scenario)
+    fastest = sum((one.rate for one in found), np.zeros(inputs))
+    return rounded(float(np.max(largest))), rounded(float(np.max(fastest)))
+
+
+def drawn_factor(scenario: Any) -> float:
+    """By how much a drawn amplitude is larger than the scenario's, at most."""
+    drawn = getattr(scenario.dispersion, "disturbance_amplitude", None)
+    return 1.0 if drawn is None else 1.0 + drawn.farthest * getattr(drawn, drawn.width)
+
+
+def _drawn_bias(scenario: Any) -> float:
+    drawn = getattr(scenario.dispersion, "disturbance_bias", None)
+    return 0.0 if drawn is None else drawn.farthest * getattr(drawn, drawn.width)
+
+
+def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
+    """A rate c [unit of d/s] for a random walk of this density, which has no largest one.
+
+    Three sigma of what it changes by while the default observer forgets, 1 / RATE, over that time: so large are then
+    the errors of the estimate that K2 = c J / l covers.
+    """
+    forgets = 1.0 / observer_rate(scenario)
+    return SIGMAS * density / math.sqrt(forgets)
+
+
+def observer_rate(scenario: Any) -> float:
+    """Rate l / J of an observer whose gain is not given [1/s]: the paper's, 10 without a body, at most one a period."""
+    rate = 10.0 if scenario.moments[0] is None else RATE
+    return min(rate, 1.0 / scenario.loop.period) if scenario.loop.mode == "sampled" else rate
+
+
+def observer_gain(scenario: Any) -> float:
+    """An observer's gain l where none is given: 10 N m s times J over the paper's 12 kg m^2, to one digit."""
+    if scenario.moments[0] is None:
+        return observer_rate(scenario)
+    return float(f"{observer_rate(scenario) * 12.0 * size(scenario):.1g}")
+
+
+def turning(scenario: Any) -> float:
+    """How fast a body turns, about [rad/s]: as it starts, twice as fast as half a turn until t_f, and as its target."""
+    target = sum(scenario.reference.frequencies().values())
+    return scenario.turning + target + 2.0 * math.pi / scenario.controller.t_f
+
+
+def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
+    """Of 3 n^2 c x J c, c a unit vector: |c x J c| <= (J_3 - J_1)/2, and c x J c changes by J_3 - J_1 times |c'|.
+
+    J_1 and J_3 are the smallest and the largest principal moment of the true body, three sigma apart where drawn; c
+    moves in the body's axes as the orbit and the body turn.
+    """
+    table = scenario.spacecraft
+    inertia = np.asarray(table.inertia if table.true_inertia is None else table.true_inertia, dtype=float)
+    moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
+    drawn = getattr(scenario.dispersion, "inertia", None)
+    off = 0.0 if drawn is None else SIGMAS * drawn.std
+    apart = moments[2] * (1.0 + off) - moments[0] * (1.0 - off)
+    most = 3.0 * orbit_rate**2 * apart
+    return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
+
+
+def along_the_run(scenario: Any, signal: Any, inputs: int) -> Bounds:
+    """Of a disturbance of one's own d(t, x): its largest size and rate on the way from the start to the target.
+
+    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    t = np.linspace(0.0, float(scenario.loop.t_end), POINTS)
+    left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
+    states = left[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _attitudes(scenario, t, left)
+    try:
+        acting = np.asarray(jax.vmap(signal)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
+    except Exception:  # which `own_checks` refuses before a flight, in one sentence
+        acting = np.zeros(0)
+    if acting.shape != (POINTS, inputs) or not np.all(np.isfinite(acting)):
+        return Bounds(np.zeros(inputs), np.zeros(inputs))
+    return Bounds(np.max(np.abs(acting), axis=0), np.max(np.abs(np.gradient(acting, t, axis=0)), axis=0))
+
+
+def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
+    """States of the body on that way."""
+    import jax
+    import jax.numpy as jnp
+
+    from ptsmc_jax.numerics import attitude
+    from ptsmc_jax.plants.rigid_body import AttitudeState
+    from ptsmc_jax.scenario import attitude_keys
+
+    reference = scenario.reference.build()
+    target = jax.vmap(lambda time: reference(time).q)(jnp.asarray(t))
+    start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))
+    off = attitude.multiply(attitude.conjugate(target[0]), start)
+    off = off * jnp.where(off[3] < 0.0, -1.0, 1.0)
+    turned = attitude.rotation_vector(off[:3])
+    q = jax.vmap(lambda one, share: attitude.multiply(one, attitude.from_rotation_vector(share * turned)))(
+        target, jnp.asarray(left)
+    )
+    q_dot = jnp.asarray(np.gradient(np.asarray(q), t, axis=0))
+    w = 2.0 * jax.vmap(lambda one, rate: attitude.multiply(attitude.conjugate(one), rate)[:3])(q, q_dot)
+    return AttitudeState(q, w)

@@ -1,0 +1,246 @@
+"""Defaults that follow from what is flown: bounds on the disturbance, the observer's gain; what is odd is said."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.observers.nonlinear import NonlinearObserver
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.scenario import build, cautions, disturbance_bounds, free_gains, parsing, reading
+from ptsmc_jax.signals.disturbances import Disturbance
+from tests.helpers import FULL_INERTIA
+from tuning.search import gains
+
+CUBESAT = [0.05, 0.08, 0.11]
+SAMPLED = {"mode": "sampled", "period": 0.1}
+
+
+def free(said):
+    assert said.tune is not None
+    assert said.tune.free is not None
+    return said.tune.free
+
+
+def bounds(**tables):
+    law = reading.complete(scenario.from_tables(tables)).controller
+    return law.disturbance_bound, law.disturbance_rate_bound
+
+
+def reached(disturbance, dispersion=None, count=400, spacecraft=None):
+    """Largest component of d and of d' over drawn times, phases and factors, by finite differences."""
+    tables = {"disturbance": disturbance, "dispersion": dispersion or {}, "spacecraft": spacecraft or {}}
+    ready = scenario.study(scenario.from_tables(tables))
+    t = np.linspace(0.0, 40.0, 8001)
+    size = rate = 0.0
+    for k in range(count):
+        drawn = ready.dispersion.apply(ready.parts, np.uint32(0), np.uint32(k))
+        d = np.asarray(jax.vmap(lambda time, part=drawn: part.disturbance(time, part.initial))(jnp.asarray(t)))
+        size, rate = max(size, np.abs(d).max()), max(rate, np.abs(np.gradient(d, t, axis=0)).max())
+    return size, rate
+
+
+def test_the_papers_own_follow_from_its_case_and_its_chains():
+    """Case I: 0.01 sin(0.1 t) on the paper's body; Figs. 1 and 2: 0.01 sin(t)."""
+    assert bounds() == (0.01, 1e-3)
+    assert scenario.from_tables({}).observer.gain == (10.0, 10.0, 10.0)
+    assert bounds(plant={"kind": "chain"}) == (0.01, 0.01)
+    assert bounds(disturbance={"kind": "none"}) == (0.0, 0.0)
+
+
+def test_a_sinusoid_reaches_amplitude_and_bias_and_amplitude_times_frequency():
+    table = {
+        "kind": "sinusoid",
+        "amplitude": [2e-3, 1e-3, 0.0],
+        "frequency": [1.0, 3.0, 9.0],
+        "bias": [0.0, -4e-3, 1e-3],
+    }
+    assert bounds(disturbance=table) == (5e-3, 3e-3)
+    assert reached(table, count=1) == pytest.approx((5e-3, 3e-3), rel=1e-3)  # 2.5 mrad of the fastest a step
+
+
+def test_what_is_drawn_counts():
+    """Factors truncated at three sigma, or uniform; a bias at three sigma; of any phase."""
+    table = {"kind": "sinusoid", "amplitude": [1e-3] * 3, "frequency": [1.0] * 3}
+    drawn = {
+        "disturbance_amplitude": {"kind": "relative_uniform", "half_width": 0.5},
+        "disturbance_phase": {"kind": "uniform"},
+        "disturbance_bias": {"kind": "uniform", "half_width": 2e-3},
+    }
+    assert bounds(disturbance=table, dispersion=drawn) == (3.5e-3, 1.5e-3)
+    seen = reached(table, drawn, count=60)
+    assert 0.9 * 3.5e-3 < seen[0] <= 3.5e-3  # the largest of 180 draws of two uniform numbers each
+    assert 0.9 * 1.5e-3 < seen[1] <= 1.5e-3
+    normal = {"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1},
+              "disturbance_bias": {"kind": "normal", "std": 1e-3}}  # fmt: skip
+    assert bounds(disturbance=table, dispersion=normal) == (4.3e-3, 1.3e-3)
+
+
+def test_several_disturbances_add_up_component_by_component():
+    terms = [{"kind": "constant", "amplitude": [3e-3, 0.0, 0.0]},
+             {"kind": "sinusoid", "amplitude": [0.0, 4e-3, 0.0], "frequency": [1.0] * 3}]  # fmt: skip
+    assert bounds(disturbance={"kind": "sum", "terms": terms}) == (4e-3, 4e-3)
+
+
+def test_the_gravity_gradient_reaches_what_its_moments_allow():
+    """The largest c x J c over all c is half the difference of the moments; it changes by at most that times |c'|."""
+    n, inertia = 1.1e-3, np.asarray(FULL_INERTIA)
+    apart = np.ptp(np.linalg.eigvalsh(inertia))
+    rng = np.random.default_rng(0)
+    c, along = rng.normal(size=(2, 20000, 3))
+    c /= np.linalg.norm(c, axis=1, keepdims=True)
+    along -= np.sum(along * c, axis=1, keepdims=True) * c
+    along /= np.linalg.norm(along, axis=1, keepdims=True)  # c' at unit rate
+    torque = np.linalg.norm(np.cross(c, c @ inertia), axis=1).max()
+    changes = np.linalg.norm(np.cross(along, c @ inertia) + np.cross(c, along @ inertia), axis=1).max()
+    assert 0.99 < torque / (0.5 * apart) <= 1.0  # of 20000 directions the nearest are 1 degree off
+    assert 0.98 < changes / apart <= 1.0
+    tables = {"spacecraft": {"inertia": FULL_INERTIA}, "disturbance": {"kind": "gravity_gradient", "orbit_rate": n}}
+    size, rate = bounds(**tables)
+    assert size == pytest.approx(1.5 * n**2 * apart, rel=1e-3)
+    turns = n + 2 * np.pi / 30.0
+    assert rate == pytest.approx(3 * n**2 * apart * turns, rel=1e-3)
+
+
+def test_a_random_walk_counts_with_three_sigma():
+    """Of where it is at t_end, and of what it changes by while the observer forgets, 1.2 s, over that time."""
+    table = {"kind": "random_walk", "density": [1e-5, 2e-5, 0.0]}
+    size, rate = bounds(disturbance=table, loop=SAMPLED)
+    assert size == pytest.approx(3 * 2e-5 * np.sqrt(40.0), rel=1e-3)
+    assert rate == pytest.approx(3 * 2e-5 / np.sqrt(1.2), rel=1e-3)
+    rng = np.random.default_rng(1)  # what such an observer is off by: 3 sigma are c J / l = c 1.2 s, over sqrt(2)
+    h, off = 0.1, np.zeros(4000)
+    for _ in range(400):
+        off = np.exp(-h / 1.2) * (off + 2e-5 * np.sqrt(h) * rng.normal(size=off.size))
+    assert np.std(off) < rate * 1.2 / 3 < 2 * np.std(off)
+
+
+class Wobble(Disturbance):
+    """Of one's own: 0.02 sin(0.3 t) about x, and what grows with the rate about y."""
+
+    share: float = 0.1
+
+    def __call__(self, t, x):
+        """Torque (3,) [N m]."""
+        return jnp.stack([0.02 * jnp.sin(0.3 * t), self.share * jnp.sum(x.w**2), 0.0 * t])
+
+
+def test_ones_own_is_looked_at_along_the_nominal_run():
+    table = {"kind": "own", "code": Wobble, "share": 0.0}
+    assert bounds(disturbance=table) == pytest.approx((0.02, 6e-3), rel=1e-3)
+    angle = 2.0 * np.arccos(0.5773502691896258)  # until t_f, fastest at the start, three times the mean rate
+    largest, _ = bounds(disturbance={**table, "share": 10.0})
+    assert largest == pytest.approx(10.0 * (3.0 * angle / 30.0) ** 2, rel=0.02)
+    assert (
+        scenario.from_tables({"disturbance": {"kind": "own", "code": "any.py:D"}}).controller.disturbance_bound is None
+    )
+
+
+def test_the_observers_gain_follows_body_and_period():
+    def gain(**tables):
+        (value,) = set(scenario.from_tables(tables).observer.gain)
+        return value
+
+    assert gain(spacecraft={"inertia": CUBESAT}) == 0.07  # 10 / 12 of 0.08 kg m^2
+    assert gain(spacecraft={"inertia": FULL_INERTIA}) == 9.0  # 34 / 3 kg m^2
+    assert gain(loop={"mode": "sampled", "period": 4.0, "window": 4.0}) == 3.0  # 12 / 4
+    assert gain(plant={"kind": "chain"}, observer={"kind": "nonlinear"}) == 10.0
+    cubesat = scenario.from_tables({"spacecraft": {"inertia": CUBESAT}})
+    assert gains.of_paper(cubesat)["observer_gain"] == 0.07
+
+
+def test_bounds_that_are_given_stay():
+    given = {"disturbance_rate_bound": 2e-3, "disturbance_bound": 0.0}
+    assert bounds(controller=given) == (0.0, 2e-3)
+
+
+def test_what_is_not_said_follows_what_is_replaced():
+    """Bounds of gains follow the period, t_end t_f, bounds on the disturbance the disturbance; what is said stays."""
+    said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.1, 5.0]}}})
+    slow = scenario.replace(said, loop__period=0.5, controller__t_f=45.0)
+    assert slow.tune is not None
+    assert slow.controller.delta == slow.tune.bounds["delta"][0] == 0.5
+    assert slow.tune.bounds["eta"] == (2.1, 5.0)
+    assert slow.loop.t_end == 55.0
+    assert scenario.replace(said, disturbance__amplitude=[0.02] * 3).controller.disturbance_bound == 0.02
+    assert "observer_gain" not in free(scenario.replace(said, observer__kind="none"))
+    assert scenario.replace(slow, loop__t_end=50.0, controller__t_f=30.0).loop.t_end == 50.0
+    assert scenario.from_tables(parsing.dump(slow)) == slow
+    assert scenario.from_tables(parsing.stated(slow)) == slow
+
+
+def test_gains_set_in_a_scenario_move_nothing_else():
+    walk = {"kind": "random_walk", "density": [1e-5] * 3}
+    said = scenario.from_tables({"loop": SAMPLED, "tune": {}, "disturbance": walk})
+    tuned = gains.in_scenario(said, {"eta": 4.0, "observer_gain": 100.0})
+    assert tuned.tune == said.tune
+    assert tuned.controller.disturbance_rate_bound == said.controller.disturbance_rate_bound
+
+
+NOISY = {"loop": SAMPLED, "spacecraft": {"inertia": CUBESAT}, "hardware": {"rate_noise": 1e-4}}
+QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        ({}, []),
+        ({"controller": {"disturbance_rate_bound": 9e-3}}, []),
+        ({"controller": {"disturbance_rate_bound": 0.011}}, ["rate_bound is 0.011", "reaches 0.001: the law"]),
+        ({"controller": {"disturbance_rate_bound": 9e-5}}, ["disturbance_rate_bound is 9e-05", "need not hold it"]),
+        ({"controller": {"disturbance_bound": 1.0}}, []),  # which an observer has no use for
+        ({"controller": {"disturbance_bound": 1.0}, "observer": {"kind": "none"}}, ["bound is 1", "chatters"]),
+        ({"controller": {"disturbance_rate_bound": 1e-3}, "disturbance": QUIET}, ["reaches 0: the law switches"]),
+        ({**NOISY, "disturbance": QUIET}, ["observer.gain is 0.07", "more than the disturbance", "at most 1e-06"]),
+        ({**NOISY, "disturbance": QUIET, "observer": {"gain": [1e-4] * 3}}, []),
+        ({**NOISY, "disturbance": {"kind": "none"}}, []),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_is_odd_is_said(tables, said):
+    found = cautions.of(scenario.from_tables(tables))
+    assert len(found) == bool(said)
+    assert all(words in found[0] for words in said)
+
+
+def test_the_noise_of_an_estimate_is_that_of_the_observer_itself():
+    """The digital observer on 40000 samples of noise alone: 3 axes, one of them 1 % off at most by chance (3 sigma)."""
+    gain, h, sigma = [0.05, 0.2, 1.0], 0.1, 1e-4
+    tables = {**NOISY, "observer": {"gain": gain}}
+    observer = NonlinearObserver(rigid_body.spacecraft(CUBESAT), vector(gain), vector(0.0), vector(0.0))
+    n = sigma * np.random.default_rng(0).normal(size=(40001, 3))
+    impulses, matrix = jnp.asarray(np.asarray(CUBESAT) * np.diff(n, axis=0)), observer.update_matrix(vector(h))
+
+    def step(memory, impulse):
+        new = observer.update(matrix, memory, impulse, vector(0.0), vector(h))
+        return new, new
+
+    _, estimates = jax.lax.scan(step, jnp.zeros(3), impulses)
+    assert np.std(np.asarray(estimates)[200:], axis=0).max() == pytest.approx(
+        cautions.estimate_noise(scenario.from_tables(tables)), rel=0.02
+    )
+
+
+def test_how_far_beyond_a_bound_is_looked_at():
+    """A tenth of the interval, none where it is known what lies there, never beyond what is allowed."""
+    said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.05, 8.0], "delta": [0.1, 10.0]}}})
+    assert free_gains.beyond(said, "eta", "upper") == pytest.approx(8.595)
+    assert free_gains.beyond(said, "eta", "lower") == pytest.approx(2.025)  # half way to 2, which is not allowed
+    assert free_gains.beyond(said, "delta", "upper") == pytest.approx(10.0 * 100.0**0.1, rel=1e-3)
+    assert free_gains.beyond(said, "delta", "lower") is None  # a period: there is none shorter
+    assert free_gains.beyond(said, "observer_gain", "upper") is None  # dead-beat
+
+
+def test_the_disturbance_that_is_built_keeps_within_its_bounds():
+    """Along a whole run of the wobbly gravity gradient, which the bounds must hold for."""
+    tables = {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-2}, "initial": {"rate": [0.05, 0.0, 0.02]}}
+    said = scenario.from_tables(tables)
+    known = disturbance_bounds.of(said, said.inputs)
+    assert known is not None
+    size, rate = known
+    signal, _ = build.disturbance(said, rigid_body.spacecraft([10.0, 12.0, 14.0]))
+    found = disturbance_bounds.along_the_run(said, signal, 3)
+    assert 0.2 * size < found.size.max() <= size
+    assert found.rate.max() <= rate

@@ -1,0 +1,68 @@
+"""Limits in an engineer's units, limits of zero, and the share of a limit that a verdict names."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario.tables import Limit
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Requirement, over
+from tuning.output import page
+from tuning.search import objective
+
+SAMPLED = {"mode": "sampled"}
+
+
+@pytest.mark.parametrize(
+    ("metric", "said", "value"),
+    [
+        ("hold_angle", "0.05 deg", 0.05 * math.pi / 180),
+        ("window_angle", "5 arcsec", 5 / 3600 * math.pi / 180),
+        ("terminal_angle", " 2  arcmin ", 2 / 60 * math.pi / 180),
+        ("peak_torque", "5 mN m", 5e-3),
+        ("peak_rate", "1e0 deg/s", math.pi / 180),
+        ("settling_time", "0.5 min", 30.0),
+        ("effort", 2, 2.0),
+    ],
+)
+def test_a_limit_may_have_its_unit(metric, said, value):
+    read = scenario.from_tables({"requirements": {metric: said}})
+    assert read.requirements == {metric: pytest.approx(value, rel=1e-15)}
+    share = scenario.from_tables({"requirements": {metric: {"limit": said, "quantile": 0.9}}}).requirements[metric]
+    assert isinstance(share, Limit)
+    assert (share.limit, share.quantile) == (pytest.approx(value, rel=1e-15), 0.9)
+    assert scenario.from_tables(parsing.dump(read)) == read
+
+
+def test_every_unit_of_a_spacecrafts_metrics_has_words():
+    assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} == set(catalogues.UNITS)
+
+
+def test_a_limit_of_zero_is_kept_by_zero_alone():
+    ready = scenario.study(scenario.from_tables({"requirements": {"saturated": 0}, "loop": SAMPLED}))
+    (requirement,) = ready.requirements
+    kept = requirement.verdict(np.zeros(3), np.ones(3, bool))
+    assert (kept.met, kept.margin) == (True, 0.0)
+    broken = requirement.verdict(np.array([0.0, 1e-6, 0.0]), np.ones(3, bool))
+    assert (broken.met, broken.failures) == (False, 1)
+    assert broken.margin > 1.0
+    np.testing.assert_array_equal(over(np.array([0.0, 0.2]), 0.0, at_least=False), [0.0, 1.2])
+    trials = objective.problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",), ready.requirements)
+    c = np.asarray(objective.measure(trials, vector([3.0]))[1])
+    np.testing.assert_array_equal(c, [[-1.0, -1.0]])  # no limit of the actuators: nothing saturates
+
+
+def test_a_page_says_the_share_of_what_decides():
+    """Of a share of the trials the one that decides, not the worst: of 0.3, 0.4, 0.45 and 0.7 the third."""
+    values = np.array([0.3, 0.4, 0.45, 0.7])
+
+    def told(quantile):
+        one = Requirement("peak_torque", 0.5, quantile=quantile).verdict(values, np.ones(4, bool))
+        return page._distance({name: getattr(one, name) for name in one.__dataclass_fields__})
+
+    assert told(0.75) == "; the trial that decides is at 0.45, 90 % of the limit"
+    assert told(None) == ", 140 % of the limit"

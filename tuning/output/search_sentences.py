@@ -1,0 +1,117 @@
+"""What the `summary.json` of a tuning run says of its search, in sentences."""
+
+import math
+from collections.abc import Iterator
+
+from tuning.output import margin_sentences
+from tuning.output.cells import Summary
+
+AGREE = 0.01  # slopes off from differences by more than this share say little
+
+
+def search(summary: Summary) -> Iterator[str]:
+    """How the search went."""
+    found = summary["search"]
+    for metric, ratio in found.get("largest_over_limit", {}).items():
+        if ratio is None or ratio > 1.0:
+            lost = ratio is None or math.isinf(ratio)
+            far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
+            yield f"no gains found within the bounds keep every limit: with these {far} in training"
+    if found.get("averaged", 0) > found.get("asked", math.inf):
+        yield (
+            f"tuned on {found['averaged']} trials, not tune.trials = {found['asked']}: on so few every single trial "
+            "would have to keep a limit that is asked for in a share of them with a confidence"
+        )
+    for one in found.get("confirmed", []):
+        most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
+        yield (
+            f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
+            f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
+            f"probability of {100 * one['probability']:.3g} %"
+        )
+    hardest = found.get("hardest")
+    if hardest is not None and hardest["unbounded"]:
+        moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
+        reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
+        yield (
+            f"worst case: {hardest['metric']} has none over {moved}, which {reach}; "
+            f"ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
+        )
+    elif hardest is not None:
+        far = "has no value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+        advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
+        yield f"worst case inside the dispersions: {hardest['metric']} {far}{advice}"
+    if "rollouts" in found:
+        yield (
+            f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
+            f"{found['seconds']:.0f} s"
+            + "".join(
+                f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
+            )
+        )
+    checked = summary.get("differential_evolution")
+    if checked is not None:
+        kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
+        beside = {
+            (True, True): f"the search is {100 * checked['distance']:+.2f} % from it",
+            (True, False): "breaks a limit, which the search keeps",
+            (False, True): "keeps every limit, unlike the search",
+            (False, False): "keeps not every limit either",
+        }[kept, checked["kept"]]
+        yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
+
+
+def advice(summary: Summary) -> Iterator[str]:
+    """What to change where fresh trials break a requirement that the search kept."""
+    found = summary["search"]
+    kept = {metric for metric, ratio in found["largest_over_limit"].items() if ratio is not None and ratio <= 1.0}
+    for told in summary["verdicts"]:
+        over = told["margin"]
+        if told["met"] or told["metric"] not in kept or told.get("at_least") or not told["limit"]:
+            continue
+        more = f"tune.trials = {4 * found.get('averaged', 256)}"
+        if over is None or not math.isfinite(over):
+            yield f"{told['metric']}: kept in the search, but fresh trials fail or lack it: tune with {more}"
+        else:
+            limit = f"{told['limit'] / (1.02 * over):.3g}"
+            yield (
+                f"{told['metric']}: kept in the search, but fresh trials reach {over:.3g} times the limit: tune with "
+                f"{more}, or with requirements.{told['metric']} = {limit}, by which these gains would keep it"
+            )
+
+
+def trust(summary: Summary) -> Iterator[str]:
+    """What the gains do, and whether the slopes are right."""
+    believed = summary.get("trust")
+    influence = {} if believed is None else believed["influence"]
+    for gain, side in summary["at_bound"].items():
+        if influence.get(gain) == "none":
+            continue
+        yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
+    for gain, how in influence.items():
+        if how == "none":
+            yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
+    if believed is None:
+        return
+    yield from margin_sentences.tuned(believed.get("margins"))
+    if believed["slopes_off_central_differences"] is None:
+        yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
+        return
+    off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
+    shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
+    if max(off.values(), default=0.0) <= AGREE:
+        yield f"slopes by automatic differentiation agree with differences to {shown}"
+    else:
+        yield (
+            f"slopes by automatic differentiation are off from differences by {shown}: the loop chatters or breaks off "
+            "there, and the descent had little to go by; trust the global check (--global-check) instead"
+        )
+
+
+def shortest(summary: Summary) -> Iterator[str]:
+    """The t_f that the limit on the torque would allow."""
+    from tuning.search import design
+
+    found = summary.get("shortest_t_f")
+    if found is not None:
+        yield design.text(found["limit"], found["theory"], found["simulated"])
