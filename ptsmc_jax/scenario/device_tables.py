@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -14,7 +15,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice, GainBounds
-from ptsmc_jax.scenario.values import Count, Kinds, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax.scenario.values import Count, Kind, Kinds, NotNegative, NotNegatives, Positive, Table, Three
 
 
 class Actuators(Table, frozen=True):
@@ -178,7 +179,7 @@ class StateHardware(Actuators, frozen=True):
         return None if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
-class FilterTable(Table, frozen=True):
+class FilterTable(Kind, frozen=True):
     """An attitude filter, or none."""
 
     on: ClassVar[bool] = True
@@ -215,6 +216,10 @@ class SteadyStateFilter(FilterTable, frozen=True):
     bandwidth: Positive | None = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": GainBounds(_usual_bandwidth)}
 
+    @staticmethod
+    def _noisy(table: Hardware) -> bool:
+        return bool(table.attitude_noise and (table.rate_noise or table.rate_noise_density))
+
     def width(self, scenario: Any) -> float:
         """Its bandwidth [rad/s]: where star tracker and gyro weigh the same, if none is given."""
         if self.bandwidth is not None:
@@ -223,11 +228,14 @@ class SteadyStateFilter(FilterTable, frozen=True):
         noises = table.attitude_noise or 0.0, table.gyro_noise(period)
         return formulas.best_bandwidth(*noises, period, table.interval(period))
 
+    def written(self, scenario: Any) -> Any:
+        """With its bandwidth, where there are noises that it follows from."""
+        noisy = self._noisy(scenario.devices)
+        return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
+
     def check(self, scenario: Any) -> None:
         """Noises that the bandwidth follows from."""
-        table = scenario.devices
-        noisy = table.attitude_noise and (table.rate_noise or table.rate_noise_density)
-        if self.bandwidth is None and not noisy:
+        if self.bandwidth is None and not self._noisy(scenario.devices):
             raise ScenarioError(
                 "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
             )

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario import disturbance_bounds
@@ -117,6 +118,11 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
         t_o = scenario.controller.t_f / 3 if self.t_o is None else self.t_o
         shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
         return t_o, min(shortest, t_o / 4) if self.delta_o is None else self.delta_o
+
+    def written(self, scenario: Any) -> Any:
+        """With its times."""
+        t_o, delta_o = self.times(scenario)
+        return msgspec.structs.replace(self, t_o=t_o, delta_o=delta_o)
 
     def check(self, scenario: Any) -> None:
         """It has converged before t_f."""

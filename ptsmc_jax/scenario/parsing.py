@@ -158,6 +158,11 @@ def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Map
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
+    """Tables for a file, with every key that follows from others; `parse` reads them back to what flies the same."""
+    return as_parsed(scenario.written())
+
+
+def as_parsed(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
     found = plain(scenario)
     tables = [name for name in TABLES[scenario.plant.kind] if name != "tune"]
@@ -165,7 +170,7 @@ def dump(scenario: Scenario) -> dict[str, Any]:
 
 
 def stated(scenario: Scenario) -> dict[str, Any]:
-    """The same without what the scenario's file did not say, and nobody changed since."""
+    """Tables for a file without what the scenario's file did not say, and nobody changed since."""
     tables = dump(scenario)
     for (*place, key), value in scenario.defaulted.items():
         table: Any = tables

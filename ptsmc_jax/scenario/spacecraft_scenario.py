@@ -4,6 +4,7 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 
 from ptsmc_jax import formulas
@@ -105,6 +106,11 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         if values.ndim == 1:
             return float(np.mean(values)), float(values.max())
         return float(np.mean(np.diag(values))), float(np.linalg.eigvalsh(values).max())
+
+    def written(self) -> Any:
+        """With the filter's keys too."""
+        found = super().written()
+        return found if self.filter is None else msgspec.structs.replace(found, filter=self.filter.written(self))
 
     def check_body(self) -> None:
         """A body that can be."""

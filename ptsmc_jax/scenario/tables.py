@@ -7,6 +7,7 @@ default. Errors, `ptsmc new` and the scenario reference are made from them.
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario.device_tables import NoFilter
@@ -169,6 +170,10 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def resolved(self) -> Any:
         """With the defaults of its plant that depend on other keys."""
         return self
+
+    def written(self) -> Any:
+        """With every key that follows from others where it is absent, as files have it."""
+        return msgspec.structs.replace(self, observer=self.observer.written(self))
 
     def check_body(self) -> None:
         """Raise ScenarioError where there is no such body: before defaults follow from it."""

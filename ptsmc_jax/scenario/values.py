@@ -48,6 +48,10 @@ class Kind(Table, frozen=True):
         """What the numbers of `each` are multiplied by."""
         return 1.0
 
+    def written(self, scenario: Any) -> Any:
+        """With its keys that follow from others of a checked scenario."""
+        return self
+
     def filled(self, scenario: Any, inputs: int) -> Any:
         """With its lists where they are absent."""
         scale = self.scale(scenario)

@@ -3,6 +3,7 @@ import copy
 import tomllib
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -482,3 +483,26 @@ def test_what_is_dumped_loads_to_the_same_scenario(tmp_path_factory, tables):
     again = read(path)
     assert again == scenario
     assert is_in(tables, parsing.dump(again))  # to the last bit
+
+
+@pytest.mark.parametrize(
+    ("text", "table", "keys"),
+    [
+        ("observer.kind = 'prescribed_time'", "observer", ("t_o", "delta_o")),
+        (SAMPLED + "hardware = { attitude_noise = 2e-5, rate_noise = 1e-6 }\nfilter.kind = 'steady_state'",
+         "filter", ("bandwidth",)),
+    ],
+)  # fmt: skip
+def test_files_have_every_key_that_follows_from_others_and_fly_the_same(text, table, keys):
+    """In memory such keys go on following: another t_f moves t_o along, but not one that stands in a file."""
+    said = from_tables(tomllib.loads(text))
+    written = parsing.dump(said)
+    assert set(keys) <= written[table].keys()
+    assert not set(keys) & parsing.stated(said)[table].keys()
+    again = from_tables(written)
+    assert parsing.dump(again) == written
+    ours, theirs = (jax.tree.leaves(study(one).parts) for one in (said, again))
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one, other)
+    moved = [parsing.dump(replace(one, controller__t_f=21.0))["observer"].get("t_o") for one in (said, again)]
+    assert moved == ([7.0, 10.0] if table == "observer" else [None, None])

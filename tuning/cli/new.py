@@ -9,7 +9,6 @@ import msgspec
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.observer_tables import PrescribedTimeObserver
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Kind, Table
@@ -66,7 +65,7 @@ class _File:
 
     def __init__(self, said: Scenario, resolved: Scenario):
         self.resolved, self.plant = resolved, resolved.plant.kind
-        self.live = parsing.dump(said)
+        self.live = parsing.as_parsed(said)
         self.values = parsing.dump(resolved)
         # with the gains that are known without running code of one's own
         default = parsing.plain(free_gains.resolve(resolved, Tune()))
@@ -149,9 +148,7 @@ class _File:
         table: Any = struct(**needed)
         if isinstance(table, Kind):
             table = table.filled(self.resolved, self.resolved.inputs)
-        if isinstance(table, PrescribedTimeObserver):
-            t_o, delta_o = table.times(self.resolved)
-            table = msgspec.structs.replace(table, t_o=t_o, delta_o=delta_o)
+            table = table.written(self.resolved)
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
