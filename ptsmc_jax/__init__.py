@@ -56,9 +56,15 @@ _EXPORTS = {
     "system": "plants.second_order",
     "Study": "scenario",
     "study": "scenario",
+    "Reach": "scenario.timing",
+    "reach_of": "scenario.timing",
+    "one": "campaigns.montecarlo",
+    "run": "campaigns.montecarlo",
 }
 
 if TYPE_CHECKING:
+    from ptsmc_jax.campaigns.montecarlo import one as one
+    from ptsmc_jax.campaigns.montecarlo import run as run
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.variation import Dispersion as Dispersion
     from ptsmc_jax.explore import floor as floor
@@ -90,6 +96,8 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario import study as study
     from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
     from ptsmc_jax.scenario.tables import Scenario as Scenario
+    from ptsmc_jax.scenario.timing import Reach as Reach
+    from ptsmc_jax.scenario.timing import reach_of as reach_of
     from ptsmc_jax.signals.disturbances import Constant as Constant
     from ptsmc_jax.signals.disturbances import Disturbance as Disturbance
     from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid

@@ -26,6 +26,9 @@ _OPTIONS = (
 programs: Path | None = None
 
 
+_called = _said = False  # whether `configure` was, and whether it was said that it was not
+
+
 class NoDeviceError(ValueError):
     """A device that JAX does not find here. Its text is one sentence."""
 
@@ -57,14 +60,21 @@ def configure(
     flags = os.environ.get("XLA_FLAGS", "")
     if fast and "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
-    global programs
+    global programs, _called
+    _called = True
     programs = folder / "programs" if keep_programs and folder is not None else None
     import jax
 
     jax.config.update("jax_enable_x64", bits == 64)
     if device is not None:
         jax.config.update("jax_platforms", device)
-    jax.config.update("jax_num_cpu_devices", devices or _cores())
+    try:
+        jax.config.update("jax_num_cpu_devices", devices or _cores())
+    except RuntimeError:
+        raise RuntimeError(
+            "configure() comes too late: JAX has already run something in this process, on other devices; call it "
+            "first, right after the imports"
+        ) from None
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -100,6 +110,21 @@ def _tell_of_rejected_once(folder: Path) -> None:
 
     warnings.showwarning = showing
     warnings.filterwarnings("always", _REJECTED)
+
+
+def warn_if_forgotten() -> None:
+    """Say once that numbers have 32 bits where nobody asked for that."""
+    import jax
+
+    global _said
+    if not (_called or _said or jax.config.read("jax_enable_x64")):
+        _said = True
+        warnings.warn(
+            "JAX computes with 32 bits here, too few for errors below 1e-5: call ptsmc_jax.configure.configure() "
+            "first, right after the imports, or configure(bits=32) if that is meant",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def _cores() -> int:

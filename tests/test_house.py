@@ -84,7 +84,7 @@ HOUSE = {
             compare pareto tune_files
         """,
         "output": """
-            cells page_captions page_charts
+            cells page_captions page_charts progress_lines
             margin_sentences
             search_sentences sentences
             page terminal

@@ -1,12 +1,12 @@
 """Campaigns as matplotlib figures: the fan of the error, distributions, points by status; each returns a Figure."""
 
 from collections.abc import Mapping
-from itertools import combinations
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ptsmc_jax.figures.style import RC, STYLES, figure_of, plain_ticks
 from ptsmc_jax.simulation.catalogues import CATALOGUES
@@ -110,23 +110,32 @@ def torque_by_angle(
     return figure
 
 
-def pairs(inputs: Mapping[str, np.ndarray], outcome: np.ndarray, totals: Mapping[str, int]) -> Figure:
-    """Every two of the inputs against each other, a point a trial; see `torque_by_angle`."""
-    names = list(inputs)
+def inputs(
+    drawn: Mapping[str, np.ndarray],
+    found: Mapping[str, tuple[str, np.ndarray, float | None]],
+    outcome: np.ndarray,
+    totals: Mapping[str, int],
+) -> Figure:
+    """What was drawn, a column each, against what came of it, a row each; a point a trial, see `torque_by_angle`.
+
+    found: metric -> (unit, values, limit), as in `distributions`.
+    """
     with matplotlib.rc_context(RC):
-        size = len(names) - 1
-        figure = Figure(figsize=(2.9 * size + 0.6, 2.7 * size + 0.6), layout="constrained")
-        grid = figure.subplots(size, size, sharex="col", sharey="row", squeeze=False)
-        for axes in grid.ravel():
-            axes.set_visible(False)
-        for i, j in combinations(range(len(names)), 2):
-            axes = grid[j - 1, i]
-            axes.set_visible(True)
-            _points(axes, inputs[names[i]], inputs[names[j]], outcome, totals)
-            if j == size:
-                axes.set_xlabel(names[i])
-            if i == 0:
-                axes.set_ylabel(names[j])
+        rows, columns = len(found), len(drawn)
+        figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
+        grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
+        for line, (metric, (unit, values, limit)) in zip(grid, found.items(), strict=True):
+            known = values[np.isfinite(values)]
+            for axes, (name, x) in zip(line, drawn.items(), strict=True):
+                _points(axes, x, values, outcome, totals)
+                if limit is not None:
+                    axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
+                if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
+                    axes.set_yscale("log")
+        for axes, name in zip(grid[-1], drawn, strict=True):
+            axes.set_xlabel(name)
+            axes.xaxis.set_major_locator(MaxNLocator(4))
+            line[0].set_ylabel(f"{metric} [{unit}]" if unit else metric)
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
     return figure

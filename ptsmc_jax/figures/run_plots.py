@@ -30,6 +30,7 @@ def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
         figures["wheels"] = wheels(parts, log)
+        figures["wheel_torque"] = wheel_torque(parts, log)
     if parts.plant.attitude:
         return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
     return {"states": states(parts, log), **figures}
@@ -118,6 +119,20 @@ def wheels(parts: Parts, log: Log) -> Figure:
     return figure
 
 
+def wheel_torque(parts: Parts, log: Log) -> Figure:
+    """Torque of the reaction wheels over time, and its limit."""
+    figure, axes = figure_of("Torque of the reaction wheels", "torque [N m]")
+    assert log.wheels is not None
+    assert parts.actuators is not None
+    _components(axes, log.t, log.wheels[1], "v")
+    device = parts.actuators.wheels
+    if device is not None and device.torque_limit is not None:
+        _limit(axes, float(device.torque_limit), " N m")
+    _mark(axes, parts)
+    axes.legend(ncols=2)
+    return figure
+
+
 def sliding(parts: Parts, log: Log) -> Figure:
     """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
     figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
@@ -172,11 +187,12 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
 
 
 def disturbance(parts: Parts, log: Log) -> Figure:
-    """Estimated and true disturbance over time."""
+    """Estimated and true disturbance over time; the true one lies on top, where a noisy estimate would cover it."""
     figure, axes = figure_of("Disturbance and its estimate", _names(parts)[1].replace("input", "disturbance"))
-    _components(axes, log.t, log.d_hat, "\\hat d")
-    axes.plot(log.t, log.disturbance, color="0.6", lw=1.0, zorder=1)
-    axes.plot([], [], color="0.6", lw=1.0, label="true $d_i$")
+    _components(axes, log.t, log.d_hat, "\\hat d", alpha=0.7)
+    axes.plot(log.t, log.disturbance, color="white", lw=2.6, zorder=4)
+    axes.plot(log.t, log.disturbance, color="black", lw=1.2, ls=(0, (5, 2)), zorder=5)
+    axes.plot([], [], color="black", lw=1.2, ls=(0, (5, 2)), label="true $d_i$")
     _mark(axes, parts)
     axes.legend(ncols=2)
     return figure

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
@@ -44,6 +44,18 @@ def pytree(cls: _Class) -> _Class:
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
     return cls
+
+
+@pytree
+@dataclass(frozen=True)
+class Function:
+    """A plain function among parts, which are pytrees: it has no numbers that could be traced."""
+
+    function: Callable = field(metadata={"static": True})
+
+    def __call__(self, *args: Any) -> Any:
+        """What the function returns."""
+        return self.function(*args)
 
 
 class Gain(NamedTuple):

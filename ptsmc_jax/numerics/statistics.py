@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 SOBOL_BINS = 32  # of an input, by equal shares of the trials
+ALIKE = 0.9999  # rank correlation of two inputs that are one
 
 
 def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 import typing
 from dataclasses import dataclass
 
+from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.scenario import build, own_checks, reading, timing
 from ptsmc_jax.scenario import tables as t
@@ -69,6 +70,7 @@ def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = N
     Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
     where the law meets its singularity on the way from the initial state to the reference.
     """
+    configure.warn_if_forgotten()
     scenario = reading.complete(scenario)
     setup = build.setup(scenario)
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))

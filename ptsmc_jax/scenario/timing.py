@@ -42,12 +42,19 @@ class Reach:
     surface_rate: float  # largest [1/s]
 
 
-def reach_of(scenario: Scenario) -> Reach:
-    """The reach of a scenario's own gains: none beyond them."""
+def reach_of(scenario: Scenario, **farther: float) -> Reach:
+    """The reach of a scenario's own gains, none beyond them; farther: fields of `Reach` that are to be others.
+
+    >>> from ptsmc_jax.scenario import from_tables
+    >>> reach = reach_of(from_tables({}), delta=2.0)
+    >>> reach.t_f, reach.smallest_delta, reach.delta
+    (30.0, 0.05, 2.0)
+    """
     table = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
     k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
-    return Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
+    own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
+    return dataclasses.replace(own, **farther)
 
 
 def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:

@@ -1,10 +1,11 @@
 """What a run is made of."""
 
 from dataclasses import dataclass, field, fields, replace
+from types import FunctionType
 from typing import Any, TypeVar
 
 from ptsmc_jax.devices.actuators import Actuators
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 
@@ -28,6 +29,13 @@ class Setup:
     settling_angle: Leaf  # [rad]
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
+
+    def __post_init__(self) -> None:
+        """A plain function, or a lambda, is a disturbance and a reference too."""
+        for name in ("disturbance", "reference"):
+            value = getattr(self, name)
+            if isinstance(value, FunctionType):
+                object.__setattr__(self, name, Function(value))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
         """The same with another prescribed time [s]; the time after it is kept."""

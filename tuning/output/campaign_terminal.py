@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tuning.output import sentences, terminal
+from tuning.output.progress_lines import Lines
 
 
 class Progress:
@@ -14,14 +15,16 @@ class Progress:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+        console = Console(stderr=True)
+        self._lines = Lines(silent=quiet or console.is_terminal)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(20),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(elapsed_when_finished=True),
-            console=Console(stderr=True),
-            disable=quiet,
+            console=console,
+            disable=quiet or not console.is_terminal,
         )
         self._task = self._bar.add_task("compiling", total=None)
         self._started: tuple[float, int] | None = None
@@ -44,6 +47,7 @@ class Progress:
         text += f", {rate:,.0f} a second" if rate else ""
         text += f", {standing.failed} failed or missed" if standing.failed else ""
         self._bar.update(self._task, completed=standing.done, total=standing.total, description=text)
+        self._lines(text, 0, 0)
 
 
 def campaign(found: dict[str, Any], folder: Path) -> None:

@@ -306,6 +306,7 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
     sections = [
         *_limits(summary["verdicts"]),
         Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),
+        Section("Gains", [_table(sentences.flown_gains(result.scenario, result.kind))]),
     ]
     lines = [*sentences.campaign_counts(summary), *sentences.campaign_error(summary)]
     return _verdict(summary, lines, bool(summary["verdicts"])), sections

@@ -175,8 +175,16 @@ def comparison(summary: Summary) -> Table:
         found = [{v["metric"]: v for v in law["verdicts"]}.get(name) for law in laws.values()]
         if any(found):
             rows.append((name.replace("_", " "), *("-" if one is None else _margin(one) for one in found), unit))
+    for metric in dict.fromkeys(v["metric"] for law in laws.values() for v in law["verdicts"]):
+        told = [{v["metric"]: v for v in law["verdicts"]}.get(metric) for law in laws.values()]
+        rows.append((f"trials beyond {metric}", *("-" if one is None else _broken(one) for one in told), ""))
     rows.append(("all limits met", *("yes" if found["met"] else "no" for found in laws.values()), ""))
     return Table(("", *(law.replace("_", " ") for law in laws), "unit"), rows)
+
+
+def _broken(told: Summary) -> str:
+    """In how many trials a requirement is broken, and whether that is too many."""
+    return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
 
 
 def _margin(told: Summary) -> str:
@@ -287,6 +295,19 @@ def campaign_error(summary: Summary) -> Iterator[str]:
     beside = floor(error, summary.get("floor"))
     if beside:
         yield f"RMS window error {error:.3e}{beside}"
+
+
+def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
+    """The law, observer and filter of a scenario's tables, with the numbers that they fly with; kind: of its plant."""
+    from tuning.search.gains import units
+
+    known, rows = units(kind), list[tuple[str, ...]]()
+    for table, prefix in (("controller", ""), ("observer", "observer_"), ("filter", "filter_")):
+        for key, value in scenario.get(table, {}).items():
+            numbers = value if isinstance(value, list) else [value]
+            said = ", ".join(f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers)
+            rows.append((f"{table}.{key}", said, known.get(prefix + key, "").replace("-", "")))
+    return Table(("key", "value", "unit"), rows)
 
 
 def campaign_drivers(summary: Summary) -> Iterator[str]:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from tuning.output import margin_sentences, search_sentences, sentences
+from tuning.output.progress_lines import Lines
 
 
 class Progress:
@@ -20,7 +21,8 @@ class Progress:
             TimeRemainingColumn,
         )
 
-        self._goal = goal
+        self._goal, console = goal, Console(stderr=True)
+        self._lines = Lines(silent=quiet or console.is_terminal)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(20),
@@ -28,8 +30,8 @@ class Progress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(elapsed_when_finished=True),
-            console=Console(stderr=True),
-            disable=quiet,
+            console=console,
+            disable=quiet or not console.is_terminal,
         )
         self._total, self._task = 0, self._bar.add_task("compiling", total=None)
 
@@ -48,6 +50,7 @@ class Progress:
         limits = "limits met" if over == 0.0 else f"{100 * over:.3g} % beyond a limit"
         best = f": {self._goal} {value:.4g}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done, total=total or None, description=what + best)
+        self._lines(what + best, done, total)
 
 
 def reproduction(summary: dict[str, Any], folder: Path) -> None:

@@ -226,7 +226,13 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     )
     driving = sorted(found["drivers"].get("window_error", {}).items(), key=lambda item: -item[1]["first_order"])
     varied = [name for name, _ in driving][:4]
-    if len(varied) >= 2:
+    if varied:
         inputs = rows.read(parts, varied)[some]
-        made["inputs"] = plots.pairs({name: inputs[name].to_numpy() for name in varied}, outcome[some], totals)
+        units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
+        made["inputs"] = plots.inputs(
+            {name: inputs[name].to_numpy() for name in varied},
+            {name: (units[name], frame[name].to_numpy()[some].astype(float), limits.get(name)) for name in names[:4]},
+            outcome[some],
+            totals,
+        )
     return made

@@ -1,0 +1,47 @@
+"""Progress where the output is redirected."""
+
+import numpy as np
+
+from ptsmc_jax.numerics import statistics
+from tuning.output import sentences
+from tuning.output.progress_lines import Lines
+
+
+def test_a_line_every_ten_seconds_where_no_terminal_shows_a_bar(capsys):
+    at = iter([0.0, 1.0, 10.5, 12.0, 20.6])
+    tell = Lines(silent=False, clock=lambda: next(at))
+    for done in range(4):
+        tell("searching", done, 7)
+    assert capsys.readouterr().err.splitlines() == ["ptsmc: searching, 1 of 7, 10 s", "ptsmc: searching, 3 of 7, 21 s"]
+    at = iter([0.0, 99.0])
+    Lines(silent=True, clock=lambda: next(at))("searching", 1, 7)
+    assert not capsys.readouterr().err
+
+
+def test_the_gains_that_a_campaign_flew_with_have_their_units():
+    tables = {"controller": {"kind": "prescribed_time", "eta": 3.0}, "observer": {"gain": [1.0, 2.0, 3.0]}}
+    rows = sentences.flown_gains(tables, "spacecraft").rows
+    assert rows == [
+        ("controller.kind", "prescribed_time", ""),
+        ("controller.eta", "3", ""),
+        ("observer.gain", "1, 2, 3", "N m s"),
+    ]
+
+
+def test_a_comparison_says_which_requirement_each_law_breaks_and_in_how_many_trials():
+    def law(failures, met):
+        verdict = {"metric": "peak_torque", "failures": failures, "trials": 1000, "met": met, "worst": 0.5}
+        numbers = dict.fromkeys(
+            ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "settling_near_far")
+        )
+        return {**numbers, "settling_time": None, "unsettled": 0, "verdicts": [verdict], "met": met}
+
+    rows = sentences.comparison({"laws": {"pd": law(12, False), "prescribed_time": law(0, True)}}).rows
+    assert ("trials beyond peak_torque", "12 of 1000: NOT met", "0 of 1000", "") in rows
+
+
+def test_of_inputs_that_rank_the_trials_alike_only_the_first_is_a_driver():
+    rng = np.random.default_rng(0)
+    angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)
+    inputs = {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "other": other}
+    assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]
