@@ -126,16 +126,16 @@ def inputs(
         grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
         for line, (metric, (unit, values, limit)) in zip(grid, found.items(), strict=True):
             known = values[np.isfinite(values)]
-            for axes, (name, x) in zip(line, drawn.items(), strict=True):
+            for axes, x in zip(line, drawn.values(), strict=True):
                 _points(axes, x, values, outcome, totals)
                 if limit is not None:
                     axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
                 if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
                     axes.set_yscale("log")
+            line[0].set_ylabel(f"{metric} [{unit}]" if unit else metric)
         for axes, name in zip(grid[-1], drawn, strict=True):
             axes.set_xlabel(name)
             axes.xaxis.set_major_locator(MaxNLocator(4))
-            line[0].set_ylabel(f"{metric} [{unit}]" if unit else metric)
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
     return figure

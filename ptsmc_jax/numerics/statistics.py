@@ -58,7 +58,8 @@ def drivers(
     Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,
     over its variance, less what bins of unrelated numbers would show. Of ranks, so that a long tail does not decide.
     (trials,) each; empty where the metric or every input has one value only. known: what the inputs are ranked to is
-    kept there, for other metrics of the same trials.
+    kept there, for other metrics of the same trials. Of inputs that rank the trials alike, such as an angle and the
+    scalar part of its quaternion, the first one speaks for all.
     """
     known = {} if known is None else known
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
@@ -71,7 +72,11 @@ def drivers(
             continue
         if name not in known:
             own = stats.rankdata(values)
-            known[name] = (own - own.mean()) / own.std(), np.argsort(own, kind="stable")
+            own, order = (own - own.mean()) / own.std(), np.argsort(own, kind="stable")
+            alike = any(abs(np.mean(own * one)) > ALIKE for one, _ in filter(None, known.values()))
+            known[name] = () if alike else (own, order)
+        if not known[name]:
+            continue
         own, order = known[name]
         correlation = float(np.mean(own * rank))
         bins = np.array_split(rank[order], SOBOL_BINS)
