@@ -29,9 +29,9 @@ checked = [name for name, path in modules().items() if name not in UNCHECKED and
 hook = install_import_hook(checked, "beartype.beartype")
 
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
-gc.set_threshold(200_000, 20, 100)
+gc.set_threshold(200_000, 10, 10)
 
-MANY = 15_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
+MANY = 25_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
@@ -58,6 +58,7 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
