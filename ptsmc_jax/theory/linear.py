@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState
@@ -61,10 +61,10 @@ class Loop:
     period: Leaf  # h [s]
     delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
 
-    def closed_at_sensors(self) -> tuple[Float[Array, "n n"], Float[Array, "m n"]]:
+    def closed_at_sensors(self, xp: Any = jnp) -> tuple[Float[ArrayLike, "n n"], Float[ArrayLike, "m n"]]:
         """A (n, n) and C (m, n) with x_seen = x, in the units of the coordinates: rad, rad/s, [N m]."""
-        k = self.seen.shape[1]
-        return self.a.at[:, :k].add(self.seen), self.command.at[:, :k].add(self.direct)
+        others = ((0, 0), (0, self.a.shape[0] - self.seen.shape[1]))
+        return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
 
 
 class Nominal(NamedTuple):
@@ -298,13 +298,13 @@ def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     return np.flatnonzero(whole & (np.asarray(ticks.hold) == hold))
 
 
-def acting(loop: Loop, late: Scalar) -> tuple[Array, Array]:
+def acting(loop: Loop, late: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
     """N and O, (n, m) each, for a command [N m] that is late by a share of a period, by polynomials through NODES."""
-    gap = late - jnp.asarray(NODES)
-    on = jnp.abs(gap) < 1e-14
-    weights = jnp.asarray(_WEIGHTS) / jnp.where(on, 1.0, gap)
-    weights = jnp.where(jnp.any(on), on.astype(float), weights / jnp.sum(weights))
-    return jnp.tensordot(weights, loop.new, 1), jnp.tensordot(weights, loop.old, 1)
+    gap = late - xp.asarray(NODES)
+    on = xp.abs(gap) < 1e-14
+    weights = xp.asarray(_WEIGHTS) / xp.where(on, 1.0, gap)
+    weights = xp.where(xp.any(on), on.astype(float), weights / xp.sum(weights))
+    return xp.tensordot(weights, loop.new, 1), xp.tensordot(weights, loop.old, 1)
 
 
 class Opening(NamedTuple):
@@ -313,37 +313,33 @@ class Opening(NamedTuple):
     Its states are z and the commands on their way. 1 + L = 0 is the border of stability.
     """
 
-    a: Array  # (n, n)
-    b: Array  # (n, m)
-    c: Array  # (m, n)
+    a: Any  # (n, n)
+    b: Any  # (n, m)
+    c: Any  # (m, n)
 
-    def closed(self, gain: Any = 1.0) -> Array:
+    def closed(self, gain: Any = 1.0) -> Any:
         """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
-        return self.a + self.b @ (gain * self.c if jnp.ndim(gain) == 0 else gain @ self.c)
+        return self.a + self.b @ (gain * self.c if np.ndim(gain) == 0 else gain @ self.c)
 
     def response(self, z: Array) -> Complex[Array, "m m"]:
         """L(z) [-], (m, m), what comes back by what acts."""
         return -self.c @ jnp.linalg.solve(z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j)
 
 
-def at_input(loop: Loop, late: float = 0.0) -> Opening:
+def at_input(loop: Loop, late: float = 0.0, xp: Any = jnp) -> Opening:
     """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
-    a, command = loop.closed_at_sensors()
-    m, n = command.shape
-    total = loop.delay + late
+    a, command = loop.closed_at_sensors(xp)
+    (m, n), total = command.shape, loop.delay + late
     whole = int(np.floor(total + 1e-12))
     part = max(total - whole, 0.0)
-    new, old = (loop.new[0], None) if part == 0.0 else acting(loop, jnp.asarray(part))
-    kept = (whole + (part > 0.0)) * m  # states that hold commands on their way, the newest first
-    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(a)
-    full = full.at[n + m :, n : n + kept - m].set(jnp.eye(max(kept - m, 0)))
-    b = jnp.zeros((n + kept, m)).at[n : n + m].set(jnp.eye(min(kept, m), m))
-    for back, push in ((whole, new), (whole + 1, old)):  # the command of so many periods ago
-        if push is not None and back == 0:
-            b = b.at[:n].add(push)
-        elif push is not None:
-            full = full.at[:n, n + (back - 1) * m : n + back * m].add(push)
-    return Opening(full, b, jnp.zeros((m, n + kept)).at[:, :n].set(command))
+    pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # of the commands of so many periods ago
+    if part > 0.0:
+        pushes[whole:] = acting(loop, part, xp)
+    kept = (len(pushes) - 1) * m  # states that hold commands on their way, the newest first
+    coming = xp.concatenate([a, *pushes[1:]], axis=1)
+    moving = xp.concatenate([xp.zeros((kept, n)), xp.eye(kept, k=-m)], axis=1)
+    b = xp.concatenate([pushes[0], xp.eye(kept, m)])
+    return Opening(xp.concatenate([coming, moving]), b, xp.pad(command, ((0, 0), (0, kept))))
 
 
 def at_sensors(loop: Loop) -> Opening:
@@ -369,5 +365,9 @@ def one_late(loop: Loop, z: Array, late: Scalar, axis: Any) -> Complex[Array, "m
 
 
 def radius(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> float:
-    """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1."""
-    return float(np.abs(np.linalg.eigvals(at_input(loop, late).closed(gain))).max())
+    """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1.
+
+    In NumPy: with every delay the matrix has another size, and would be another program.
+    """
+    closed = at_input(jax.tree.map(np.asarray, loop), late, np).closed(gain)
+    return float(np.abs(np.linalg.eigvals(closed)).max())
