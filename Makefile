@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO := scenarios/first_flight.toml
 OUT := out/tune-first_flight
 
-.PHONY: tune test test-long setup table docs notebooks notebooks-kept clean
+.PHONY: tune test types suite test-long setup table docs notebooks notebooks-kept clean
 
 tune: $(VENV)/.installed
 	$(BIN)/ptsmc tune $(SCENARIO) --out $(OUT)
@@ -14,7 +14,12 @@ tune: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(MAKE) --jobs 2 types suite
+
+types:
 	$(BIN)/pyright
+
+suite:
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 # what `test` leaves out: more cases of each kind, and what takes minutes
