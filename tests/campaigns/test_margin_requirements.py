@@ -125,7 +125,7 @@ def drawn():
 
 
 def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(drawn):
-    """Slopes against central differences of order 4, over all axes and times; those of what has no limit are zero."""
+    """Slopes against central differences of order 4, over all axes and times, along all gains at once."""
     posed = drawn
     asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
     assert asked is not None
@@ -133,12 +133,13 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
-    step = 1e-4
-    points = [share + k * step * e for e in np.eye(share.size) for k in (-2, -1, 1, 2)]
-    c = np.stack([np.asarray(margin_rows.sloped(asked, bounds, p)["c"]) for p in points])
-    c = c.reshape(share.size, 4, *c.shape[1:])
-    numeric = (c[:, 0] - 8 * c[:, 1] + 8 * c[:, 2] - c[:, 3]) / (12 * step)
-    exact = np.moveaxis(np.asarray(found["c_slope"]), -1, 0)
+    step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
+    points = [share + k * step * along for k in (-2, -1, 1, 2)]
+    c = [np.asarray(margin_rows.sloped(asked, bounds, p)["c"]) for p in points]
+    numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
+    slopes = np.asarray(found["c_slope"])
+    assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain counts
+    exact = slopes @ along
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8 * np.abs(exact).max())
     told = explore.verdicts(posed.ready.scenario, explore.trials(posed.ready.scenario, 2, seed=3), seed=3)[-2:]
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # of the loops of the same trials
@@ -165,7 +166,8 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
     each = worst_of(all_of(parts, asked.dispersion, 3, 4)[0])
     harder, near = margin_rows.hardest(asked, other)
-    row = np.asarray(margin_rows.rows(harder, jnp.asarray(other)))
+    bounds = posed.evaluate.bounds
+    row = np.asarray(margin_rows.sloped(harder, bounds, bounds.share(other))["c"])
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
     limits = posed.ready.margins
     shares = [over(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
@@ -175,7 +177,7 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_inertias_are_
 FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains
 
 
-@pytest.mark.parametrize("changes", short(FACTORS, FACTORS[::2]))
+@pytest.mark.parametrize("changes", short(FACTORS, FACTORS[2:]))
 def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, changes, monkeypatch):
     """As by judging all of them; the nominal loop is not the worst. Lines are off by less than half of `OFF`."""
     posed, count = drawn, 24

@@ -15,7 +15,7 @@ from ptsmc_jax.numerics import pytrees
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, parts, vector
+from tests.helpers import FIRST_FLIGHT, parts, short, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -182,7 +182,7 @@ def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
     assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "missed": 0, "unfinished": 0}
 
 
-@pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), TABLE)
+@pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))
 def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, quiet, noisy):
     base = scenario.replace(
         scenario.read(FIRST_FLIGHT),
@@ -194,7 +194,7 @@ def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, 
     silent = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})
     for case, (rms, peak) in ((silent, quiet), (base, noisy)):
         ready = scenario.study(case)
-        trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(1000))
+        trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(500))
         assert np.all(trials.ok)
         # 15 %: the notes' figures come from 64 trials
         np.testing.assert_allclose(np.sqrt(np.mean(trials.metrics.window_error**2)), rms, rtol=0.15)

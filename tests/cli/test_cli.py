@@ -370,7 +370,7 @@ def test_a_killed_search_goes_on(tmp_path):
     code = (
         "import sys; from tuning.cli import main; from tuning.search import confirm, descents, refine, starts, worst; "
         "starts.SWEPT = 16; descents.MANY = 16; refine.GENERATIONS = 3; "
-        "worst.SCREENED = 64; confirm.FRESH = 40; main.main()"
+        "worst.SCREENED = 48; confirm.FRESH = 40; main.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
     journal = tmp_path / "t" / "journal.bin"
@@ -406,7 +406,7 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     )
     assert "peak_torque at most 0.01 N m: worst" in told
     # the best compromise: the smallest torque within the bounds is that of the smallest eta
-    assert 2.1 <= summary["gains"]["eta"] < 2.9  # of 2.1 to 6
+    assert 2.6 <= summary["gains"]["eta"] < 2.8  # of 2.6 to 3.1
 
 
 def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
@@ -528,20 +528,6 @@ def test_a_chain_is_tuned(command, tmp_path):
     assert command("tune", "c.toml", "--seed", 2)[1].startswith("tuning already done")
 
 
-def test_reproduce_leaves_what_the_contract_says(command, tmp_path):
-    status, out, err = command("reproduce", "--no-figures")
-    assert (status, err) == (0, "")
-    assert "holds in part" in out
-    folder = tmp_path / "out" / "reproduce"
-    read = checked(folder)
-    assert read.charts == {}
-    for claim in json.loads((folder / "summary.json").read_text())["claims"]:
-        assert " ".join(claim["claim"].split()) in read.text
-    assert {"summary.json", "versions.json", "claims.md"} <= set(tree(folder))
-    assert command("reproduce")[0] == 2  # it is there already
-    assert command("reproduce", "some.toml")[0] == 2
-
-
 def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_leave(command, tmp_path):
     (tmp_path / "s.toml").write_text("initial.quat_xyzw = [1, 0, 0, 0]\n" + SHORT)
     status, _, err = command("simulate", "s.toml", "--no-figures")
@@ -551,12 +537,12 @@ def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_le
 
 
 def test_map_leaves_what_the_contract_says(command, tmp_path):
-    pairs = ("--x", "loop.period=0.05:0.1:2", "--y", "controller.delta=0.2:0.8:2")
+    pairs = ("--x", "controller.eta=2.7:3.0:2", "--y", "controller.delta=0.2:0.8:2")
     status, out, _ = command("map", "s.toml", *pairs, "--trials", 2)
     assert status == 0
     assert "4 of 4 pairs flown" in out
     assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
-    again = "ptsmc map scenario.toml --x loop.period=0.05:0.1:2 --y controller.delta=0.2:0.8:2 --trials 2 --seed 0"
+    again = "ptsmc map scenario.toml --x controller.eta=2.7:3.0:2 --y controller.delta=0.2:0.8:2 --trials 2 --seed 0"
     assert again in checked(tmp_path / "out" / "map-s").text
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.delta=0.2:0.8:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip

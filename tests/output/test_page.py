@@ -33,10 +33,17 @@ def in_chromium(path, tmp_path, *options):
     return done.stdout, [line for line in said if not any(word in line for word in harmless)]
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    return tmp_path_factory.mktemp("kept") / "run"
+
+
 @pytest.fixture
-def flown(command, tmp_path):
-    assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", "run", "--quiet")[0] in (0, 1)
-    return tmp_path / "run"
+def flown(command, kept, tmp_path):
+    """Results of one run, flown once: a copy."""
+    if not kept.exists():
+        assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", kept, "--quiet")[0] in (0, 1)
+    return shutil.copytree(kept, tmp_path / "run")
 
 
 def test_a_run_becomes_a_page(command, flown):

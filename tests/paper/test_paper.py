@@ -7,7 +7,8 @@ import pytest
 
 from ptsmc_jax.paper import claims, slips
 from ptsmc_jax.scenario import read
-from tests.helpers import REFERENCE
+from tests.helpers import REFERENCE, tree
+from tests.output.pages import checked
 from tuning.studies import reproduction
 
 
@@ -110,6 +111,21 @@ def test_folder_holds_figures_claims_and_scenarios(made, tmp_path):
         assert scenario.controller.eta == float(run.parts.controller.eta)
         assert summary["cases"][name]["terminal_error"] == run.metrics["terminal_error"]
     assert slips.__doc__
+
+
+def test_reproduce_leaves_what_the_contract_says(made, command, tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduction, "reproduce", lambda: made)  # it takes as long as all other tests here
+    status, out, err = command("reproduce", "--no-figures")
+    assert (status, err) == (0, "")
+    assert "holds in part" in out
+    folder = tmp_path / "out" / "reproduce"
+    read = checked(folder)
+    assert read.charts == {}
+    for claim in json.loads((folder / "summary.json").read_text())["claims"]:
+        assert " ".join(claim["claim"].split()) in read.text
+    assert {"summary.json", "versions.json", "claims.md"} <= set(tree(folder))
+    assert command("reproduce")[0] == 2  # it is there already
+    assert command("reproduce", "some.toml")[0] == 2
 
 
 def test_remark_2_is_measured_as_theory_says(made):

@@ -52,13 +52,13 @@ def test_bad_axes_are_refused_in_a_sentence(text):
 
 
 def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives():
-    loaded, x, y, cells = flown("loop.period=0.05:0.2:3", "controller.delta=0.1:0.9:3")
+    loaded, x, y, cells = flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:3")
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
     refused = [c for c in cells if c.status != "flown"]
-    assert [(c.x, c.y) for c in refused] == [(0.125, 0.1), (0.2, 0.1)]  # below one period
+    assert [(c.x, c.y) for c in refused] == [(0.2, 0.1)]  # below one period
     assert all("at least one control period" in c.status for c in refused)
     for cell in cells:
-        if (cell.x, cell.y) in ((0.05, 0.9), (0.2, 0.5)):  # every one compiles a program of its own
+        if (cell.x, cell.y) == (0.2, 0.5):  # every one compiles a program of its own
             alone = scenario.study(scenario.replace(loaded, loop__period=cell.x, controller__delta=cell.y))
             trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
             np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
