@@ -1,4 +1,7 @@
-"""One continuous run against `solve_ivp` with a NumPy right-hand side and adaptive diffrax, at matched error."""
+"""Continuous runs against `solve_ivp` with a NumPy right-hand side and adaptive diffrax, at matched error.
+
+One run, and a batch of so many from drawn attitudes: its time is told for a run.
+"""
 
 import jax
 
@@ -15,9 +18,12 @@ from common import machine, medians, say  # noqa: E402
 from scipy.integrate import solve_ivp  # noqa: E402
 
 from ptsmc_jax import scenario  # noqa: E402
+from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
 ERROR = 1e-9  # wanted in the attitude error vector at t_f
+BATCH = 1024  # runs
+DRAWN = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 140.0}}}
 
 
 def numpy_loop(parts):
@@ -112,9 +118,13 @@ def main() -> None:
                 say(f"diffrax {type(solver).__name__}: tolerance {tolerance:.0e}, off by {error:.1e}")
                 runs[f"diffrax {type(solver).__name__}"] = partial(by_diffrax, tolerance, solver)
                 break
+    many = scenario.study(scenario.from_tables(DRAWN))
+    trials = np.arange(BATCH)
+    runs[f"batch of {BATCH}"] = lambda: montecarlo.run(many.parts, many.dispersion, 0, trials).metrics
     seconds = medians(runs)
+    seconds[f"batch of {BATCH}"] /= BATCH
     for name, s in seconds.items():
-        say(f"  {name:18s} {s * 1e3:9.2f} ms, {s / seconds['ptsmc_jax']:7.0f} times ptsmc_jax")
+        say(f"  {name:18s} {s * 1e3:9.4f} ms a run, {s / seconds['ptsmc_jax']:8.4g} times ptsmc_jax")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,11 @@
-"""Cold and warm start of the commands, each in a process of its own, and what compiling the sampled loop takes."""
+"""Cold and warm start of the commands, each in a process of its own, and what compiling the sampled loop takes.
+
+Seconds, and seconds of the processors beside them: those hardly change where other work runs on the machine. With names
+of commands, as printed, only those.
+"""
 
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -8,6 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from common import machine
 
 PTSMC = Path(sys.executable).with_name("ptsmc")
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
@@ -15,24 +21,28 @@ FIRST_FLIGHT, HARD_FLIGHT = (str(SCENARIOS / f"{name}_flight.toml") for name in 
 COMMANDS = {
     "--version": ["--version"],
     "--help": ["--help"],
+    "simulate, refused": ["simulate", "refused.toml"],
     "simulate --no-figures": ["simulate", "--no-figures"],
     "simulate first_flight.toml --no-figures": ["simulate", FIRST_FLIGHT, "--trial", "0", "--no-figures"],
     "simulate": ["simulate"],
     "map (9 x 9) --no-figures": ["map", FIRST_FLIGHT, "--no-figures"],
     "reproduce": ["reproduce"],
+    "tune first_flight.toml": ["tune", FIRST_FLIGHT],
 }
 WARM = 5
 
 
-def run(arguments: list[str], cache: str) -> float:
-    """Seconds of one call with this compile cache."""
+def run(arguments: list[str], cache: str) -> tuple[float, float]:
+    """Seconds of one call with this compile cache, and of the processors."""
     with tempfile.TemporaryDirectory() as out:
+        (Path(out) / "refused.toml").write_text("[controller]\neta = 1.0\n", encoding="utf-8")
         extra = [] if arguments[0].startswith("--") else ["--quiet", "--out", str(Path(out) / "made")]
-        start = time.perf_counter()
-        done = subprocess.run([str(PTSMC), *arguments, *extra], env=dict(os.environ, XDG_CACHE_HOME=cache),
+        start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([str(PTSMC), *arguments, *extra], env=dict(os.environ, XDG_CACHE_HOME=cache), cwd=out,
                               capture_output=True, check=False)  # fmt: skip
-        assert done.returncode in (0, 1), done.stderr.decode()
-        return time.perf_counter() - start
+        seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert done.returncode in ((2,) if "refused.toml" in arguments else (0, 1)), done.stderr.decode()
+        return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def compiling() -> None:
@@ -65,10 +75,16 @@ def compiling() -> None:
 
 
 if __name__ == "__main__":
-    for name, arguments in COMMANDS.items():
+    print(machine())
+    wanted = sys.argv[1:] or list(COMMANDS)
+    for name in wanted:
         with tempfile.TemporaryDirectory() as cache:
-            cold = run(arguments, cache)
-            warm = float(np.median([run(arguments, cache) for _ in range(WARM)]))
-        print(f"  ptsmc {name:42s} cold {cold:6.2f} s   warm {warm:5.2f} s")
+            cold = run(COMMANDS[name], cache)
+            warm = np.median([run(COMMANDS[name], cache) for _ in range(WARM)], axis=0)
+        told = "   ".join(
+            f"{what} {wall:6.2f} s ({used:6.2f} s)" for what, (wall, used) in (("cold", cold), ("warm", warm))
+        )
+        print(f"  ptsmc {name:42s} {told}")
         sys.stdout.flush()
-    compiling()
+    if not sys.argv[1:]:
+        compiling()
