@@ -57,7 +57,7 @@ HOUSE = {
             board fields printing translate
             generate vectors
             templates
-            readme
+            library readme
             folder
         """,
         "paper": "claims remark_2 | slips",

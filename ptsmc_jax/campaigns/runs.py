@@ -17,6 +17,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import Entry
+from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import error_floor
@@ -71,18 +72,21 @@ def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
-def fly(ready: Study, seed: int = 0, trial: int | Row | None = None) -> Run:
-    """Fly one run: nominal with the noise of trial 0, or a trial, or a plan's row, with its dispersions and noise."""
-    run = _fly(ready, seed, trial)
+def fly(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = OURS) -> Run:
+    """Fly one run: nominal with the noise of trial 0, or a trial, or a plan's row, with its dispersions and noise.
+
+    software: the flight computer, where it is not the parts' own code.
+    """
+    run = _fly(ready, seed, trial, software)
     return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
 
 
-def _fly(ready: Study, seed: int, trial: int | Row | None) -> Run:
+def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = OURS) -> Run:
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
     key, number = jnp.uint32(row.seed), jnp.uint32(row.trial)
     about = trial if isinstance(trial, Row) else number
     parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
-    result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True))
+    result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True, software=software))
     assert result.log is not None
     lasts = result.log.lasts
     log = jax.tree.map(lambda rows: rows[lasts], result.log)

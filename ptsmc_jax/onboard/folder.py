@@ -92,22 +92,28 @@ def table(made: Controller, seed: int, trials: int) -> tuple[list[str], list[lis
 
 def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
     """Fills a folder that is there."""
-    code, about = made.code, made.about
     header, rows = table(made, seed, trials)
+    write_program(folder, made)
+    store.write_csv(folder / "vectors.csv", header, rows)
+    store.write_toml(folder / "scenario.toml", parsing.dump(made.scenario))
+    store.write_json(folder / "versions.json", store.versions("export", seed, **own.digests(made.scenario)))
+
+
+def write_program(folder: Path, made: Controller) -> None:
+    """The files that do not depend on a trial."""
+    code, about = made.code, made.about
     texts = {
         f"ptsmc_{about.name}.h": templates.header(code, about),
         f"ptsmc_{about.name}.c": templates.source(code, about),
         f"ptsmc_{about.name}_parameters.c": templates.values(code, about),
         f"ptsmc_{about.name}_flat.h": templates.flat(code, about),
         "check.c": templates.check(code, about),
+        "fuzz.c": templates.fuzz(code, about),
         "Makefile": templates.makefile(about),
         "README.md": readme(code, about),
     }
     for name, text in texts.items():
         store.write_text(folder / name, text)
-    store.write_csv(folder / "vectors.csv", header, rows)
-    store.write_toml(folder / "scenario.toml", parsing.dump(made.scenario))
-    store.write_json(folder / "versions.json", store.versions("export", seed, **own.digests(made.scenario)))
     layout = {"name": about.name, "digest": about.digest, "columns": templates.columns(code)}
     store.write_json(folder / "controller.json", layout)
 

@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,12 +44,7 @@ class Code:
 def generate(board: Board) -> Code:
     """The C of a flight computer; raises NoRuleError where something in it has no rule."""
     leaves, names, values = _parameters(board)
-    structs = {"in": Struct("in"), "before": Struct("before"), "out": Struct("out")}
-    trees: dict[str, Any] = {}
-    for prefix, shapes in (("in", board.inputs), ("before", board.state), ("out", board.outputs)):
-        for name, shape in shapes.items():
-            plain = isinstance(shape, jax.ShapeDtypeStruct)
-            trees[f"{prefix}.{name}"] = structs[prefix].add(name, shape, board.about.get(name, "") if plain else "")
+    structs, trees = _structs(board)
     used: set[str] = {"period"}
     code = Code([], {}, list(structs["in"].fields.values()), list(structs["before"].fields.values()),
                 list(structs["out"].fields.values()))  # fmt: skip
@@ -58,6 +54,36 @@ def generate(board: Board) -> Code:
     code.parameters = [made for made, _ in wanted]
     code.values = {made.name: value for made, value in wanted}
     return code
+
+
+def _structs(board: Board) -> tuple[dict[str, Struct], dict[str, Any]]:
+    """The structs, and for each named tree its leaves' fields."""
+    structs = {"in": Struct("in"), "before": Struct("before"), "out": Struct("out")}
+    trees: dict[str, Any] = {}
+    for prefix, shapes in (("in", board.inputs), ("before", board.state), ("out", board.outputs)):
+        for name, shape in shapes.items():
+            plain = isinstance(shape, jax.ShapeDtypeStruct)
+            trees[f"{prefix}.{name}"] = structs[prefix].add(name, shape, board.about.get(name, "") if plain else "")
+    return structs, trees
+
+
+def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
+    """The columns of vectors.csv that are inputs, outputs and state, as C has them, in order."""
+
+    def all_of(members: Sequence[Field], owner: str = "") -> list[str]:
+        return [owner + element for made in members for element in made.elements()]
+
+    return {
+        "in": ["t", *all_of(inputs)],
+        "out": all_of(outputs),
+        "state": ["t", "started", "tracking", *all_of(state), *all_of(outputs, "last.")],
+    }
+
+
+def names_of(board: Board) -> dict[str, list[str]]:
+    """The columns of a flight computer, without its C."""
+    structs, _ = _structs(board)
+    return columns(*(list(structs[name].fields.values()) for name in ("in", "before", "out")))
 
 
 def _parameters(board: Board) -> tuple[list[Any], list[Field], list[tuple[Field, np.ndarray]]]:
@@ -157,7 +183,7 @@ def _function(
 def _shortened(body: list[str]) -> list[str]:
     """Lines in which an array of a struct that is read often has a name of its own."""
     text = "\n".join(body)
-    reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\] =(?!=))", text))
+    reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\](?: =(?!=)|\[))", text))
     found, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
     for place, count in sorted(reads.items(), key=lambda item: (item[0].startswith("before"), item[0])):
         name = re.split(r"->|\.", place)[-1]

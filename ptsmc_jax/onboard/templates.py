@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ptsmc_jax.onboard import generate
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
@@ -17,7 +18,8 @@ STATUS = {
     "SATURATED": "done; a limit of the actuators cuts the command",
     "MISSED": "done; the last sample is not one period ago, so the observer has left this one out",
     "SINGULAR": "the law is next to its singularity: its last good command",
-    "INPUT": "not finite, no rotation, too fast, or no later than the last one: the last good command; nothing is kept",
+    "INPUT": "an input that is not finite, beyond all measure, no rotation, or no later than the last: the last good "
+    "command; nothing is kept",
     "OVERFLOW": "a result is not finite: the last good command; nothing is kept",
 }
 
@@ -160,6 +162,12 @@ HELPERS = {
 }
 
 
+def _within(made: Field, owner: str) -> str:
+    if not made.shape:
+        return f"within(&{owner}{made.name}, 1)"
+    return f"within(&{owner}{made.name}{'[0]' * len(made.shape)}, {made.size})"
+
+
 def _finite(made: Field, owner: str) -> str:
     if not made.shape:
         return f"isfinite({owner}{made.name})"
@@ -176,6 +184,11 @@ def _checks(code: Code, about: About) -> list[str]:
     reals = [made for made in code.inputs if made.kind == REAL]
     lines = ["static int finite(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
              "        if (!isfinite(v[k])) {", "            return 0;", "        }", "    }", "    return 1;", "}", "",
+             f"/* Finite and no larger than {'1e6' if about.spacecraft else '1e12'}: what is larger would stay in the "
+             "observer for long. */",
+             "static int within(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
+             f"        if (!(M(fabs)(v[k]) <= R({'1e6' if about.spacecraft else '1e12'}))) {{",
+             "            return 0;", "        }", "    }", "    return 1;", "}", "",
              "/* Whether an input can be used. */"]  # fmt: skip
     parameters = "const ptsmc_params *p, " if about.spacecraft else ""
     lines += [f"static int usable({parameters}const ptsmc_state *state, const ptsmc_in *in)", "{"]
@@ -197,8 +210,8 @@ def _checks(code: Code, about: About) -> list[str]:
         turned = ["attitude" if about.filtered else "rotation", "turn < R(1)"]
     else:
         turned = []
-    terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)", *(_finite(made, "in->") for made in required),
-             *turned]  # fmt: skip
+    terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)",
+             *(_within(made, "in->") for made in required), *turned]  # fmt: skip
     lines += [*_all(terms, "        "), "}", "", "/* Whether everything that is kept, and goes out, is finite. */",
               "static int sound(const ptsmc_state *now, const ptsmc_out *out)", "{"]  # fmt: skip
     kept = [_finite(made, "now->") for made in code.state if made.kind == REAL]
@@ -252,16 +265,8 @@ def _arguments(call: str) -> list[str]:
 
 
 def columns(code: Code) -> dict[str, list[str]]:
-    """The columns of vectors.csv that are inputs, outputs and state, as C has them, in order."""
-
-    def all_of(members: Sequence[Field], owner: str) -> list[str]:
-        return [owner + element for made in members for element in made.elements()]
-
-    return {
-        "in": ["t", *all_of(code.inputs, "")],
-        "out": all_of(code.outputs, ""),
-        "state": ["t", "started", "tracking", *all_of(code.state, ""), *all_of(code.outputs, "last.")],
-    }
+    """See `generate.columns`."""
+    return generate.columns(code.inputs, code.state, code.outputs)
 
 
 def flat(code: Code, about: About) -> str:
@@ -280,10 +285,10 @@ def flat(code: Code, about: About) -> str:
     lines += ["enum {", *(f"    PTSMC_{name.upper()}_SIZE = {len(found)}{',' if name != 'state' else ''}"
                           for name, found in lists.items()), "};", ""]  # fmt: skip
     for name in ("in", "state"):
-        lines += [f"static void {name}_from(const double *v, ptsmc_{name} *x)", "{"]
+        lines += [f"static inline void {name}_from(const double *v, ptsmc_{name} *x)", "{"]
         lines += [f"    x->{column} = ({kind(column)})v[{k}];" for k, column in enumerate(lists[name])] + ["}", ""]
     for name in ("out", "state"):
-        lines += [f"static void {name}_to(const ptsmc_{name} *x, double *v)", "{"]
+        lines += [f"static inline void {name}_to(const ptsmc_{name} *x, double *v)", "{"]
         lines += [f"    v[{k}] = (double)x->{column};" for k, column in enumerate(lists[name])] + ["}", ""]
     return "\n".join(lines)
 
@@ -297,8 +302,27 @@ def check(code: Code, about: About) -> str:
     """check.c."""
     lists = columns(code)
     names = [f"{kind}.{column}" for kind in ("out", "state") for column in lists[kind]]
-    listed = ",\n".join(f'    "{name}"' for name in names)
+    groups = {group: k for k, group in enumerate(dict.fromkeys(map(_compared, names)))}
+    listed = ",\n".join(f'    {{"{name}", {groups[_compared(name)]}}}' for name in names)
     return filled("check.c", name=about.name, listed=listed)
+
+
+def fuzz(code: Code, about: About) -> str:
+    """fuzz.c."""
+    kinds = {made.name: made.kind for made in code.inputs}
+    flags = [k for k, column in enumerate(columns(code)["in"]) if kinds.get(column.partition("[")[0], REAL) != REAL]
+    lines = [f"        v[{k}] = (double)(bits() % 2); /* a flag */" for k in flags]
+    return filled("fuzz.c", name=about.name, flags="\n".join(lines))
+
+
+# what is a difference of what: rounding leaves of it what it leaves of those
+TORQUES, RATES = ("d_hat", "observer", "command", "torque"), ("rate", "bias", "gyro")
+
+
+def _compared(column: str) -> str:
+    """The group of columns by the largest of which a column is compared."""
+    name = column.partition(".")[2].removeprefix("last.").partition("[")[0]
+    return TORQUES[0] if name.startswith(TORQUES) else RATES[0] if name in RATES else name
 
 
 def operations(code: Code) -> dict[str, int]:

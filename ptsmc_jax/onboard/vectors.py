@@ -66,7 +66,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             measured, _ = read(sensing, x, now, dt_before)
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
-        (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, x)
+        (target, d_hat, u, s, w, _), computer = decide(parts, k2, about(tick), computer, x)
         drive, queue = actuators.command(acting, u, w, dt, now.noise_weight)
         if pushed is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
@@ -95,7 +95,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     return jax.lax.scan(period, start, listed)[1]
 
 
-@programs.jit
+@programs.jit(compiler_options=programs.QUICKLY)
 def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
     """Trials by samples, (trials, samples, ..)."""
     return jax.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)

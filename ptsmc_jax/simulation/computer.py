@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.actuators import Actuators, Drive
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics.draws import Whole
@@ -38,6 +38,14 @@ class Decision(NamedTuple):
     u: Array  # (m,) commanded torque [N m]
     s: Array  # sliding variable
     w: Array  # (m,) velocity as it is seen [rad/s]
+    channels: Array | None = None  # (channels,) torque that software with limits and wheels of its own allots [N m]
+
+
+class Software(NamedTuple):
+    """A flight computer, as the rollout flies it: `boot` and `decide`, or what stands for them."""
+
+    boot: Callable[..., Computer]  # (parts, seed, trial, x0, first)
+    decide: Callable[..., tuple[Decision, Computer]]  # (parts, k2, period, computer, x, what the actuators carry)
 
 
 class Period(NamedTuple):
@@ -122,6 +130,14 @@ def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) ->
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
     decision = Decision(target, d_hat, u, s, parts.plant.velocity(seen))
     return decision, Computer(sensing, seen, memory, law, computer.applied)
+
+
+def _decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState) -> tuple:
+    del acting  # it is told what they did
+    return decide(parts, k2, period, computer, x)
+
+
+OURS = Software(boot, _decide)
 
 
 def _kept(flown: Array, new: Any, old: Any) -> Any:

@@ -20,7 +20,7 @@ from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.clock import Graded
-from ptsmc_jax.simulation.computer import Computer, boot, brought_about, decide, schedule
+from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
 
@@ -97,9 +97,12 @@ class _World(NamedTuple):
     pushed: Array | None  # random walk of the disturbance [N m]
 
 
-def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False) -> Result:
+def simulate(
+    parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False, software: Software = OURS
+) -> Result:
     """One closed-loop run. seed, trial: whole numbers below 2^32 that name its noise; record: return the history too.
 
+    software: the flight computer of a sampled loop, where it is not the parts' own code.
     A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.
     """
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
@@ -109,8 +112,9 @@ def simulate(parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = Fal
     clearance = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
     arrival = parts.reference(criteria.t_f)
     course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(clearance), _gap(ticks, parts.t_end))
-    loop = _continuous if isinstance(parts.clock, Graded) else _sampled
-    return loop(parts, ticks, course, seed, trial, record)
+    if isinstance(parts.clock, Graded):
+        return _continuous(parts, ticks, course, record)
+    return _sampled(parts, ticks, course, seed, trial, record, software)
 
 
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
@@ -121,10 +125,10 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
 
 
 # One compiled program for all parts of the same structure.
-simulate_jit = programs.jit(simulate, static_argnames="record")
+simulate_jit = programs.jit(simulate, static_argnames=("record", "software"))
 
 
-def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
+def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, software: Software) -> Result:
     """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = parts.observer.error_bound()
@@ -135,8 +139,11 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
         (now, *_), (state, world) = tick, carry
         dt, pushed = now.t_next - now.t, world.pushed
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
-        (target, d_hat, u, s, w), computer = decide(parts, k2, about(tick), computer, state.x)
+        (target, d_hat, u, s, w, channels), computer = software.decide(
+            parts, k2, about(tick), computer, state.x, world.acting
+        )
         drive, queue = actuators.command(world.acting, u, w, dt, now.noise_weight)
+        drive = drive if channels is None else drive._replace(c=channels)
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         torques = _torques(actuators, drive, u, dt)
@@ -158,7 +165,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -
     state = _begin(parts, course, acting.h)
     first = state.snapshot
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    computer = boot(parts, seed, trial, course.x0, started)
+    computer = software.boot(parts, seed, trial, course.x0, started)
     if actuators.holds:  # the state has it
         computer = computer._replace(applied=None)
     world = _World(computer, acting, pushed)
@@ -203,9 +210,8 @@ def over_period(parts: Parts, t: Scalar, x: Any, drive: Drive, pushed: Array | N
     return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
 
 
-def _continuous(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record) -> Result:
+def _continuous(parts: Parts, ticks: Ticks, course: _Course, record) -> Result:
     """Law and observer inside the integrator's stages; the observer's linear part exact in every step."""
-    del seed, trial  # nothing is drawn
     controller = parts.controller
     observer: Observer = parts.observer
     model = observer.model

@@ -45,6 +45,20 @@ def test_it_compiles_without_a_warning_and_replays_the_simulator(short, tmp_path
     assert make(place, "check", f"REAL={real}").returncode != 0
 
 
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_anything_may_come_in(short, tmp_path):
+    """A hundredth of what `make fuzz` takes, under the sanitizers where the compiler has them."""
+    place = shutil.copytree(short, tmp_path / "controller")
+    text = (place / "Makefile").read_text().replace("1000000", "10000")
+    (place / "Makefile").write_text(text)
+    done = make(place, "fuzz")
+    if "sanitize" in done.stderr and "cannot find" in done.stderr:
+        done = make(place, "fuzz", "SANITIZE=-O1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines()[-1].startswith("10000 rounds:")
+
+
 def test_vectors_are_the_run_that_the_simulator_flies(short):
     """Command by command: the recorded trial is the rollout's, of which the history keeps commands and estimates."""
     with (short / "vectors.csv").open() as file:

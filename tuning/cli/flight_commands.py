@@ -1,12 +1,17 @@
-"""The command that takes gains to flight."""
+"""The command that takes gains to flight, and what flies its C in the loop."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole
 from tuning.output import terminal
+
+if TYPE_CHECKING:
+    from ptsmc_jax.campaigns.runs import Run
+    from ptsmc_jax.scenario.flyable import Study
+    from ptsmc_jax.scenario.tables import Scenario
 
 
 def export(
@@ -41,6 +46,33 @@ def export(
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code).items() if n)
         terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")
     return 0
+
+
+class Compiled:
+    """A controller's folder, compiled, for `ptsmc simulate --controller`."""
+
+    def __init__(self, folder: Path):
+        from ptsmc_jax.onboard.library import Library
+
+        self._library = Library(folder)
+
+    def flown(self, scenario: "Scenario") -> "Scenario":
+        """The scenario as it flies: on the flight clock."""
+        from ptsmc_jax.onboard import folder
+
+        return folder.flown(scenario)
+
+    def fly(self, ready: "Study", seed: int, trial: int | None) -> "Run":
+        """A run with the controller in the loop."""
+        from ptsmc_jax.campaigns import runs
+        from ptsmc_jax.onboard.library import InTheLoop
+
+        return runs.fly(ready, seed, trial, InTheLoop(self._library, ready.parts).software)
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """Which controller flew, and how many of its samples ended with each status."""
+        return {"controller": self._library.digest, "controller_statuses": dict(self._library.statuses)}
 
 
 COMMANDS = (export,)

@@ -54,6 +54,12 @@ def simulate(
         str | None,
         Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
     ] = None,
+    controller: Annotated[
+        Path | None,
+        Parameter(
+            name="--controller", help="Folder of `ptsmc export`, whose C is compiled and flies, on the flight clock."
+        ),
+    ] = None,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -73,11 +79,14 @@ def simulate(
     from ptsmc_jax.scenario import study, timing
     from tuning.studies import single
 
+    computer = None if controller is None else flight_commands.Compiled(controller)
+    loaded = loaded if computer is None else computer.flown(loaded)
     ready = study(loaded, drawn=number is not None)
     if timing.steps(ready.parts) > LONG and not quiet:
         terminal.say(f"flying {timing.steps(ready.parts)} integration steps, with their history")
-    run = runs.fly(ready, key, number)
-    store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures))
+    run = runs.fly(ready, key, number) if computer is None else computer.fly(ready, key, number)
+    said = {} if computer is None else computer.told
+    store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures, **said))
     if not quiet:
         terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
     return 0 if run.met else 1

@@ -1,7 +1,8 @@
 /* check.c: replays vectors.csv through ptsmc_step and compares every output, state and status.
  *
  * A row is trial, sample, status, inputs, outputs, state after the sample; sample -1 is the state before the first one.
- * A number is compared relative to the largest one of its column in the file. Exit status 0: all agree.
+ * A number is compared relative to the largest of its group in the file: those of an array, and torques with torques,
+ * rates with rates, since an estimated disturbance or bias is a difference of these. Exit status 0: all agree.
  */
 #include <math.h>
 #include <stdio.h>
@@ -17,7 +18,10 @@ enum {
     LINE = 32 * COLUMNS + 2
 };
 
-static const char *const names[CHECKED] = {
+static const struct {
+    const char *name;
+    int group;
+} checked[CHECKED] = {
 @listed@
 };
 
@@ -68,7 +72,8 @@ int main(int count, char **given)
     }
     while ((read = row(file, v)) == 1) {
         for (int k = 0; k < CHECKED; k++) {
-            largest[k] = fmax(largest[k], fabs(v[HEAD + PTSMC_IN_SIZE + k]));
+            double *const most = &largest[checked[k].group];
+            *most = fmax(*most, fabs(v[HEAD + PTSMC_IN_SIZE + k]));
         }
     }
     rewind(file);
@@ -91,7 +96,8 @@ int main(int count, char **given)
         state_to(&state, found + PTSMC_OUT_SIZE);
         statuses += status != (int)v[2];
         for (int k = 0; k < CHECKED; k++) {
-            const double error = fabs(found[k] - v[HEAD + PTSMC_IN_SIZE + k]) / (largest[k] > 0.0 ? largest[k] : 1.0);
+            const double most = largest[checked[k].group];
+            const double error = fabs(found[k] - v[HEAD + PTSMC_IN_SIZE + k]) / (most > 0.0 ? most : 1.0);
             if (!(error <= off[k])) {
                 off[k] = error;
             }
@@ -103,6 +109,6 @@ int main(int count, char **given)
         worst = off[k] > off[worst] || off[k] != off[k] ? k : worst;
     }
     printf("%ld samples; other status: %ld; largest difference %.2e of %s, allowed %.0e\n", rows, statuses, off[worst],
-           names[worst], tolerance);
+           checked[worst].name, tolerance);
     return rows > 0 && statuses == 0 && off[worst] <= tolerance ? 0 : 1;
 }

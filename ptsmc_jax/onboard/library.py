@@ -1,0 +1,208 @@
+"""A controller's folder compiled, and flown in the loop: `ptsmc_step` decides where else the parts' own code does."""
+
+import ctypes
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.devices.actuators import ActuatorState
+from ptsmc_jax.devices.sensors import Sensors
+from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.generate import names_of
+from ptsmc_jax.onboard.templates import STATUS
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
+
+# many steps, a row each: states, inputs -> states, outputs, statuses
+GLUE = """
+#include "ptsmc_@name@_flat.h"
+
+void ptsmc_many(long count, const double *state, const double *in, double *after, double *out, int *status);
+void ptsmc_first(double *state);
+
+void ptsmc_many(long count, const double *state, const double *in, double *after, double *out, int *status)
+{
+    for (long k = 0; k < count; k++) {
+        ptsmc_state x;
+        ptsmc_in given;
+        ptsmc_out found;
+        state_from(state + k * PTSMC_STATE_SIZE, &x);
+        in_from(in + k * PTSMC_IN_SIZE, &given);
+        status[k] = ptsmc_step(&ptsmc_parameters, &x, &given, &found);
+        state_to(&x, after + k * PTSMC_STATE_SIZE);
+        out_to(&found, out + k * PTSMC_OUT_SIZE);
+    }
+}
+
+void ptsmc_first(double *state)
+{
+    ptsmc_state x;
+    ptsmc_init(&ptsmc_parameters, &x);
+    state_to(&x, state);
+}
+"""
+OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC")
+
+
+def compiler() -> list[str]:
+    """The command that compiles C; raises ScenarioError where there is none."""
+    said = os.environ.get("CC", "")
+    found = shlex.split(said) or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
+    if not found or shutil.which(found[0]) is None:
+        raise ScenarioError(
+            f"there is no C compiler{f' {said}' if said else ''}; allowed is cc, gcc or clang, or what CC names"
+        )
+    return found
+
+
+class Library:
+    """A controller's folder, compiled."""
+
+    def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
+        """Compiles it; raises ScenarioError where it is no controller, or does not compile."""
+        self.folder = Path(folder)
+        try:
+            layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
+            self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise ScenarioError(
+                f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
+            ) from None
+        self.statuses: Counter[str] = Counter()
+        with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
+            self._made = ctypes.CDLL(str(self._compiled(Path(place), real, options)))
+
+    def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
+        glue, made = place / "glue.c", place / "controller.so"
+        glue.write_text(GLUE.replace("@name@", self.name), encoding="utf-8")
+        sources = [self.folder / f"ptsmc_{self.name}{end}.c" for end in ("", "_parameters")]
+        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{self.folder}", *map(str, sources)]
+        done = subprocess.run(
+            [*command, str(glue), "-o", str(made), "-lm"], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            first = (done.stderr.strip().splitlines() or ["for no reason told"])[0]
+            raise ScenarioError(f"the controller in {self.folder} does not compile: {first}")
+        return made
+
+    def first(self) -> np.ndarray:
+        """The state that `ptsmc_init` leaves."""
+        state = np.zeros(len(self.columns["state"]))
+        self._made.ptsmc_first(_at(state))
+        return state
+
+    def many(self, state: Any, given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A step of each row (.., columns): states after it, outputs, statuses."""
+        state, given = (np.ascontiguousarray(v, dtype=float) for v in (state, given))
+        shape = state.shape[:-1]
+        after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
+        status = np.empty(shape, dtype=np.int32)
+        count = ctypes.c_long(int(np.prod(shape, dtype=int)))
+        self._made.ptsmc_many(count, *map(_at, (state, given, after, out, status)))
+        names = list(STATUS)
+        self.statuses.update({names[k].lower(): int(n) for k, n in enumerate(np.bincount(status.ravel())) if n})
+        return after, out, status
+
+
+def _at(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+class InTheLoop:
+    """A library as the flight computer of a rollout.
+
+    The true sensors, their noise and the actuators stay the simulator's; what they say goes through C, and what C
+    makes of it is what acts.
+    """
+
+    def __init__(self, library: Library, parts: Parts):
+        """Raises ScenarioError where the controller is one of other parts."""
+        self.library, self.board = library, board(parts)
+        mine = names_of(self.board)
+        for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
+            if library.columns[kind] != mine[kind]:
+                raise ScenarioError(
+                    f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
+                    "one with the same plant, law, observer, filter and actuators"
+                )
+
+    @property
+    def software(self) -> Software:
+        """What the rollout takes."""
+        return Software(self.boot, self.decide)
+
+    def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
+        """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""
+        computer = OURS.boot(parts, seed, trial, x0, first)
+        state = jnp.asarray(self.library.first())
+        estimate = getattr(computer.sensing, "estimate", None)
+        if estimate is not None:
+            state = self._with(self._with(state, "attitude", estimate.q), "bias", estimate.bias)
+        return computer._replace(sensing=(computer.sensing, state))
+
+    def decide(
+        self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
+    ) -> tuple[Decision, Computer]:
+        """A period by `ptsmc_step`; k2 is C's own."""
+        (now, dt_before, _), (sensing, state) = period, computer.sensing
+        read = x
+        if parts.sensors is not None:
+            sample = parts.sensors.sample if isinstance(parts.sensors, Sensors) else parts.sensors.measure
+            read, sensing = sample(sensing, x, now, dt_before)
+        known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
+        if computer.applied is not None:
+            known["applied"] = computer.applied[0]
+        if self.board.spacecraft:
+            known |= {"attitude": read.q, "rate": read.w}
+        if isinstance(parts.sensors, Sensors):
+            known["attitude_valid"] = (parts.sensors.star_weight(now) > 0.0).astype(float)
+        given = jnp.concatenate([now.t[None], *(jnp.ravel(known[name]) for name in self.board.inputs)])
+        after, out = self._stepped(state, given)
+        after = jnp.where(period.length > 0.0, after, state)
+        found = self._trees(self.board.outputs, out, 0)
+        kept = self._trees(self.board.state, after, 3)
+        channels = found.get("wheel_torque", found.get("torque"))
+        seen = self.board.state_of(tuple(kept[name] for name in self.board.seen))
+        decision = Decision(parts.reference(now.t), found["d_hat"], found["command"], found["s"],
+                            parts.plant.velocity(seen), channels)  # fmt: skip
+        return decision, Computer((sensing, after), seen, kept["observer"], kept["law"], computer.applied)
+
+    def _stepped(self, state: Any, given: Any) -> tuple[Any, Any]:
+        shapes = (
+            jax.ShapeDtypeStruct(state.shape, state.dtype),
+            jax.ShapeDtypeStruct((len(self.library.columns["out"]),), state.dtype),
+        )
+
+        def step(state: Any, given: Any) -> tuple[np.ndarray, np.ndarray]:
+            after, out, _ = self.library.many(np.asarray(state), np.asarray(given))
+            return after, out
+
+        return jax.pure_callback(step, shapes, state, given, vmap_method="broadcast_all")
+
+    def _with(self, state: Any, name: str, value: Any) -> Any:
+        at = self.library.columns["state"].index(f"{name}[0]")
+        return state.at[at : at + value.size].set(value)
+
+    def _trees(self, shapes: dict[str, Any], row: Any, at: int) -> dict[str, Any]:
+        """Named trees from a row of numbers, from a place on."""
+        found = {}
+        for name, shape in shapes.items():
+            leaves, tree = jax.tree.flatten(shape)
+            values = []
+            for leaf in leaves:
+                size = int(np.prod(leaf.shape, dtype=int))
+                values.append(row[at : at + size].reshape(leaf.shape).astype(leaf.dtype))
+                at += size
+            found[name] = jax.tree.unflatten(tree, values)
+        return found

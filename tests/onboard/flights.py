@@ -1,0 +1,66 @@
+"""Scenarios whose flight computers are written in C: one of each kind of what it may consist of."""
+
+from typing import Any
+
+from tests.tree import ROOT
+
+LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
+LAW = {"t_f": 5.0, "delta": 0.5}
+NOISE = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
+SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
+FULL = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
+OWN = f"{ROOT / 'scenarios' / 'own_parts.py'}:"
+PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
+
+
+def flight(**tables: Any) -> dict[str, Any]:
+    """A short flight on raw samples, with these tables."""
+    found: dict[str, Any] = {"loop": LOOP, "controller": LAW, "hardware": NOISE, "dispersion": SPREAD}
+    for name, table in tables.items():
+        found[name] = {**found.get(name, {}), **table} if isinstance(table, dict) and name != "observer" else table
+    return found
+
+
+FILTER = {"filter": {"kind": "steady_state"}}
+CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, -0.2]}, "loop": LOOP, "controller": LAW,
+         "hardware": {"state_noise": [1e-5, 1e-5]},
+         "dispersion": {"x0": {"kind": "uniform", "half_width": [0.5, 0.1]}}}  # fmt: skip
+FLIGHTS: dict[str, dict[str, Any]] = {
+    "raw": flight(),
+    "filter": flight(**FILTER),
+    "wheels": flight(**FILTER, wheels={"torque_limit": 2.0}, spacecraft={"inertia": FULL}),
+    "chain": CHAIN,
+    "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
+                             reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
+                                        "frequency": [0.2, 0.3, 0.1]}),
+    "own law": flight(controller={"kind": "own", "code": OWN + "Scaling", "delta": 1.0},
+                      observer={"kind": "own", "code": OWN + "LowPass"},
+                      reference={"kind": "own", "code": OWN + "Nodding", "angle": 0.1}),
+    # more of each kind
+    "no observer": flight(observer={"kind": "none"}, controller={"sign_width": 0.0}),
+    "finite time observer": flight(observer={"kind": "finite_time", "gain": [0.1, 0.1, 0.1]}),
+    "prescribed time observer": flight(observer={"kind": "prescribed_time", "t_o": 2.0}),
+    "implicit": flight(controller={"sampling": "implicit"}),
+    "chain of order 4": {**CHAIN, "plant": {"kind": "chain", "order": 4, "x0": [1.0, 0.0, 0.0, 0.0]},
+                         "hardware": {}, "dispersion": {}, "controller": {"t_f": 5.0, "delta": 1.0}},
+    "implicit chain": {**CHAIN, "controller": {**LAW, "sampling": "implicit"}},
+    "delay, limit, quantised": flight(hardware={"delay": 2, "torque_limit": 3.0, "torque_step": 1e-3},
+                                      controller={"delta": 1.0}),
+    "lag and rate limit": flight(
+        **FILTER, hardware={"torque_lag": 0.1, "torque_rate_limit": 20.0, "torque_limit": 4.0}),
+    "slow star tracker": flight(
+        **FILTER, hardware={"star_tracker_every": 5, "rate_bias": 1e-5, "rate_bias_walk": 1e-7}),
+    "wheels with lag, limits, delay": flight(
+        hardware={"torque_lag": 0.05, "delay": 1}, controller={"delta": 1.0},
+        wheels={"torque_limit": 1.5, "momentum_limit": 4.0, "momentum": [0.5, -0.2, 0.1, 0.3]}),
+    "spin": flight(reference={"kind": "spin", "rate": [0.01, 0.02, -0.01]}),
+    "slew": flight(controller={"error": "multiplicative"},
+                   reference={"kind": "slew", "to_quat_xyzw": [0.0, 0.0, 0.3826834323650898, 0.9238795325112867],
+                              "duration": 4.0}),
+    **{kind: {**flight(), "controller": {"kind": kind, "t_f": 5.0}} for kind in
+       ("pd", "terminal", "fixed_time", "time_base_pd", "time_base_sliding", "scaling", "predefined_time",
+        "super_twisting")},
+    "system": {"plant": {"kind": "system", "system": PENDULUM, "x0": [1.0, -0.5, 0.0, 0.0]}, "loop": LOOP,
+               "controller": LAW},
+}  # fmt: skip
+SIX = ("raw", "filter", "wheels", "chain", "multiplicative", "own law")

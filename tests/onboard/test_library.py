@@ -1,0 +1,178 @@
+"""The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import runs, store
+from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.generate import names_of
+from ptsmc_jax.onboard.library import InTheLoop, Library
+from ptsmc_jax.onboard.templates import STATUS
+from ptsmc_jax.scenario.errors import ScenarioError
+from tests.helpers import short
+from tests.onboard.compiled import needs_compiler
+from tests.onboard.flights import FLIGHTS
+
+OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
+
+
+def exported(place, name):
+    """A flight's controller without vectors, and its study."""
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
+    store.write(place, lambda making: folder.write_program(making, made))
+    return made, Library(place)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels", "own law"]))
+def test_the_compiled_controller_flies_what_the_simulator_flies(name, tmp_path):
+    made, library = exported(tmp_path / "controller", name)
+    ours = runs.fly(made.ready, 3, 2)
+    theirs = runs.fly(made.ready, 3, 2, InTheLoop(library, made.ready.parts).software)
+    assert sum(library.statuses.values()) == len(ours.log.t) - 1
+    assert set(library.statuses) <= {"ok", "saturated"}
+    for column, value in ours.columns().items():
+        other = theirs.columns()[column][:-1]  # the last row's s is of the parts' own law
+        np.testing.assert_allclose(
+            other, value[:-1], rtol=1e-9, atol=1e-9 * np.max(np.abs(value)) + 1e-15, err_msg=column
+        )
+    for metric, value in ours.metrics.items():
+        np.testing.assert_allclose(theirs.metrics[metric], value, rtol=1e-9, atol=1e-15, err_msg=metric)
+
+
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory):
+    """The compiled controller of a flight behind the attitude filter, and inputs of a trial (samples, columns)."""
+    made, library = exported(tmp_path_factory.mktemp("filtered") / "controller", "filter")
+    return library, given(made)
+
+
+def given(made):
+    """Good samples: a body that turns slowly, seen by star tracker and gyro."""
+    t = 0.1 * np.arange(40)
+    half = 0.25 + 0.01 * t
+    one, none = np.ones_like(t), np.zeros_like(t)
+    q = np.stack([np.sin(half), none, none, np.cos(half)], axis=1)
+    columns = {"t": t, **{f"attitude[{k}]": q[:, k] for k in range(4)}, "attitude_valid": one, "rate[0]": 0.02 * one}
+    return np.stack([columns.get(name, none) for name in names_of(made.board)["in"]], axis=1)
+
+
+def flown(library, samples):
+    """Statuses and outputs of samples one after the other."""
+    state, statuses, outputs = library.first(), [], []
+    for row in samples:
+        state, out, status = library.many(state, row)
+        statuses.append(int(status))
+        outputs.append(out)
+    return np.array(statuses), np.array(outputs)
+
+
+def changed(samples, at, **values):
+    """The samples with one of them changed, by columns without their brackets."""
+    found = samples.copy()
+    names = [
+        "t",
+        "attitude[0]",
+        "attitude[1]",
+        "attitude[2]",
+        "attitude[3]",
+        "attitude_valid",
+        "rate[0]",
+        "rate[1]",
+        "rate[2]",
+    ]
+    for name, value in values.items():
+        for column in (name, *(f"{name}[{k}]" for k in range(4))):
+            if column in names:
+                found[at, names.index(column)] = value
+    return found
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"rate": np.nan},
+        {"attitude": np.inf},
+        {"attitude": 0.0},
+        {"t": np.nan},
+        {"t": 0.3},  # backwards
+        {"t": 0.9},  # the last one's
+        {"rate": 20.0},  # more than a radian a period
+        {"rate": 1e300},
+    ],
+    ids=str,
+)
+def test_bad_input_gets_a_status_the_last_good_output_and_is_forgotten(filtered, bad):
+    library, samples = filtered
+    assert not flown(library, samples)[0].any()
+    statuses, outputs = flown(library, changed(samples, 10, **bad))
+    assert statuses[10] == INPUT
+    np.testing.assert_array_equal(outputs[10], outputs[9])
+    assert statuses[11] == MISSED
+    assert not np.delete(statuses, (10, 11)).any()
+    # all that is left of it is what a missed sample leaves
+    np.testing.assert_array_equal(outputs[11:], flown(library, np.delete(samples, 10, axis=0))[1][10:])
+
+
+@needs_compiler
+def test_a_star_tracker_without_an_attitude_is_not_missed(filtered):
+    library, samples = filtered
+    statuses, outputs = flown(library, changed(samples, 10, attitude_valid=0.0, attitude=np.nan))
+    assert not statuses.any()
+    assert np.all(np.isfinite(outputs))
+
+
+@needs_compiler
+def test_minus_q_is_the_same_attitude(filtered):
+    library, samples = filtered
+    other = samples.copy()
+    other[::2, 1:5] *= -1.0
+    np.testing.assert_allclose(flown(library, other)[1], flown(library, samples)[1], rtol=1e-12, atol=1e-14)
+
+
+@needs_compiler
+def test_a_singular_attitude_gets_the_last_good_command(tmp_path):
+    made, library = exported(tmp_path / "controller", "raw")
+    names = names_of(made.board)["in"]
+    angles = np.concatenate([np.linspace(2.9, np.pi, 11), np.linspace(np.pi, 2.9, 11)[1:]])
+    samples = np.zeros((len(angles), len(names)))
+    samples[:, 0] = 0.1 * np.arange(len(angles))
+    samples[:, names.index("attitude[0]")] = np.sin(angles / 2.0)
+    samples[:, names.index("attitude[3]")] = np.cos(angles / 2.0)
+    statuses, outputs = flown(library, samples)
+    assert statuses.tolist() == [OK] * 10 + [SINGULAR] + [OK] * 10  # half an angle within 1e-3 of a right one
+    at = names_of(made.board)["out"].index("command[0]")
+    np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
+
+
+@needs_compiler
+def test_limits_are_told(tmp_path):
+    made, library = exported(tmp_path / "controller", "delay, limit, quantised")
+    run = runs.fly(made.ready, 0, 0, InTheLoop(library, made.ready.parts).software)
+    assert library.statuses["saturated"] > 0
+    assert np.max(np.abs(run.log.u)) <= 3.0
+
+
+@needs_compiler
+def test_single_precision_flies_as_well(tmp_path):
+    """Statistics to three digits: see `benchmarks/exported_c.py`; one run's peak, and its error at t_f."""
+    made, _ = exported(tmp_path / "controller", "multiplicative")
+    single = InTheLoop(Library(tmp_path / "controller", "float"), made.ready.parts).software
+    ours, theirs = runs.fly(made.ready, 0, 0), runs.fly(made.ready, 0, 0, single)
+    for name in ("peak_torque", "window_error", "effort"):
+        np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-3, err_msg=name)
+
+
+@needs_compiler
+def test_what_is_no_controller_is_refused(tmp_path):
+    with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
+        Library(tmp_path / "nothing")
+    _, library = exported(tmp_path / "controller", "raw")
+    other = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
+    with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
+        InTheLoop(library, other.parts)
+    (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
+    with pytest.raises(ScenarioError, match="does not compile: "):
+        Library(tmp_path / "controller")
