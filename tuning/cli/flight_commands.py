@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.flyable import Study
     from ptsmc_jax.scenario.tables import Scenario
 
+ControllerFolder = Annotated[
+    Path | None,
+    Parameter(help="Folder that export left: its C is compiled and decides in the loop, on the flight clock."),
+]
+
 
 def export(
     scenario: Annotated[
@@ -62,17 +67,13 @@ class Compiled:
 
         return folder.flown(scenario)
 
-    def fly(self, ready: "Study", seed: int, trial: int | None) -> "Run":
-        """A run with the controller in the loop."""
+    def fly(self, ready: "Study", seed: int, trial: int | None) -> "tuple[Run, dict[str, Any]]":
+        """A run with the controller in the loop; which one it is, and how many samples ended with each status."""
         from ptsmc_jax.campaigns import runs
         from ptsmc_jax.onboard.library import InTheLoop
 
-        return runs.fly(ready, seed, trial, InTheLoop(self._library, ready.parts).software)
-
-    @property
-    def told(self) -> dict[str, Any]:
-        """Which controller flew, and how many of its samples ended with each status."""
-        return {"controller": self._library.digest, "controller_statuses": dict(self._library.statuses)}
+        run = runs.fly(ready, seed, trial, InTheLoop(self._library, ready.parts).software)
+        return run, {"controller": self._library.digest, "controller_statuses": dict(self._library.statuses)}
 
 
 COMMANDS = (export,)

@@ -84,8 +84,7 @@ def simulate(
     ready = study(loaded, drawn=number is not None)
     if timing.steps(ready.parts) > LONG and not quiet:
         terminal.say(f"flying {timing.steps(ready.parts)} integration steps, with their history")
-    run = runs.fly(ready, key, number) if computer is None else computer.fly(ready, key, number)
-    said = {} if computer is None else computer.told
+    run, said = (runs.fly(ready, key, number), {}) if computer is None else computer.fly(ready, key, number)
     store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures, **said))
     if not quiet:
         terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
