@@ -87,6 +87,22 @@ def drivers(
     return found
 
 
+def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
+    """Names of inputs (trials,) each, but for those that rank the trials as one before them does, or its reverse.
+
+    >>> angle = np.array([0.1, 0.7, 0.4])
+    >>> distinct({"initial_angle": angle, "initial_q4": np.cos(angle / 2), "initial_w1": np.array([2.0, 1.0, 3.0])})
+    ['initial_angle', 'initial_w1']
+    """
+    kept: dict[str, np.ndarray] = {}
+    for name, values in inputs.items():
+        rank = stats.rankdata(values)
+        rank = (rank - rank.mean()) / rank.std()
+        if all(abs(np.mean(rank * other)) <= ALIKE for other in kept.values()):
+            kept[name] = rank
+    return list(kept)
+
+
 def fewest_for(failures: int, quantile: float, confidence: float) -> int:
     """The fewest trials that show a quantile with this one-sided confidence where so many of them fail.
 

@@ -170,21 +170,36 @@ def worst(
     *,
     by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
     n: Annotated[str, Parameter(name=["--n", "-n"], help="Trials, a whole number from 1 to 10000.")] = "5",
+    why: Annotated[
+        bool,
+        Parameter(
+            negative="",
+            help="Say what was drawn in them, each input as a percentile of all trials, for every required metric too.",
+        ),
+    ] = False,
     quiet: Quiet = False,
 ) -> int:
-    """The worst trials of a campaign, failed ones first; leaves worst.csv in its folder.
+    """The worst trials of a campaign, failed ones first; leaves worst.csv, with --why why.csv, in its folder.
 
     Exit status: 0 done, 2 bad input.
     """
     count = whole("--n", n, 1, 10_000)
     _configured(folder)
+    from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
     from tuning.studies import campaign_folder, campaign_summary
 
-    frame = campaign_summary.worst(campaign_folder.opened(folder), by, count)
+    opened = campaign_folder.opened(folder)
+    frame = campaign_summary.worst(opened, by, count)
     store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
+    told = []
+    if why:
+        asked = [one.metric for one in scenarios.requirements(opened.scenario)]
+        told = campaign_summary.why(opened, list(dict.fromkeys((by, *asked))), count)
+        store.write_csv(folder / "why.csv", list(told[0]) if told else [], [list(one.values()) for one in told])
     if not quiet:
         campaign_terminal.worst(frame, by, folder)
+        campaign_terminal.why(told)
     return 0
 
 

@@ -90,6 +90,15 @@ def worst(frame: Any, by: str, folder: Path) -> None:
     console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
 
 
+def why(told: list[dict[str, Any]]) -> None:
+    """Of each worst trial the inputs that lie farthest from the middle, as percentiles of all trials."""
+    for metric, trial in dict.fromkeys((one["metric"], one["trial"]) for one in told):
+        mine = [one for one in told if (one["metric"], one["trial"]) == (metric, trial)]
+        mine = sorted(mine, key=lambda one: -abs(one["percentile"] - 50.0))[:4]
+        said = (f"{m['input']} {m['drawn']:.4g} at {m['percentile']:.1f} % (median {m['median']:.3g})" for m in mine)
+        terminal.say(f"{metric} {mine[0]['value']:.4g} in trial {trial}: {', '.join(said)}")
+
+
 def replayed(off: float | None, rounding: float) -> None:
     """How far a trial flown again is off its row, and the run with its history off both."""
     if off is None:

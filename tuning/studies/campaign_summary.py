@@ -1,6 +1,6 @@
 """What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,6 +150,36 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     failed = ~flying.finished(frame)
     chosen = statistics.most_extreme(frame[by].fill_null(float("nan")).to_numpy(), failed, count)
     return rows.read(parts).head(folder.trials)[chosen]
+
+
+def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
+    """What was drawn in the worst trials by each metric: each input as a percentile of all trials, and their median.
+
+    Failed trials first, as in `worst`; of inputs that rank the trials alike only the first.
+    """
+    parts = folder.whole_parts()
+    names = list(pl.read_parquet_schema(parts[0].path))
+    drawn = [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
+    frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
+    inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
+    distinct = statistics.distinct({name: values for name, values in inputs.items() if np.ptp(values) > 0.0})
+    failed, told = ~flying.finished(frame), []
+    for metric in metrics:
+        values = frame[metric].fill_null(float("nan")).to_numpy()
+        for at in statistics.most_extreme(values, failed, count):
+            told += [
+                {
+                    "metric": metric,
+                    "trial": int(frame["trial"][int(at)]),
+                    "value": float(values[at]),
+                    "input": name,
+                    "drawn": float(inputs[name][at]),
+                    "percentile": 100.0 * float(np.mean(inputs[name] <= inputs[name][at])),
+                    "median": float(np.median(inputs[name])),
+                }
+                for name in distinct
+            ]
+    return told
 
 
 @dataclass(frozen=True)
