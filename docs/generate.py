@@ -13,7 +13,7 @@ from unittest import mock
 from ptsmc_jax.scenario import errors, keys, layouts
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.tables import Limit
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Kinds, Table
 from ptsmc_jax.simulation import catalogues
 from tuning.cli.main import app
 
@@ -22,9 +22,9 @@ MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. 
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
 SCENARIOS = """\
 A scenario is a TOML file of tables; every table and every key is optional. What is not said has the default, for a
-spacecraft the paper's Case I. `hardware`, `wheels`, `filter`, `dispersion`, `requirements` and `tune` are off where
-they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name. `ptsmc new`
-writes all this into a file, to be changed.
+spacecraft the paper's Case I. `flexible`, `hardware`, `wheels`, `filter`, `dispersion`, `requirements` and `tune`
+are off where they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name.
+`ptsmc new` writes all this into a file, to be changed.
 
 A table with a `kind` has the keys of that kind. Commands that fly leave the scenario that they flew, every default
 filled in, as `scenario.toml` beside their results. What follows from several keys together, such as `delta` of at
@@ -40,8 +40,8 @@ t_end. One that is `missed`, far from the reference at t_f, counts with its metr
 ERRORS = """\
 The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
 part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and
-input. `peak_wheel_momentum` and `peak_wheel_torque` are there with `[wheels]` only.
-Numbers of one's own: `ptsmc montecarlo --metrics`."""
+input. `peak_wheel_momentum` and `peak_wheel_torque` are there with `[wheels]` only, `peak_modal` and `residual_modal`
+with `[flexible]`. Numbers of one's own: `ptsmc montecarlo --metrics`."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. And, of the sampled loop, any
@@ -122,6 +122,10 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
     ]
     if rows:
         yield _grid("key allowed default unit meaning", rows)
+    for key in keys.of(struct):
+        if f"{table}.{key.name}" in layouts.KINDS and plant == "spacecraft":
+            yield f"The kinds of `{key.name}`:"
+            yield _grid("key what given how", list(_kinds(key, layouts.KINDS[f"{table}.{key.name}"])))
     if borrowed:
         yield "And one of the attitude keys of `[initial]`."
 
@@ -133,15 +137,18 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _dispersion(struct: type[Table]) -> Iterator[str]:
-    rows = []
-    for key in keys.of(struct):
-        for kind, drawn in layouts.DISPERSIONS[key.name].items():
-            given = [f'`kind = "{kind}"`']
-            for k in keys.of(drawn):
-                said = [f"default {shown}" if (shown := _default(k.default)) else "", k.told]
-                given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
-            rows.append([f"`{key.name}`", key.meaning, "; ".join(given), keys.about(drawn)])
+    rows = [row for key in keys.of(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name])]
     yield _grid("key what given how", rows)
+
+
+def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
+    """A row for each kind of an inline table."""
+    for kind, struct in kinds.items():
+        given = [f'`kind = "{kind}"`']
+        for k in keys.of(struct):
+            said = [f"default {shown}" if (shown := _default(k.default)) else "", k.told]
+            given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
+        yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]
 
 
 def _default(value: object) -> str:

@@ -43,6 +43,31 @@ def bodies(tensors: np.ndarray) -> np.ndarray:
     return (moments[:, 0] > 1e-12 * scale) & (moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-9))
 
 
+def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
+    """J - D'D (3, 3) of a flexible body [kg m^2], for D (modes, 3) [sqrt(kg) m]; raises ValueError where it is not > 0.
+
+    inertia: J (3, 3), of the whole body with its modes at rest.
+    """
+    rows = np.asarray(coupling, dtype=float)
+    rest = inertia - rows.T @ rows
+    least = float(np.linalg.eigvalsh(rest)[0])
+    if least <= 1e-9 * np.abs(inertia).max():
+        raise ValueError(
+            "the inertia less D'D, what is left when all modes move along, must be positive definite "
+            f"(its smallest principal moment is {least:.6g} kg m^2)"
+        )
+    return rest
+
+
+def free_modes(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray:
+    """Angular frequencies (modes,) at which a flexible body rings where nothing holds it, without damping [rad/s]."""
+    rows, stiff = np.asarray(coupling, dtype=float), np.asarray(frequency, dtype=float) ** 2
+    # w' eliminated: (1 - D J^-1 D') e'' + W^2 e = 0
+    mass = np.eye(len(rows)) - rows @ np.linalg.solve(inertia, rows.T)
+    root = np.sqrt(stiff)
+    return np.sqrt(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root))
+
+
 def surface_roots(a: Any) -> np.ndarray:
     """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
     return np.roots([1.0, *reversed([float(v) for v in a])])

@@ -76,7 +76,7 @@ ROWS: dict[str, dict] = {
         "hardware": {
             "attitude_noise": 2e-4, "rate_noise_density": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
             "star_tracker_every": 3, "torque_limit": 2.0, "torque_rate_limit": 8.0, "torque_lag": 0.05,
-            "torque_step": 1e-3, "delay": 1,
+            "torque_step": 1e-3, "delay": 1, "command_filter": {"kind": "second_order", "corner": 6.0},
         },
         "disturbance": {
             "kind": "sum",
@@ -138,6 +138,13 @@ ROWS: dict[str, dict] = {
         "loop": SAMPLED,
         "hardware": NOISE,
         "dispersion": SPREAD,
+    },
+    "flexible body, sampled": {
+        "flexible": {"frequency": [3.0, 9.0], "damping": [0.005, 0.0], "coupling": [[1.2, 0.0, 0.3], [0.1, 0.9, 0.0]]},
+        "controller": {**SLEW, "error": "multiplicative"},
+        "loop": SAMPLED,
+        "hardware": NOISE,
+        "dispersion": {**SPREAD, "inertia": {"kind": "relative_normal"}, "rate": {"kind": "normal"}},
     },
     "implicit sampling": {
         "controller": {**SLEW, "error": "multiplicative", "sampling": "implicit"},
@@ -241,7 +248,7 @@ def at_rest_on_the_target(parts):
     """From the start, with the exact sign: every norm, root and sign at 0."""
     target = parts.reference(jnp.zeros(()))
     if isinstance(target, references.Target):
-        initial = rigid_body.AttitudeState(target.q, target.w)
+        initial = parts.plant.at_rest(rigid_body.AttitudeState(target.q, target.w))
     else:
         initial = jnp.zeros_like(parts.initial)
     exact = {"sign_width": jnp.zeros(())} if hasattr(parts.controller, "sign_width") else {}

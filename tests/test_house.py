@@ -20,7 +20,7 @@ HOUSE = {
         ".": "configure formulas | programs",
         "numerics": "elementary guards pytrees statistics | attitude draws matrices | integrators",
         "batching": "components dependence | lanes | kernel",
-        "plants": "base | integrator_chain rigid_body second_order",
+        "plants": "base | integrator_chain rigid_body second_order | flexible_body",
         "signals": "disturbances references",
         "laws": """
             error_motions
@@ -29,13 +29,14 @@ HOUSE = {
             fixed_time pd predefined_time scaling super_twisting terminal time_base
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
-        "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
+        "devices": "attitude_filter command_filter reaction_wheels ticks | actuators sensors",
         "simulation": "catalogues clock interval | assembly metric_rows requirements | computer metrics | rollout",
-        "dispersions": "base | attitudes inertias numbers quantities | variation | planned",
+        "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """
             errors systems values
             attitude_keys dispersion_tables gain_record keys scales
+            command_filter_tables
             device_tables gain_bounds own start_checks
             disturbance_bounds
             disturbance_tables law_record observer_tables reference_tables

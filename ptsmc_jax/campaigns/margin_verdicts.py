@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import INERTIA
+from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
@@ -39,7 +40,7 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
 
     rows: those of a plan, in place of the first trials.
     """
-    given = isinstance(rows, Row) and INERTIA in rows.given
+    given = isinstance(rows, Row) and bool({INERTIA, *OF_MISFITS} & set(rows.given))
     if not ready.margins or not (given or differ(ready.dispersion)):
         return of_loop(ready.parts, ready.margins)
     limits = {one.metric: one.limit for one in ready.margins}
@@ -55,7 +56,7 @@ def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Ve
 
 def differ(dispersion: Dispersion) -> bool:
     """Whether loops differ from trial to trial."""
-    return INERTIA in dispersion.kinds
+    return INERTIA in dispersion.kinds or bool(dispersion.misfits)
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:

@@ -56,11 +56,12 @@ class Run:
         return error_floor.along(self.parts, self.log) if finished else None
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history by column, (time,) each: t [s], state, estimate, delivered torque, sliding variable, wheels."""
+        """The history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, flexible modes."""
         log = self.log
         blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
         if log.wheels is not None:
             blocks["h"], blocks["v"] = log.wheels
+        blocks |= self.parts.plant.hidden_columns(log.x)
         found = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
             found |= numbered(name, block)

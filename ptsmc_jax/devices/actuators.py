@@ -3,7 +3,7 @@
 Each device is off where it is None. Quantisation has the derivative of the command it is given.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -40,6 +40,7 @@ class Drive(NamedTuple):
     c: Array
     h: Any  # (wheels,) at the start of the period [N m s]; None without wheels
     limited: Array  # bool: a limit cuts the command
+    works: Array | None = None  # (channels,) bool; None: all of them
 
 
 class Push(NamedTuple):
@@ -74,6 +75,32 @@ class Actuators:
     step: Leaf | None = None  # quantisation [N m]
     wheels: Wheels | None = None
     delay: int = field(default=0, metadata={"static": True})  # whole control periods
+    # as they are, where that is not as the flight software knows them
+    scale: Leaf | None = None  # (channels,) what each axis, or wheel, gives of its torque [-]
+    directions: Leaf | None = None  # (m, channels) unit vectors along which they act
+    fails: Leaf | None = None  # (channels,) times from whose next sample on they give nothing [s]
+    spares: Leaf | None = None  # (wheels, wheels, 3) allocation without each of them, where a failure is known
+
+    @property
+    def known(self) -> "Actuators":
+        """The same as the flight software knows them."""
+        return replace(self, scale=None, directions=None, fails=None)
+
+    def told(self, drive: Drive, dt: Scalar) -> Push:
+        """What flight software takes to have acted in a period dt [s], torques in N m: as `over` of what it knows."""
+        return self.known.over(drive if self.spares is not None else drive._replace(works=None), jnp.zeros_like(dt), dt)
+
+    def given(self, drive: Drive, v: Array) -> Array:
+        """What channels give of their torques [N m], or of anything linear in them, (channels,)."""
+        given = v if self.scale is None else self.scale * v
+        return given if drive.works is None else jnp.where(drive.works, given, 0.0)
+
+    def on_body(self, v: Array) -> Vector:
+        """A vector in body axes (m,) of numbers along the channels' directions (channels,), torques [N m] or others."""
+        axes = self.directions
+        if axes is None and self.wheels is not None:
+            axes = self.wheels.axes
+        return v if axes is None else axes @ v
 
     @property
     def moves(self) -> bool:
@@ -83,7 +110,8 @@ class Actuators:
     @property
     def holds(self) -> bool:
         """Whether the torque on the body is the target from the start of a period to its end."""
-        return not self.moves and self.wheels is None
+        fits = self.scale is None and self.directions is None and self.fails is None
+        return fits and not self.moves and self.wheels is None
 
     def begin(self, inputs: int) -> ActuatorState:
         """At rest: no torque, no command on its way."""
@@ -92,8 +120,10 @@ class Actuators:
         rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
         return ActuatorState(queue, None if self.holds else rest, momentum)
 
-    def command(self, state: ActuatorState, u: Vector, w: Vector, dt: Scalar, weight: Scalar) -> tuple[Drive, Any]:
-        """The period's drive and the queue after it, for the law's command u [N m] at the rate seen w [rad/s].
+    def command(
+        self, state: ActuatorState, u: Vector, w: Vector, t: Scalar, dt: Scalar, weight: Scalar
+    ) -> tuple[Drive, Any]:
+        """Drive of a period dt at t [s], and the queue after it, for the command u [N m] at the rate seen w [rad/s].
 
         The flight software knows the wheels' momentum and adds w x A h. weight: share of a partial first period; its
         command counts that much of the way, so that nothing jumps where the period vanishes.
@@ -107,7 +137,12 @@ class Actuators:
         limited = jnp.any(wanted != now)
         if self.wheels is not None:
             assert state.h is not None
-            wanted = self.wheels.allocation @ (wanted + jnp.cross(w, self.wheels.axes @ state.h))
+            allocation = self.wheels.allocation
+            if self.fails is not None and self.spares is not None:
+                failed = t >= self.fails
+                spare = jnp.sum(jnp.where(failed[:, None, None], self.spares, 0.0), axis=0)
+                allocation = jnp.where(jnp.any(failed), spare, allocation)
+            wanted = allocation @ (wanted + jnp.cross(w, self.wheels.axes @ state.h))
         if self.step is not None:
             wanted = quantise(wanted, self.step)
             if self.torque_limit is not None and self.wheels is None:  # a step may lie beyond it
@@ -120,7 +155,8 @@ class Actuators:
             assert state.v is not None
             reach = self.rate_limit * (dt if self.lag is None else dt + self.lag)
             limited = limited | jnp.any(jnp.abs(cut - state.v) > reach)
-        return Drive(state.v if self.moves else None, cut, state.h, limited), queue
+        works = None if self.fails is None else t < self.fails
+        return Drive(state.v if self.moves else None, cut, state.h, limited, works), queue
 
     def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
         """Wheel torques that keep the momentum limit at the end of the period, and the torque limit in any case.
@@ -173,12 +209,12 @@ class Actuators:
     def torque(self, drive: Drive, s: Scalar) -> Vector:
         """Torque on the body s [s] into the period [N m]."""
         v, *_ = self.channels(drive, s)
-        return v if self.wheels is None else self.wheels.axes @ v
+        return self.on_body(self.given(drive, v))
 
     def wheels_at(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
         """Momentum [N m s] and torque [N m] of each wheel s [s] into the period, (wheels,) each."""
         v, impulse, _ = self.channels(drive, s)
-        return drive.h - impulse, v
+        return drive.h - self.given(drive, impulse), self.given(drive, v)
 
     def over(self, drive: Drive, start: Scalar, dt: Scalar) -> Push:
         """What acts over dt [s] from `start` in the period: the torque's impulse and first moment are exact.
@@ -192,13 +228,12 @@ class Actuators:
             v = jnp.where(lasts, (first_next - first) / long, drive.v)
             moment = (first + first_next) / 2 * dt - (second_next - second)  # of the torque about the middle
             slope = jnp.where(lasts, 12.0 * moment / long**3, 0.0)
-        if self.wheels is None:
-            return Push(v, slope, None, dt)
-        axes = self.wheels.axes
-        return Push(axes @ v, None if slope is None else axes @ slope, axes @ self.wheels_at(drive, start)[0], dt)
+        stored = None if self.wheels is None else self.on_body(self.wheels_at(drive, start)[0])
+        mean = self.on_body(self.given(drive, v))
+        return Push(mean, None if slope is None else self.on_body(self.given(drive, slope)), stored, dt)
 
     def end(self, state: ActuatorState, drive: Drive, queue: Any, dt: Scalar) -> ActuatorState:
         """State after a period of dt [s]; one of length zero changes nothing."""
         v, impulse, _ = self.channels(drive, dt)
         v = None if state.v is None else jnp.where(dt > 0.0, v, state.v)
-        return ActuatorState(queue, v, None if drive.h is None else drive.h - impulse)
+        return ActuatorState(queue, v, None if drive.h is None else drive.h - self.given(drive, impulse))

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ptsmc_jax.formulas import wheel_axes
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
@@ -35,3 +36,9 @@ def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_li
     start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
     limits = (None if v is None else jnp.asarray(float(v)) for v in (torque_limit, momentum_limit))
     return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)
+
+
+def spares(device: Wheels) -> Float[Array, "n n 3"]:
+    """Allocation (n, n, 3) without each of the wheels: pseudo-inverses of A = axes [-], one of whose columns is 0."""
+    axes, each = np.asarray(device.axes), np.arange(device.axes.shape[1])
+    return jnp.stack([jnp.asarray(np.linalg.pinv(axes * (each != k), rcond=1e-6)) for k in each])

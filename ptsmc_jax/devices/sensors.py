@@ -80,6 +80,16 @@ class Sensors:
     filter: AttitudeFilter | None = None
     every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
     given_bias: Leaf | None = None  # (3,) at the first sample, where it is not drawn [rad/s]
+    # as they are, where that is not as the flight software takes them
+    misalignment: Leaf | None = None  # (3,) rotation vector of the star tracker in the body [rad]
+    rate_scale: Leaf | None = None  # (3,) what the gyro reads of the rate [-]
+    outage: Leaf | None = None  # (2,) from when to when the star tracker has no samples [s]; with a filter
+
+    def turned(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
+        """The attitude (4,) of the star tracker, a unit quaternion, for that of the body."""
+        if self.misalignment is None:
+            return q
+        return attitude.multiply(q, attitude.from_rotation_vector(self.misalignment))
 
     def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
         """The same with a filter of another bandwidth [rad/s]; period: of control [s]."""
@@ -123,7 +133,7 @@ class Sensors:
         if self.filter is not None:
             normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
             none = jnp.zeros(3) if bias is None else bias
-            estimate = self.filter.begin(x0.q, none, normals, now.sample, now.noise_weight)
+            estimate = self.filter.begin(self.turned(x0.q), none, normals, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
     def sample(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
@@ -133,15 +143,18 @@ class Sensors:
         bias = memory.bias
         if self.bias_rate is not None:
             bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
-        w = jnp.add(x.w, shift)
+        w = jnp.add(x.w if self.rate_scale is None else self.rate_scale * x.w, shift)
         if bias is not None:
             w = w + bias
-        q = attitude.multiply(x.q, attitude.from_rotation_vector(turn))
+        q = attitude.multiply(self.turned(x.q), attitude.from_rotation_vector(turn))
         return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
 
     def star_weight(self, now: Ticks) -> Scalar:
         """How much a star tracker sample counts at this sample; 0: there is none."""
-        return jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+        weight = jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+        if self.outage is not None:
+            weight = jnp.where((now.t >= self.outage[0]) & (now.t < self.outage[1]), 0.0, weight)
+        return weight
 
     def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
         """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""

@@ -4,9 +4,9 @@ A quantity is a row of `QUANTITIES`, by the name of the stream that it is drawn 
 these columns, and a plan may give it there.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,9 +23,15 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_RATE,
     INITIAL_STATE,
     REFERENCE,
+    Quantity,
+    UnfitError,
+    not_negative,
+    numbered,
+    positive,
 )
+from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.numerics import matrices
-from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
+from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -46,36 +52,6 @@ def level(name: str) -> str:
     return f"{name}_level"
 
 
-class UnfitError(ValueError):
-    """Numbers that cannot be flown: in which row, and what is allowed there."""
-
-    def __init__(self, row: int, allowed: str):
-        super().__init__(allowed)
-        self.row = row
-
-    @staticmethod
-    def check(fit: Any, allowed: Callable[[int], str]) -> None:
-        """Raise it of the first row that is not fit, (rows,) bool; allowed: what that row must have, in words."""
-        if not fit.all():
-            row = int(np.argmin(fit))
-            raise UnfitError(row, allowed(row))
-
-
-class Quantity(NamedTuple):
-    """One of `QUANTITIES`. Its numbers (n,) stand in as many columns."""
-
-    columns: Callable[[Parts], list[str]]  # their names; empty where these parts have no such quantity
-    read: Callable[[Parts], Numbers]
-    write: Callable[[Parts, Numbers], Parts]
-    # numbers (rows, n) as a plan gives them -> as they are flown; raises UnfitError
-    checked: Callable[[np.ndarray], np.ndarray] = lambda given: given
-
-
-def numbered(name: str, count: int) -> list[str]:
-    """Names of so many numbers, counted from 1."""
-    return [f"{name}{k + 1}" for k in range(count)]
-
-
 def _unit(q: np.ndarray) -> np.ndarray:
     """Unit quaternions; those that are unit ones but for rounding stay to the last digit."""
     norm = np.linalg.norm(q, axis=1)
@@ -84,21 +60,11 @@ def _unit(q: np.ndarray) -> np.ndarray:
     return np.where(rounding[:, None], q, q / norm[:, None])
 
 
-def _not_negative(given: np.ndarray) -> np.ndarray:
-    UnfitError.check((given >= 0.0).all(axis=1), lambda k: "numbers of at least 0")
-    return given
-
-
-def _positive(given: np.ndarray) -> np.ndarray:
-    UnfitError.check((given > 0.0).all(axis=1), lambda k: "a number greater than 0")
-    return given
-
-
 def _attitude() -> Quantity:
     return Quantity(
         lambda parts: numbered("initial_q", 4) if parts.plant.attitude else [],
         lambda parts: parts.initial.q,
-        lambda parts, q: replace(parts, initial=AttitudeState(q, parts.initial.w)),
+        lambda parts, q: replace(parts, initial=parts.initial._replace(q=q)),
         _unit,
     )
 
@@ -107,7 +73,7 @@ def _rate() -> Quantity:
     return Quantity(
         lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
         lambda parts: parts.initial.w,
-        lambda parts, w: replace(parts, initial=AttitudeState(parts.initial.q, w)),
+        lambda parts, w: replace(parts, initial=parts.initial._replace(w=w)),
     )
 
 
@@ -139,7 +105,8 @@ def with_body(parts: Parts, body: Spacecraft) -> Parts:
 def _with_inertia(parts: Parts, given: Numbers) -> Parts:
     entries = {pair: given[k] for k, pair in enumerate(PAIRS)}
     inertia = jnp.stack([jnp.stack([entries[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
-    return with_body(parts, Spacecraft(inertia, matrices.solve(inertia, jnp.eye(3))))
+    plant: Any = parts.plant
+    return with_body(parts, plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
 
 
 def _inertia_checked(given: np.ndarray) -> np.ndarray:
@@ -203,7 +170,7 @@ def _level(name: str) -> Quantity:
         return replace(parts, **{part: replace(device, **{key: given.reshape(there(parts).shape)})})
 
     return Quantity(
-        columns, lambda parts: jnp.ravel(there(parts)), write, _positive if name == "torque_limit" else _not_negative
+        columns, lambda parts: jnp.ravel(there(parts)), write, positive if name == "torque_limit" else not_negative
     )
 
 
@@ -232,6 +199,7 @@ QUANTITIES: dict[str, Quantity] = {
     DISTURBANCE_BIAS: _bias(),
     **{level(name): _level(name) for name in LEVELS},
     RATE_BIAS: _rate_bias(),
+    **OF_MISFITS,
 }
 
 

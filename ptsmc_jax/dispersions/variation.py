@@ -21,12 +21,12 @@ from ptsmc_jax.dispersions.base import (
     Coordinates,
 )
 from ptsmc_jax.dispersions.inertias import RelativeInertia
+from ptsmc_jax.dispersions.misfits import Misfit
 from ptsmc_jax.dispersions.numbers import Factor, Normal, Uniform, UniformPhase
-from ptsmc_jax.dispersions.quantities import LEVELS
+from ptsmc_jax.dispersions.quantities import LEVELS, QUANTITIES
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.numerics.pytrees import pytree
-from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -60,6 +60,7 @@ class Dispersion:
     bias: Uniform | Normal | None = None  # a constant disturbance that is added, about zero [N m]
     reference: Attitudes | None = None
     levels: dict[str, Factor] = field(default_factory=dict)  # see `LEVELS`
+    misfits: dict[str, Misfit] = field(default_factory=dict)  # see `misfits.MISFITS`
 
     @property
     def varies(self) -> bool:
@@ -71,6 +72,7 @@ class Dispersion:
         """What is drawn, by the name of its stream."""
         kinds = {name: getattr(self, field) for name, field in FIELDS.items()}
         kinds |= {quantities.level(name): level for name, level in self.levels.items()}
+        kinds |= self.misfits
         return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def coordinates(self, seed: Whole, trial: Whole) -> Coordinates:
@@ -95,18 +97,21 @@ class Dispersion:
         if self.attitude is not None:
             reference = parts.reference(jnp.zeros_like(parts.t_end))
             q = self.attitude.at(coordinates[INITIAL_ATTITUDE], parts.initial.q, reference.q)
-            parts = replace(parts, initial=AttitudeState(q, parts.initial.w))
+            parts = replace(parts, initial=parts.initial._replace(q=q))
         if self.rate is not None:
             w = self.rate.at(coordinates[INITIAL_RATE], parts.initial.w)
-            parts = replace(parts, initial=AttitudeState(parts.initial.q, w))
+            parts = replace(parts, initial=parts.initial._replace(w=w))
         if self.inertia is not None:
-            parts = quantities.with_body(parts, Spacecraft(*self.inertia.at(coordinates[INERTIA])))
+            plant: Any = parts.plant
+            parts = quantities.with_body(parts, plant.with_inertia(*self.inertia.at(coordinates[INERTIA])))
         for name, level in self.levels.items():
             part, key = LEVELS[name]
             device = getattr(parts, part)
             nominal = getattr(device, key)
             factor = level.at(coordinates[quantities.level(name)], jnp.ones(level.count))
             parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
+        for name, misfit in self.misfits.items():
+            parts = QUANTITIES[name].write(parts, misfit.at(coordinates[name], parts))
         return replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
 
     def _disturbance(self, nominal: Any, coordinates: Coordinates) -> Any:
@@ -140,4 +145,5 @@ class Dispersion:
         """The same, with nothing drawn from these streams; each of the others draws what it drew."""
         none = {field: None for name, field in FIELDS.items() if name in names}
         kept = {name: level for name, level in self.levels.items() if quantities.level(name) not in names}
-        return replace(self, **none, levels=kept)
+        misfits = {name: misfit for name, misfit in self.misfits.items() if name not in names}
+        return replace(self, **none, levels=kept, misfits=misfits)

@@ -73,7 +73,7 @@ class ErrorVector(ErrorMotion):
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""
         opposite = x.q[3] * target.q[3] < 0.0
-        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+        return x._replace(q=jnp.where(opposite, -x.q, x.q))
 
     def clearance(self, x: AttitudeState, target: Target) -> Scalar:
         """q4 counted positive on the reference's side [-]: at 0 the law is singular, beyond it cannot come back."""
@@ -112,7 +112,7 @@ class ErrorQuaternion(ErrorMotion):
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """The same attitude with the sign of q for which q_e4 >= 0."""
         opposite = jnp.dot(x.q, target.q) < 0.0
-        return AttitudeState(jnp.where(opposite, -x.q, x.q), x.w)
+        return x._replace(q=jnp.where(opposite, -x.q, x.q))
 
     def clearance(self, x: AttitudeState, target: Target) -> Scalar:
         """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""

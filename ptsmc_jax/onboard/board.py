@@ -305,7 +305,8 @@ def _acting(made: Board, device: Actuators, m: int) -> None:
     def act(given: Any, u: Any, *read: Any) -> dict[str, Any]:
         found, known = dict(zip(names, read, strict=True)), given["actuators"]
         state = ActuatorState(found.get("before.queue"), found.get("in.acting"), found.get("in.wheel_momentum"))
-        drive, queue = known.command(state, u, found.get("now.rate", jnp.zeros_like(u)), given["period"], jnp.ones(()))
+        rate = found.get("now.rate", jnp.zeros_like(u))
+        drive, queue = known.command(state, u, rate, jnp.zeros(()), given["period"], jnp.ones(()))
         made = {"limited": drive.limited}
         if queue is not None:
             made["now.queue"] = queue

@@ -46,9 +46,17 @@ class Controller:
 
 
 def flown(scenario: Scenario) -> Scenario:
-    """The scenario as a flight computer has it, on the flight clock; raises ScenarioError of a continuous loop."""
+    """The scenario as a flight computer has it, on the flight clock.
+
+    Raises ScenarioError of a continuous loop, and of a filter of the command.
+    """
     if scenario.loop.mode != "sampled":
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
+    filtering = getattr(scenario.hardware, "command_filter", None)
+    if filtering is not None:
+        raise wrong(
+            "hardware.command_filter", parsing.plain(filtering), "absent to be exported: it is not written in C"
+        )
     return scenarios.replace(scenario, loop__clock="flight")
 
 

@@ -60,14 +60,15 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     def period(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
         (now, dt_before, *_), (x, computer, acting, pushed, unit) = tick, carry
         dt = now.t_next - now.t
-        measured, sensing = x, computer.sensing
+        there, sensing = parts.plant.seen(x), computer.sensing
+        measured = there
         if sensors is not None:
             read = sensors.sample if isinstance(sensors, Sensors) else sensors.measure
-            measured, _ = read(sensing, x, now, dt_before)
+            measured, _ = read(sensing, there, now, dt_before)
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
-        (target, d_hat, u, s, w, _), computer = decide(parts, k2, about(tick), computer, x)
-        drive, queue = actuators.command(acting, u, w, dt, now.noise_weight)
+        (target, d_hat, u, s, w, _), computer = decide(parts, k2, about(tick), computer, there)
+        drive, queue = actuators.command(acting, u, w, now.t, dt, now.noise_weight)
         if pushed is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         x_next = over_period(parts, now.t, x, drive, pushed, dt)
@@ -87,7 +88,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         )  # fmt: skip
         return (x_next, computer._replace(applied=known), actuators.end(acting, drive, queue, dt), pushed, unit), row
 
-    computer = boot(parts, seed, trial, x0, started)
+    computer = boot(parts, seed, trial, parts.plant.seen(x0), started)
     if actuators.holds:
         computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)

@@ -1,7 +1,19 @@
-"""What is controlled: the rigid spacecraft, the chain of integrators, second-order systems of one's own."""
+"""What is controlled: rigid and flexible spacecraft, chains of integrators, second-order systems of one's own."""
 
+from ptsmc_jax.plants.flexible_body import FlexibleSpacecraft, Modes, flexible
 from ptsmc_jax.plants.integrator_chain import Chain, chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft, spacecraft
 from ptsmc_jax.plants.second_order import System, system
 
-__all__ = ["AttitudeState", "Chain", "Spacecraft", "System", "chain", "spacecraft", "system"]
+__all__ = [
+    "AttitudeState",
+    "Chain",
+    "FlexibleSpacecraft",
+    "Modes",
+    "Spacecraft",
+    "System",
+    "chain",
+    "flexible",
+    "spacecraft",
+    "system",
+]

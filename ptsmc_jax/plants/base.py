@@ -66,8 +66,19 @@ class Plant(ABC):
         """The state with its constraints met again, which integration meets but for its error."""
         return x
 
+    def seen(self, x: Any) -> Any:
+        """What sensors see of a state: that of the model which law and observer know. Of most plants all of it."""
+        return x
+
+    def at_rest(self, seen: Any) -> Any:
+        """The state of which sensors see this, with what they do not see at rest."""
+        return seen
+
     def moved(self, x: Any, by: Float[Array, " n"]) -> Any:
-        """A state near another one: local coordinates (n,), as many as it has degrees of freedom."""
+        """A state near another one: local coordinates (n,), as many as it has degrees of freedom.
+
+        Those of what sensors see come first.
+        """
         return x + by
 
     def apart(self, x: Any, other: Any) -> Float[Array, " n"]:
@@ -86,9 +97,17 @@ class Plant(ABC):
         """Whether more happens in an integration step of dt [s] than it can follow."""
         return jnp.zeros_like(dt, dtype=bool)
 
+    def ringing(self, x: Any) -> Scalar | None:
+        """What the metrics peak_modal and residual_modal are the largest of; None where nothing rings."""
+        return None
+
     @abstractmethod
     def columns(self, x: Any) -> dict[str, Any]:
         """A history of states by the names of its columns: name -> (time, components)."""
+
+    def hidden_columns(self, x: Any) -> dict[str, Any]:
+        """The same of what sensors do not see."""
+        return {}
 
 
 def called(function: Callable | None) -> Any:

@@ -1,6 +1,6 @@
 """The rigid spacecraft of (1), (2), with reaction wheels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -16,10 +16,11 @@ Scalar = Float[Array, ""]
 
 
 class AttitudeState(NamedTuple):
-    """State of a rigid spacecraft."""
+    """State of a spacecraft; sensors see attitude and rate of it, and laws know no more."""
 
     q: Array  # (4,) unit quaternion, scalar last, body relative to inertial [-]
     w: Array  # (3,) body rate in body axes [rad/s]
+    modes: Any = None  # of a flexible body, see `flexible_body.Modes`
 
 
 @pytree
@@ -56,7 +57,7 @@ class Spacecraft(Plant):
 
     def normalise(self, x: AttitudeState) -> AttitudeState:
         """The state with |q| = 1 again."""
-        return AttitudeState(attitude.normalise(x.q), x.w)
+        return x._replace(q=attitude.normalise(x.q))
 
     def moved(self, x: AttitudeState, by: Float[Array, "6"]) -> AttitudeState:
         """The state turned by a small rotation in body axes [rad], its rate changed [rad/s]."""
@@ -77,6 +78,10 @@ class Spacecraft(Plant):
     def too_fast(self, x: AttitudeState, dt: Scalar) -> Array:
         """Whether the body turns more than 1 rad in a step of dt [s]."""
         return jnp.sum(x.w * x.w) * dt * dt > 1.0
+
+    def with_inertia(self, inertia: Float[Array, "3 3"], inverse: Float[Array, "3 3"]) -> "Spacecraft":
+        """The same body with another inertia [kg m^2], (3, 3), and its inverse."""
+        return replace(self, inertia=inertia, inertia_inverse=inverse)
 
     def columns(self, x: AttitudeState) -> dict[str, Any]:
         """Quaternion q1..q4 and body rate w1..w3 [rad/s]."""

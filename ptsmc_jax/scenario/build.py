@@ -1,10 +1,13 @@
 """The parts of a checked scenario that any plant has: law, observer, disturbance, sensors, actuators, dispersion."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
 
+from ptsmc_jax.devices import reaction_wheels
 from ptsmc_jax.dispersions import numbers, variation
+from ptsmc_jax.dispersions.misfits import MISFITS
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.scenario.tables import Scenario
@@ -18,6 +21,10 @@ def setup(scenario: Scenario) -> Setup:
     plant = scenario.truth(model)
     acting, walk = disturbance(scenario, plant)
     wheels = scenario.reaction_wheels
+    devices = scenario.devices.actuators(None if wheels is None else wheels.build())
+    if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
+        devices = dataclasses.replace(devices, spares=reaction_wheels.spares(devices.wheels))
+    filtering = scenario.devices.command_filter
     return Setup(
         plant=plant,
         disturbance=acting,
@@ -25,12 +32,13 @@ def setup(scenario: Scenario) -> Setup:
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
         sensors=scenario.devices.sensors(scenario),
-        initial=scenario.start(),
+        initial=plant.at_rest(scenario.start()),
         t_end=vector(scenario.end),
         window=vector(scenario.loop.window),
         settling_angle=vector(scenario.loop.settling_angle),
-        actuators=scenario.devices.actuators(None if wheels is None else wheels.build()),
+        actuators=devices,
         walk_rate=walk,
+        command_filter=None if filtering is None else filtering.build(),
     )
 
 
@@ -66,4 +74,9 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         amplitude=drawn("disturbance_amplitude", amplitudes),
         bias=drawn("disturbance_bias", parts.plant.inputs),
         levels={key: level for key, level in levels.items() if level is not None},
+        misfits={
+            key: made(getattr(table, key), parts)
+            for key, made in MISFITS.items()
+            if getattr(table, key, None) is not None
+        },
     )

@@ -90,7 +90,10 @@ def _check_loop(scenario: Scenario) -> None:
 
 def _check_periods(scenario: Scenario) -> None:
     """What is counted in periods, or holds some, against the period and the run."""
-    loop = scenario.loop
+    loop, filtering = scenario.loop, scenario.devices.command_filter
+    if filtering is not None and filtering.corner >= math.pi / loop.period:
+        highest = f"below pi / loop.period = {math.pi / loop.period:.6g}, the Nyquist frequency"
+        raise wrong("hardware.command_filter.corner", filtering.corner, highest)
     if loop.window < loop.period * (1 - 1e-9):
         raise wrong("loop.window", loop.window, f"at least one control period, loop.period = {loop.period}")
     samples = math.ceil(scenario.end / loop.period * (1 - 1e-9))
@@ -113,6 +116,7 @@ def _check_dispersion(scenario: Scenario) -> None:
         given = any(getattr(scenario.devices, one) is not None for one in given_by)
         if getattr(dispersion, key, None) is not None and not given:
             raise ScenarioError(f"dispersion.{key} needs hardware.{key}, which is absent")
+    _check_misfits(scenario)
     for key in ("attitude", "reference"):
         angles = getattr(dispersion, key, None)
         if angles is not None and getattr(angles, "min_deg", 0.0) > getattr(angles, "max_deg", 180.0):
@@ -123,3 +127,33 @@ def _check_dispersion(scenario: Scenario) -> None:
         value = getattr(drawn, key)
         if len(value) != states:
             raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
+
+
+def _check_misfits(scenario: Scenario) -> None:
+    dispersion, devices = scenario.dispersion, scenario.devices
+
+    def asked(*keys: str) -> list[str]:
+        return [key for key in keys if getattr(dispersion, key, None) is not None]
+
+    for key in asked("actuator_scale", "actuator_misalignment"):
+        if scenario.loop.mode != "sampled":
+            raise ScenarioError(f'dispersion.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
+        given = any(getattr(devices, one) is not None for one in devices.levels.get(name, ()))
+        if asked(key) and not given:
+            raise ScenarioError(f"dispersion.{key} needs hardware.{name}, which is absent; 0 will do")
+    if asked("wheel_failure") and scenario.reaction_wheels is None:
+        raise ScenarioError("dispersion.wheel_failure needs reaction wheels, but there is no [wheels] table")
+    if asked("star_tracker_outage") and not scenario.estimator.on:
+        raise ScenarioError(
+            "dispersion.star_tracker_outage needs an attitude filter, without which the law has no attitude; "
+            'allowed is [filter] with kind = "steady_state"'
+        )
+    for key in asked("star_tracker_outage", "wheel_failure"):
+        times = getattr(dispersion, key)
+        latest = scenario.end if times.latest is None else times.latest
+        if times.earliest > latest:
+            raise wrong(f"dispersion.{key}.earliest", times.earliest, f"at most {latest}, the latest time")
+    for key in asked("mode_frequency", "mode_coupling"):
+        if getattr(scenario, "flexible", None) is None:
+            raise ScenarioError(f"dispersion.{key} needs flexible modes, but there is no [flexible] table")

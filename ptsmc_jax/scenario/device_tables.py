@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from ptsmc_jax import formulas
 from ptsmc_jax.scenario import errors
+from ptsmc_jax.scenario.command_filter_tables import FirstOrderFilter, NotchFilter, SecondOrderFilter
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice, GainBounds
 from ptsmc_jax.scenario.values import Count, Kind, Kinds, NotNegative, NotNegatives, Positive, Table, Three
@@ -22,6 +23,7 @@ class Actuators(Table, frozen=True):
     """Between the command and the plant; each device is off where it is absent.
 
     Attributes:
+        command_filter: between the law and all that follows, an inline table with a kind
         torque_limit: largest torque per body axis [N m]
         torque_rate_limit: largest rate of the torque [N m/s]
         torque_lag: time constant of a first-order lag [s]
@@ -29,12 +31,18 @@ class Actuators(Table, frozen=True):
         delay: control periods from measuring to acting
     """
 
+    command_filter: FirstOrderFilter | SecondOrderFilter | NotchFilter | None = None
     torque_limit: Positive | None = None
     torque_rate_limit: Positive | None = None
     torque_lag: Positive | None = None
     torque_step: Positive | None = None
     delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # that can be drawn: the keys, any of which gives it
+
+    @property
+    def gains(self) -> Mapping[str, GainBounds]:
+        """What tuning may move."""
+        return {} if self.command_filter is None else self.command_filter.gains
 
     @property
     def periods_late(self) -> int:

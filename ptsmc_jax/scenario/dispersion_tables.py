@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from msgspec import Meta
 
-from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Table
+from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Table, Truth
 
 
 class Numbers(Table, frozen=True):
@@ -162,6 +162,7 @@ class RelativeNormal(Numbers, frozen=True):
         std: 1 sigma of the share
     """
 
+    widest: ClassVar[float] = 3.0
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
 
@@ -181,6 +182,68 @@ class RelativeUniform(Uniform, frozen=True):
 
     kind: Literal["relative_uniform"] = "relative_uniform"
     half_width: Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")] = 0.2
+
+
+class NormalTurn(Normal, frozen=True):
+    """Turned by a normal rotation vector.
+
+    Attributes:
+        std_deg: 1 sigma per component [deg]
+    """
+
+    width: ClassVar[str] = "std_deg"
+    kind: Literal["normal"] = "normal"
+    std_deg: NotNegative = 0.1
+
+    def of(self, count: int = 1) -> np.ndarray:
+        """The width of so many components [rad]."""
+        return np.deg2rad(super().of(count))
+
+
+class UniformTurn(Uniform, frozen=True):
+    """Turned by a rotation vector whose components are uniform.
+
+    Attributes:
+        half_width_deg: largest size of a component [deg]
+    """
+
+    width: ClassVar[str] = "half_width_deg"
+    kind: Literal["uniform"] = "uniform"
+    half_width_deg: NotNegative = 0.1
+
+    def of(self, count: int = 1) -> np.ndarray:
+        """The width of so many components [rad]."""
+        return np.deg2rad(super().of(count))
+
+
+class Outage(Table, frozen=True):
+    """Begins at any time between two, uniformly.
+
+    Attributes:
+        duration: how long it lasts [s]
+        earliest: from when on it may begin [s]
+        latest: until when; default: loop.t_end [s]
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    duration: Positive = 10.0
+    earliest: NotNegative = 0.0
+    latest: NotNegative | None = None
+
+
+class Failure(Table, frozen=True):
+    """Of any one wheel, at any time between two, uniformly.
+
+    Attributes:
+        earliest: from when on it may be [s]
+        latest: until when; default: loop.t_end [s]
+        known: the torque is given to the other wheels from then on
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    earliest: NotNegative = 0.0
+    latest: NotNegative | None = None
+    known: Truth = False
 
 
 class NormalBias(Normal, frozen=True):
@@ -241,6 +304,14 @@ class Dispersion(Table, frozen=True):
         attitude_noise: factor on hardware.attitude_noise
         rate_noise: factor on hardware.rate_noise
         torque_limit: factor on hardware.torque_limit
+        actuator_scale: factor on the torque of each axis, or wheel, that flight software does not know
+        actuator_misalignment: each axis, or wheel, turned from where flight software takes it to be
+        star_tracker_misalignment: the star tracker turned in the body
+        gyro_scale: factor on the rate that the gyro reads about each axis
+        star_tracker_outage: an interval without samples of the star tracker, with a filter
+        wheel_failure: a wheel that gives no torque any more
+        mode_frequency: factor on each of flexible.frequency
+        mode_coupling: factor on each row of flexible.coupling
     """
 
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
@@ -253,6 +324,14 @@ class Dispersion(Table, frozen=True):
     attitude_noise: RelativeNormal | RelativeUniform | None = None
     rate_noise: RelativeNormal | RelativeUniform | None = None
     torque_limit: RelativeNormal | RelativeUniform | None = None
+    actuator_scale: RelativeNormal | RelativeUniform | None = None
+    actuator_misalignment: NormalTurn | UniformTurn | None = None
+    star_tracker_misalignment: NormalTurn | UniformTurn | None = None
+    gyro_scale: RelativeNormal | RelativeUniform | None = None
+    star_tracker_outage: Outage | None = None
+    wheel_failure: Failure | None = None
+    mode_frequency: RelativeNormal | RelativeUniform | None = None
+    mode_coupling: RelativeNormal | RelativeUniform | None = None
 
 
 class StateDispersion(Table, frozen=True):

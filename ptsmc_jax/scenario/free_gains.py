@@ -9,6 +9,8 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice, GainBounds
 from ptsmc_jax.scenario.tables import Scenario
 
+_OTHERS = ("filter_bandwidth", "command_corner")  # gains that are none of a law or an observer
+
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     """The table with its defaults: gains, bounds, level; of a scenario that is checked but for it.
@@ -19,7 +21,7 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     if free is None:
         law = scenario.controller
         first, rest = law.free(sampled=scenario.loop.mode == "sampled")
-        free = (*first, *scenario.observer.gains, *rest, *scenario.estimator.gains)
+        free = (*first, *scenario.observer.gains, *rest, *scenario.estimator.gains, *scenario.devices.gains)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -43,11 +45,11 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
         raise wrong("tune.free", free, tables.FREE_TOLD)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in ("observer_gain", "filter_bandwidth", *scenario.controller.gains, *scenario.observer.gains):
+        if name not in ("observer_gain", *_OTHERS, *scenario.controller.gains, *scenario.observer.gains):
             known = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, "observer_gain"))
             raise ScenarioError(
                 f"{said} the law of controller.kind = {errors.show(scenario.controller.kind)} has no {name}; "
-                f"allowed is some of {', '.join(known)}, filter_bandwidth"
+                f"allowed is some of {', '.join((*known, *_OTHERS))}"
             )
     if "observer_gain" in free and "observer_gain" not in scenario.observer.gains:
         raise ScenarioError(
@@ -57,6 +59,10 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     if "filter_bandwidth" in free and "filter_bandwidth" not in scenario.estimator.gains:
         raise ScenarioError(
             f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
+        )
+    if "command_corner" in free and "command_corner" not in scenario.devices.gains:
+        raise ScenarioError(
+            f"{said} the command is not filtered; allowed is command_corner with hardware.command_filter"
         )
     if "t_f" in free and getattr(scenario.observer, "t_o", 0.0) is None:
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
@@ -92,7 +98,8 @@ def _check_bounds(choice: Choice, name: str) -> None:
 
 def _gain(scenario: Scenario, name: str) -> GainBounds:
     """The bounds of a gain that the scenario has."""
-    return {**scenario.controller.gains, **scenario.observer.gains, **scenario.estimator.gains}[name]
+    others = scenario.observer.gains, scenario.estimator.gains, scenario.devices.gains
+    return {**scenario.controller.gains, **others[0], **others[1], **others[2]}[name]
 
 
 def _default(choice: Choice, name: str) -> tuple[float, float]:
@@ -115,6 +122,9 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
     """The scenario's gain of this name, on each axis where it has several; none if it has none."""
     if name == "observer_gain":
         return getattr(scenario.observer, "gain", None) or ()
+    if name == "command_corner":
+        filtering = scenario.devices.command_filter
+        return () if filtering is None else (filtering.corner,)
     law = name in scenario.controller.gains
     value = getattr(scenario.controller if law else scenario.observer, name if law else _field(name), None)
     return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)

@@ -52,7 +52,9 @@ def about(struct: type[Table]) -> str:
 def allowed(kind: Any) -> str:
     """What a type allows, in words."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        return " or ".join(allowed(k) for k in typing.get_args(kind) if k is not type(None))
+        return " or ".join(dict.fromkeys(allowed(k) for k in typing.get_args(kind) if k is not type(None)))
+    if isinstance(kind, type) and issubclass(kind, Table):
+        return "an inline table"
     if typing.get_origin(kind) is Literal:
         return " or ".join(f'"{v}"' for v in typing.get_args(kind))
     return next((m.description for m in getattr(kind, "__metadata__", ()) if m.description), "of another type")

@@ -312,7 +312,19 @@ def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
     for key in raw:
         if key not in known:
             raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
-    return struct(**{key: _value(f"{name}.{key}", value, hints[key]) for key, value in raw.items()})
+    return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in raw.items()})
+
+
+def _key(key: str, value: Any, kind: Any) -> Any:
+    """A value, or a table of one of several kinds."""
+    kinds = layouts.KINDS.get(key)
+    if kinds is None:
+        return _value(key, value, kind)
+    if isinstance(value, Table):
+        return value
+    if not isinstance(value, Mapping):
+        raise wrong(key, value, f"an inline table such as {{ kind = {show(next(iter(kinds)))} }}")
+    return _table(key, value, kinds)
 
 
 def _value(key: str, value: Any, kind: Any) -> Any:

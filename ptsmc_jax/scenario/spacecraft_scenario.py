@@ -2,21 +2,22 @@
 
 import math
 from collections.abc import Collection, Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from ptsmc_jax import formulas
 from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
-from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Inertia, Kinds, Table
+from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 
 # of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
@@ -46,18 +47,55 @@ class Spacecraft(Table, frozen=True):
     true_inertia: Inertia | None = None
 
 
+class Flexible(Table, frozen=True):
+    """Flexible appendages, or liquid that sloshes, of the body that flies; law, observer and filter know a rigid one.
+
+    J w' + D' e'' = -w x (J w + D' e') + u + d, e'' + 2 z W e' + W^2 e = -D w', with the modes e at rest at t = 0, J the
+    inertia of the whole body and D the rows of `coupling`.
+
+    Attributes:
+        frequency: W of each mode, the body held [rad/s]
+        damping: damping ratio z of each mode
+        coupling: D, a row for each mode: how much it turns the body about each axis [sqrt(kg) m]
+    """
+
+    frequency: Annotated[
+        tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0, one for each mode")
+    ] = (6.0,)
+    damping: Annotated[
+        tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each mode")
+    ] = (0.005,)
+    coupling: Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] = (
+        (0.8, 0.0, 0.0),
+    )
+
+    def check(self, inertia: Any) -> None:
+        """As many numbers as modes, and a body that can have them; inertia: of the body that flies [kg m^2]."""
+        lists = {key: getattr(self, key) for key in self.__struct_fields__}
+        modes = sorted(map(len, lists.values()))[1]  # two of the three say it
+        for key, value in lists.items():
+            if len(value) != modes:
+                raise wrong(f"flexible.{key}", value, f"a list of {modes}, one for each mode")
+        try:
+            formulas.rest_inertia(formulas.check_inertia(inertia), self.coupling)
+        except ValueError as error:
+            raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
+
+
 class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     """A scenario of a rigid spacecraft."""
 
     spacecraft: Spacecraft
     initial: Initial
     reference: Any  # `reference_tables.ReferenceTable`
+    flexible: Flexible | None = None
     wheels: WheelLimits | None = None
     filter: FilterTable | None = None
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {
         "plant": SpacecraftPlant,
         "spacecraft": Spacecraft,
+        "flexible": Flexible,
         "initial": Initial,
         "reference": REFERENCES,
         "disturbance": DISTURBANCES["spacecraft"],
@@ -112,6 +150,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         found = super().written()
         return found if self.filter is None else msgspec.structs.replace(found, filter=self.filter.written(self))
 
+    @property
+    def true_inertia(self) -> Any:
+        """Inertia of the body that flies, as the scenario gives it [kg m^2]."""
+        table = self.spacecraft
+        return table.inertia if table.true_inertia is None else table.true_inertia
+
     def check_body(self) -> None:
         """A body that can be."""
         for key in ("inertia", "true_inertia"):
@@ -121,6 +165,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                     formulas.check_inertia(value)
                 except ValueError as error:
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
+        if self.flexible is not None:
+            self.flexible.check(self.true_inertia)
 
     def check_plant(self) -> None:
         """Attitudes that are given once, and devices that fit."""
@@ -141,11 +187,14 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return spacecraft(self.spacecraft.inertia)
 
     def truth(self, model: Any) -> Any:
-        """The body with its true inertia, where the scenario gives one."""
+        """The body with its true inertia, where the scenario gives one, and its flexible modes."""
+        from ptsmc_jax.plants.flexible_body import flexible
         from ptsmc_jax.plants.rigid_body import spacecraft
 
-        table = self.spacecraft
-        return spacecraft(table.inertia if table.true_inertia is None else table.true_inertia)
+        modes = self.flexible
+        if modes is None:
+            return spacecraft(self.true_inertia)
+        return flexible(self.true_inertia, modes.frequency, modes.damping, modes.coupling)
 
     def start(self) -> Any:
         """Attitude and rate at t = 0."""
@@ -177,6 +226,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         found[key] = rate
         for key, rate in self._nutation(setup).items():
             found[key] = found.get(key, 0.0) + rate
+        if self.flexible is not None:
+            modes, drawn = self.flexible, getattr(self.dispersion, "mode_frequency", None)
+            most = 1.0 if drawn is None else 1.0 + drawn.widest * float(drawn.of()[0])
+            inertia = np.asarray(setup.plant.inertia)
+            fastest = formulas.free_modes(inertia, modes.frequency, modes.coupling).max()
+            found["flexible.frequency"] = most * float(fastest)
         return found
 
     def _nutation(self, setup: Any) -> dict[str, float]:

@@ -24,7 +24,7 @@ from ptsmc_jax.theory import solutions
 
 MOST_SUBSTEPS = 200
 MOVING = 4  # steps a period at least where the torque changes within it
-_SMOOTHED = ("disturbance.frequency", "plant.system")
+_SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if loop.mode == "continuous":
-        if "plant.system" in frequencies:
-            frequencies["plant.system"] *= 2.0  # of which nothing else is known: 0.15 rad a step
+        for key in {"plant.system", "flexible.frequency"} & set(frequencies):
+            frequencies[key] *= 2.0  # 0.15 rad a step: of a system nothing else is known, and modes ring for long
         return _grid(scenario, reach, setup, saves, frequencies, visited), 1
     substeps = _substeps(scenario, frequencies)
     last = scenario.end + reach.t_f - scenario.controller.t_f
@@ -115,7 +115,7 @@ def _fastest(frequencies: Mapping[str, float]) -> float:
 def _substeps(scenario: Scenario, frequencies: Mapping[str, float]) -> int:
     """Integration steps a control period: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
 
-    At 0.1 rad of a disturbance, or of a system of one's own, 1e-7 of what it does.
+    At 0.1 rad of a disturbance, of a flexible mode, or of a system of one's own, 1e-7 of what it does.
     """
     frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
     needed = scenario.loop.period * _fastest(frequencies) / 0.025

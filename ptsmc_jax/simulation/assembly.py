@@ -5,6 +5,7 @@ from types import FunctionType
 from typing import Any, TypeVar
 
 from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
@@ -29,6 +30,7 @@ class Setup:
     settling_angle: Leaf  # [rad]
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
+    command_filter: CommandFilter | None = None  # between the law and the actuators
 
     def __post_init__(self) -> None:
         """A plain function, or a lambda, is a disturbance and a reference too."""

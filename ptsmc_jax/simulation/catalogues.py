@@ -32,6 +32,10 @@ CATALOGUE = {
     "peak_momentum": Entry("N m s", "largest 2-norm of the body's angular momentum"),
     "peak_wheel_momentum": Entry("N m s", "largest momentum stored in one reaction wheel", "wheels"),
     "peak_wheel_torque": Entry("N m", "largest torque of one reaction wheel", "wheels"),
+    "peak_modal": Entry(
+        "sqrt(kg) m", "largest size of the flexible modes' motion, (sum of e^2 + (e'/W)^2)^1/2", "flexible"
+    ),
+    "residual_modal": Entry("sqrt(kg) m", "the same from t_f to t_end", "flexible"),
 }
 # The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
 STATE_CATALOGUE = {

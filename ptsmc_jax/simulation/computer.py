@@ -28,6 +28,7 @@ class Computer(NamedTuple):
     law: Any  # memory of the law; None where it has none
     # what its actuators did in the last period: mean torque [N m], and momentum of the wheels in it [N m s]
     applied: tuple[Array, Array | None] | None  # None: kept elsewhere
+    filtered: Any = None  # memory of the command's filter; None without one
 
 
 class Decision(NamedTuple):
@@ -35,7 +36,7 @@ class Decision(NamedTuple):
 
     target: Any  # what the reference is then
     d_hat: Array  # (m,) [N m]
-    u: Array  # (m,) commanded torque [N m]
+    u: Array  # (m,) commanded torque, behind its filter [N m]
     s: Array  # sliding variable
     w: Array  # (m,) velocity as it is seen [rad/s]
     channels: Array | None = None  # (channels,) torque that software with limits and wheels of its own allots [N m]
@@ -80,16 +81,17 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
 
 
 def boot(parts: Parts, seed: Whole, trial: Whole, x0: Any, first: Ticks) -> Computer:
-    """A flight computer before its first sample; x0: the true state."""
+    """A flight computer before its first sample; x0: what sensors without noise see of the true state."""
     sensing = None if parts.sensors is None else parts.sensors.begin(seed, trial, x0, first)
     none = jnp.zeros(parts.plant.inputs)
     wheels = parts.actuators is not None and parts.actuators.wheels is not None
     applied = none, none if wheels else None
-    return Computer(sensing, x0, parts.observer.begin(), parts.controller.begin(), applied)
+    filtered = None if parts.command_filter is None else parts.command_filter.begin(parts.plant.inputs)
+    return Computer(sensing, x0, parts.observer.begin(), parts.controller.begin(), applied, filtered)
 
 
 def measure(parts: Parts, period: Period, computer: Computer, x: Any) -> tuple[Any, Any]:
-    """The state as the sensors see it at the start of a period, and their memory; x: the true state."""
+    """The state as the sensors see it at the start of a period, and their memory; x: as in `decide`."""
     if parts.sensors is None:
         return x, None
     return parts.sensors.measure(computer.sensing, x, period.now, period.dt_before)
@@ -97,12 +99,12 @@ def measure(parts: Parts, period: Period, computer: Computer, x: Any) -> tuple[A
 
 def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:
     """The disturbance (m,) [N m] by what the last period did to the state, and the observer's memory."""
-    observer, plant, dt = parts.observer, parts.plant, period.dt_before
+    observer, model, dt = parts.observer, parts.observer.model, period.dt_before
     assert computer.applied is not None
     torque, stored = computer.applied
     if stored is not None:  # w x h of the wheels, by the mean rate
-        torque = torque - jnp.cross((plant.velocity(computer.seen) + plant.velocity(seen)) / 2, stored)
-    impulse = observer.model.unexplained_impulse(period.now.t, computer.seen, seen, torque, dt)
+        torque = torque - jnp.cross((model.velocity(computer.seen) + model.velocity(seen)) / 2, stored)
+    impulse = model.unexplained_impulse(period.now.t, computer.seen, seen, torque, dt)
     memory = observer.update(period.matrix, computer.memory, impulse, period.now.t, dt)
     memory = _kept(dt > 0.0, memory, computer.memory)
     return observer.estimate(memory), memory
@@ -119,17 +121,27 @@ def command(
     return u, s, _kept(flown, memory, computer.law)
 
 
-def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) -> tuple[Decision, Computer]:
-    """The flight software in a control period: sensors, observer, law; k2: its K2(t) [s]; x: the true state.
+def filtered(parts: Parts, period: Period, computer: Computer, u: Array) -> tuple[Array, Any]:
+    """What the command's filter lets through of the law's torque (m,) [N m], and its memory."""
+    if parts.command_filter is None:
+        return u, computer.filtered
+    u, memory = parts.command_filter.step(computer.filtered, u, period.dt_before, period.length)
+    return u, _kept(period.length > 0.0, memory, computer.filtered)
 
+
+def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) -> tuple[Decision, Computer]:
+    """The flight software in a control period: sensors, observer, law, filter of its command; k2: its K2(t) [s].
+
+    x: what sensors without noise see of the true state, `Plant.seen`.
     `applied` of the computer that comes back is the old one: what the period's command brings about is not known yet.
     """
     target = parts.reference(period.now.t)
     seen, sensing = measure(parts, period, computer, x)
     d_hat, memory = estimate(parts, period, computer, seen)
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
-    decision = Decision(target, d_hat, u, s, parts.plant.velocity(seen))
-    return decision, Computer(sensing, seen, memory, law, computer.applied)
+    u, kept = filtered(parts, period, computer, u)
+    decision = Decision(target, d_hat, u, s, parts.observer.model.velocity(seen))
+    return decision, Computer(sensing, seen, memory, law, computer.applied, kept)
 
 
 def _decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState) -> tuple:
@@ -147,5 +159,5 @@ def _kept(flown: Array, new: Any, old: Any) -> Any:
 
 def brought_about(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
     """What the flight software knows of what its actuators did in a period."""
-    push = actuators.over(drive, jnp.zeros_like(dt), dt)
+    push = actuators.told(drive, dt)
     return push.mean, push.middle

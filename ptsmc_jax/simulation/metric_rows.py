@@ -111,6 +111,25 @@ def _wheels(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     return largest if stored is None else jnp.maximum(largest, jnp.max(jnp.abs(stored)))
 
 
+def _ringing_at_start(start: Start, criteria: Criteria) -> Array:
+    ringing = start.snapshot.ringing
+    return jnp.full_like(criteria.t_f, jnp.nan) if ringing is None else ringing
+
+
+def _ringing(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+    ringing = interval.end.ringing
+    return largest if ringing is None else jnp.maximum(largest, ringing)
+
+
+def _late_ringing(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+    """The largest at ends of intervals from t_f on; before, what it was."""
+    ringing = interval.end.ringing
+    if ringing is None:
+        return largest
+    early = interval.t < criteria.t_f  # an interval that t_f lies in begins anew
+    return jnp.where(interval.t_next >= criteria.t_f, jnp.where(early, ringing, jnp.maximum(largest, ringing)), largest)
+
+
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
@@ -161,4 +180,6 @@ METRICS = {
     "peak_wheel_torque": Metric(
         begin=lambda start, criteria: 0.0 * _wheels_at_start(start, criteria), update=_wheel_torque
     ),
+    "peak_modal": Metric(begin=_ringing_at_start, update=_ringing),
+    "residual_modal": Metric(begin=_ringing_at_start, update=_late_ringing),
 }

@@ -140,9 +140,9 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
         dt, pushed = now.t_next - now.t, world.pushed
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w, channels), computer = software.decide(
-            parts, k2, about(tick), computer, state.x, world.acting
+            parts, k2, about(tick), computer, parts.plant.seen(state.x), world.acting
         )
-        drive, queue = actuators.command(world.acting, u, w, dt, now.noise_weight)
+        drive, queue = actuators.command(world.acting, u, w, now.t, dt, now.noise_weight)
         drive = drive if channels is None else drive._replace(c=channels)
         if parts.walk_rate is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
@@ -165,7 +165,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     state = _begin(parts, course, acting.h)
     first = state.snapshot
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    computer = software.boot(parts, seed, trial, course.x0, started)
+    computer = software.boot(parts, seed, trial, parts.plant.seen(course.x0), started)
     if actuators.holds:  # the state has it
         computer = computer._replace(applied=None)
     world = _World(computer, acting, pushed)
@@ -332,7 +332,8 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     angle = parts.controller.angle(x, target)
-    return Snapshot(angle, parts.plant.speed(x), guards.norm(parts.plant.momentum(x)))
+    plant = parts.plant
+    return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.ringing(x))
 
 
 def _watch(

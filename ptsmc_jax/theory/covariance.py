@@ -59,7 +59,7 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * h)
     rows: Any = linear.opened_in(parts, run, lasting)
     loops = rows.loop
-    n, m, k = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2]
+    n, m, k, whole = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2], rows.error.shape[2]
     none = Reading(np.eye(k), np.zeros(k), np.ones(k, int), np.zeros(0), np.zeros(0))
     said: Reading = none if parts.sensors is None else parts.sensors.reading(h)
     waiting, own = loops.delay * m, said.own.size
@@ -70,8 +70,9 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     factor[mine] = np.diag(said.own)
     if said.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
         start = np.zeros((size, 6))
-        start[2 * k : 2 * k + 6] = error_floor.root(said.start[1])
-        factor[2 * k + 3 : 2 * k + 6] = np.diag(said.own)
+        kept = whole + k  # after x and what the computer saw of it
+        start[kept : kept + 6] = error_floor.root(said.start[1])
+        factor[kept + 3 : kept + 6] = np.diag(said.own)
         factor = np.hstack([factor, start])
     p = factor @ factor.T
     reads = np.zeros((k, size))  # x_seen
@@ -101,7 +102,7 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
             moves[:n], enters[:n] = moves[:n] + one.new[0] @ sends, enters[:n] + one.new[0] @ sent
         torque = max(torque, float(np.sqrt(np.diag(sends @ p @ sends.T + sent @ sent.T).max())))
         squares[j] = (
-            np.trace(row.error @ p[:k, :k] @ row.error.T),
+            np.trace(row.error @ p[:whole, :whole] @ row.error.T),
             np.mean(np.diag(slides @ p @ slides.T + slid @ slid.T)),
         )
         drift = np.concatenate([np.zeros(n + waiting), said.own_drift * dt, walked * dt])

@@ -5,10 +5,11 @@ else known, the covariance of the Kalman filter along the run is the least that 
 Cramer-Rao bound (Tichavsky, Muravchik, Nehorai, IEEE Trans. Signal Processing 46(5), 1998), at every sample
 P+ = P - P H' (H P H' + R)^-1 H P and P <- F P F' + Q between them; F is the derivative of a period of the true plant.
 
-Known are the plant, its true inertia, the disturbance but for its random walk, the torque on the body, and how large
-every noise is. The state is not, but by the samples: the bound is on whoever does as well from every start. Behind an
-attitude filter its steady state is known at t = 0, a gyro's bias by its 1 sigma. The torque in a period can use samples
-up to `delay` periods before its start: from there on the error is predicted.
+Known are the plant, its true inertia, its flexible modes, which are at rest at t = 0, the disturbance but for its
+random walk, the torque on the body, and how large every noise is. Attitude and rate are not, but by the samples: the
+bound is on whoever does as well from every start. Behind an attitude filter its steady state is known at t = 0, a
+gyro's bias by its 1 sigma. The torque in a period can use samples up to `delay` periods before its start: from there on
+the error is predicted.
 
 It bounds the mean over trials. A single run, or a small campaign, may come out below it by chance.
 """
@@ -153,11 +154,14 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     torque = slice(size - m, size)
 
     def wide(rows: np.ndarray) -> np.ndarray:
+        seen = rows.shape[1] - said.own.size  # what no sensor reads, the modes of a flexible body, comes after it
+        rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=1)
         return np.pad(rows, [(0, 0), (0, size - rows.shape[1])])
 
     # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
-    off = np.hypot(said.noise, np.linalg.norm(said.rows[:, n:] * said.own, axis=1))
-    unknown = UNKNOWN * np.max(np.abs(said.rows[:, :n]) * off[:, None], axis=0)
+    read = wide(said.rows)
+    off = np.hypot(said.noise, np.linalg.norm(read[:, n : n + said.own.size] * said.own, axis=1))
+    unknown = UNKNOWN * np.max(np.abs(read[:, :n]) * off[:, None], axis=0)
     start = np.diag(np.concatenate([unknown, said.own, np.zeros(m)]))
     if said.start is not None:
         rows, covariance = said.start
@@ -170,7 +174,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
     return Model(
         start=start,
-        rows=wide(said.rows),
+        rows=read,
         noise=np.where(ticks.sample[:, None] % said.every == 0, said.noise, np.inf),
         kick=np.asarray(ticks.t_next - ticks.t)[:, None, None] * drift,
         move=move,
@@ -207,7 +211,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     def acted(state: Any, now: tuple) -> tuple:
         tick, x, wanted = now
         dt = tick.t_next - tick.t
-        drive, queue = actuators.command(state, wanted, plant.velocity(x), dt, tick.noise_weight)
+        drive, queue = actuators.command(state, wanted, plant.velocity(x), tick.t, dt, tick.noise_weight)
         return actuators.end(state, drive, queue, dt), drive
 
     _, drives = jax.lax.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))

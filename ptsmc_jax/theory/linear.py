@@ -6,7 +6,7 @@ of the actuators among it. Closed are
 
     z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
 
-with x_seen = x, the state that the sensors see; u_new, u_old = u, `delay` periods ago, which acts from `late` on, and a
+with x_seen the part of x that sensors see; u_new, u_old = u, `delay` periods ago, which acts from `late` on, and a
 period before that, until then; d a torque on the plant. The flight computer is told what its own model of the actuators
 makes of u: a gain or a delay at the plant's input is one that it does not know. About the nominal run: no noise and no
 disturbance; of a star tracker that is slower than the loop the mean over its interval.
@@ -49,7 +49,7 @@ class Carry(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class Loop:
-    """A period of the loop, opened, see above: z (n,), of which the first k are x; u (m,)."""
+    """A period of the loop, opened, see above: z (n,), of which the first k are what sensors see of x; u (m,)."""
 
     a: Leaf  # (n, n) A
     seen: Leaf  # (n, k) B
@@ -62,7 +62,7 @@ class Loop:
     delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
 
     def closed_at_sensors(self, xp: Any = jnp) -> tuple[Float[ArrayLike, "n n"], Float[ArrayLike, "m n"]]:
-        """A (n, n) and C (m, n) with x_seen = x, in the units of the coordinates: rad, rad/s, [N m]."""
+        """A (n, n) and C (m, n) with x_seen closed, in the units of the coordinates: rad, rad/s, [N m]."""
         others = ((0, 0), (0, self.a.shape[0] - self.seen.shape[1]))
         return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
 
@@ -103,11 +103,11 @@ def nominal(parts: Parts) -> Nominal:
     k2, actuators = parts.observer.error_bound(), _actuators(parts)
     x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     model = actuators.begin(parts.plant.inputs)
-    computer = boot(parts, np.uint32(0), np.uint32(0), x0, started)
+    computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.seen(x0), started)
 
     def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
         period = about(tick)
-        decision, computer, model = _computed(parts, k2, period, carry, carry.x)
+        decision, computer, model = _computed(parts, k2, period, carry, parts.plant.seen(carry.x))
         wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
         x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
         after = Carry(x, acting, computer, model)
@@ -130,7 +130,7 @@ def _computed(
     """The flight computer's part of a period; seen: the state as the sensors see it."""
     actuators, dt = _actuators(parts), period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
-    drive, queue = actuators.command(carry.model, decision.u, decision.w, dt, period.now.noise_weight)
+    drive, queue = actuators.command(carry.model, decision.u, decision.w, period.now.t, dt, period.now.noise_weight)
     computer = computer._replace(applied=brought_about(actuators, drive, dt))
     return decision, computer, actuators.end(carry.model, drive, queue, dt)
 
@@ -149,7 +149,7 @@ def _acted(
     """
     prompt, x, acting = replace(_actuators(parts), delay=0), carry.x, carry.acting
     for command, t, length in commands:
-        drive, _ = prompt.command(acting, command, w, length, period.now.noise_weight)
+        drive, _ = prompt.command(acting, command, w, t, length, period.now.noise_weight)
         x = rollout.over_period(parts, t, x, drive, pushed, length)
         acting = prompt.end(acting, drive, None, length)
     return x, acting
@@ -159,31 +159,35 @@ class _Local:
     """Local coordinates of carries about one: x, then the state last seen, the sensors' memory, and all the rest."""
 
     def __init__(self, parts: Parts, base: Carry):
-        self._plant, self._sensors, self._base = parts.plant, parts.sensors, base
+        self._plant, self._model, self._sensors = parts.plant, parts.observer.model, parts.sensors
+        self._base = base
         self._turned = hasattr(parts.sensors, "moved")
-        start = jnp.zeros_like(parts.plant.apart(base.x, base.x))
+        start = parts.plant.apart(base.x, base.x)
+        known = self._model.apart(base.computer.seen, base.computer.seen)
         inside = parts.sensors.apart(base.computer.sensing, base.computer.sensing) if self._turned else jnp.zeros(0)
         rest, self._unravel = ravel_pytree(self._rest(base))
-        self.sizes = [start.size, start.size, inside.size, rest.size]
+        self.sizes = [start.size, known.size, inside.size, rest.size]
 
     def _rest(self, carry: Carry) -> Any:
         computer = carry.computer
         kept = None if self._turned else _numbers(computer.sensing)
-        return carry.acting, computer.memory, computer.applied, carry.model, kept, _numbers(computer.law)
+        own = _numbers(computer.law), computer.filtered
+        return carry.acting, computer.memory, computer.applied, carry.model, kept, *own
 
     def moved(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
-        acting, memory, told, model, kept, law = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
+        near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
+        acting, memory, told, model, kept, law, filtered = near
         inside = base.computer.sensing
         inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
         law = _with_numbers(base.computer.law, law)
-        computer = Computer(inside, plant.moved(base.computer.seen, seen), memory, law, told)
+        computer = Computer(inside, self._model.moved(base.computer.seen, seen), memory, law, told, filtered)
         return Carry(plant.moved(base.x, x), acting, computer, model)
 
     def apart(self, other: Carry) -> Array:
         base, plant = self._base, self._plant
-        seen = plant.apart(base.computer.seen, other.computer.seen)
+        seen = self._model.apart(base.computer.seen, other.computer.seen)
         inside = jnp.zeros(0)
         if self._turned:
             inside = self._sensors.apart(base.computer.sensing, other.computer.sensing)
@@ -207,7 +211,7 @@ class Opened(NamedTuple):
     """A control period of the nominal run: the loop, and what is asked of it."""
 
     loop: Loop
-    error: Array  # (m, k) of what the law drives to zero, by x
+    error: Array  # (m, x) of what the law drives to zero, by x
     s_command: Array  # (components, n) of s by z
     s_direct: Array  # (components, k) and by x_seen
 
@@ -218,12 +222,13 @@ def opened(parts: Parts, during: Nominal) -> Opened:
     period, before, after, arriving = during
     k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
     here, there, now, dt = _Local(parts, before), _Local(parts, after), period.now, period.length
-    z0, x0, u0 = jnp.zeros(sum(here.sizes)), jnp.zeros(here.sizes[0]), jnp.zeros(plant.inputs)
+    z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
 
     def flown(z: Array, seen: Array) -> tuple[Array, Array, Array]:
         carry = here.moved(z)
-        decision, computer, model = _computed(parts, k2, period, carry, plant.moved(before.x, seen))
+        seen = parts.observer.model.moved(plant.seen(before.x), seen)
+        decision, computer, model = _computed(parts, k2, period, carry, seen)
         x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
         return there.apart(Carry(x, acting, computer, model)), decision.u, decision.s
 
@@ -235,7 +240,7 @@ def opened(parts: Parts, during: Nominal) -> Opened:
 
         return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
 
-    (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, x0)
+    (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
     old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=_actuators(parts).delay)
     error = jax.jacfwd(lambda by: law.errors(plant.moved(before.x, by), target)[0])(x0)

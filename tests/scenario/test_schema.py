@@ -7,6 +7,7 @@ import pytest
 from ptsmc_jax.scenario import errors, from_tables, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -134,6 +135,7 @@ COMPLETE = [
     {"disturbance": {"kind": "none"}},
     {
         "hardware": {
+            "command_filter": {"kind": "second_order", "corner": 2.0, "damping": 0.7},
             "torque_limit": 0.5,
             "torque_rate_limit": 5.0,
             "torque_lag": 0.1,
@@ -147,7 +149,10 @@ COMPLETE = [
         }
     },
     {"hardware": {"rate_noise_density": 1e-7}},
+    {"hardware": {"command_filter": {"kind": "first_order", "corner": 2.0}}},
+    {"hardware": {"command_filter": {"kind": "notch", "corner": 2.0, "damping": 0.3}}},
     {"spacecraft": {"true_inertia": [10.0, 12.0, 14.0]}},
+    {"flexible": {"frequency": [6.0, 9.0], "damping": [0.005, 0.0], "coupling": [[0.8, 0.0, 0.1], [0.0, 0.5, 0.0]]}},
     {"wheels": {"kind": "pyramid", "cant_deg": 30.0, "torque_limit": 0.2, "momentum_limit": 4.0}},
     {"wheels": {"kind": "axes", "momentum": [0.1, 0.2, 0.3]}},
     {"filter": {"kind": "none"}},
@@ -180,6 +185,23 @@ COMPLETE = [
             "torque_limit": {"kind": "relative_normal", "std": 0.1},
         },
     },
+    {
+        "loop": {"mode": "sampled"},
+        "flexible": {},
+        "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6},
+        "wheels": {"kind": "pyramid"},
+        "filter": {"kind": "steady_state"},
+        "dispersion": {
+            "actuator_scale": {"kind": "relative_normal", "std": 0.1},
+            "actuator_misalignment": {"kind": "normal", "std_deg": 0.1},
+            "star_tracker_misalignment": {"kind": "uniform", "half_width_deg": 0.1},
+            "gyro_scale": {"kind": "relative_uniform", "half_width": 0.1},
+            "mode_frequency": {"kind": "relative_normal", "std": 0.1},
+            "mode_coupling": {"kind": "relative_uniform", "half_width": 0.1},
+            "star_tracker_outage": {"kind": "uniform", "duration": 5.0, "earliest": 1.0, "latest": 20.0},
+            "wheel_failure": {"kind": "uniform", "earliest": 1.0, "latest": 20.0, "known": True},
+        },
+    },
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
     {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
@@ -197,7 +219,13 @@ COMPLETE = [
             {"observer": {"kind": "finite_time", "gain": [0.1], "sign_width": 1e-5}},
             {"observer": {"kind": "prescribed_time", "gain": [1.0], "mu": 3.0, "t_o": 6.0, "delta_o": 0.1}},
             {"hardware": {"state_noise": [1e-5, 1e-5, 0.0], "delay": 1, "torque_limit": 0.5, "torque_lag": 0.1}},
-            {"hardware": {"torque_rate_limit": 5.0, "torque_step": 1e-4}},
+            {
+                "hardware": {
+                    "torque_rate_limit": 5.0,
+                    "torque_step": 1e-4,
+                    "command_filter": {"kind": "first_order", "corner": 2.0},
+                }
+            },
             {"dispersion": {"x0": {"kind": "uniform", "half_width": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"x0": {"kind": "normal", "std": [1.0, 0.5, 0.0]}}},
             {"dispersion": {"disturbance_phase": {"kind": "uniform"}}},
@@ -308,6 +336,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
     assert seen == {table for scenario in scenarios for table in scenario.__struct_fields__} - {"defaulted"}
     named.pop(Actuators)
     named.pop(WheelLimits)
+    named.pop(CommandFilter)
     named.pop(ReferenceTable)
     named.pop(BaselineTable)
     for table in [table for table in named if issubclass(table, Own)]:  # see test_own_kinds

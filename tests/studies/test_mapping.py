@@ -149,3 +149,31 @@ def test_folder_holds_the_map(tmp_path):
     assert (tmp_path / "figures" / "map.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "versions.json").read_text())["command"] == "map"
     assert scenario.read(tmp_path / "scenario.toml") == loaded
+
+
+FLEXIBLE = """
+loop = { mode = "sampled", period = 0.2, t_end = 9.0, clock = "flight" }
+controller = { t_f = 6.0, delta = 2.0, disturbance_bound = 0.0, k1 = 2.0, error = "multiplicative" }
+observer.kind = "none"
+disturbance.kind = "none"
+hardware.delay = 1
+initial.rotvec_deg = [10.0, 0.0, 0.0]
+flexible = { frequency = [3.0, 9.0], damping = [0.002, 0.02], coupling = [[1.0, 0.0, 0.0], [0.0, 0.1, 0.0]] }
+"""
+
+
+def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_unstable_pairs():
+    loaded, x, y, cells = flown("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIBLE, 1)
+    changed: Any = mapping._with(loaded, {"flexible.frequency[0]": 5.0})
+    assert changed.flexible is not None
+    assert changed.flexible.frequency == (5.0, 9.0)
+    with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] names a number that .* has not"):
+        mapping._with(loaded, {"flexible.frequency[2]": 5.0})
+    radii = np.array([cell.hold_radius for cell in cells]).reshape(2, 3)
+    assert np.all(radii[:, 0] < 1.0 + 1e-6)  # a slow mode is damped
+    assert np.all(radii[:, -1] > 1.0 + 1e-3)  # one that the loop is late for is driven
+    across, _ = mapping.spillover(loaded, x, y, cells)["the same in hold"]
+    after = np.flatnonzero(radii[0] > 1.0 + 1e-6)[0]
+    assert np.all((across[np.isfinite(across)] > x.values[0]) & (across[np.isfinite(across)] < x.values[-1]))
+    assert x.values[after - 1] < np.nanmin(across) < x.values[after]
+    assert mapping.spillover(asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")[0], x, y, cells) == {}

@@ -50,6 +50,7 @@ EXAMPLES: dict[str, Any] = {
     "wheels.momentum": 0.0,
     "filter.bandwidth": 0.05,
     "dispersion.half_width": 1.0,
+    "dispersion.latest": 30.0,
     "dispersion.std": 1.0,
     "tune.level": 0.9,
 }
@@ -94,6 +95,9 @@ class _File:
         borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # which [initial] explains
         for key in keys.of(struct):
             off = live is None or key.name not in live
+            if f"{name}.{key.name}" in layouts.KINDS:
+                yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
+                continue
             if not (off and key.name in borrowed):
                 value = values[key.name] if key.name in values else self.example(name, kind, key)
                 yield from _line(off, key.name, value, _meaning(key))
@@ -120,12 +124,16 @@ class _File:
         yield from _prose(keys.about(struct))
         yield f"{'#' if live is None else ''}[dispersion]"
         for key in keys.of(struct):
-            yield from _prose(f"{key.meaning}:")
             chosen = (live or {}).get(key.name, {})
-            for kind, drawn in layouts.DISPERSIONS[key.name].items():
-                table = {"kind": kind, **{k.name: self.example("dispersion", kind, k) for k in keys.of(drawn)}}
-                mine = chosen.get("kind") == kind
-                yield from _line(not mine, key.name, chosen if mine else table, keys.about(drawn))
+            yield from self.inline("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
+
+    def inline(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
+        """A line for each kind of an inline table of a table of this name; chosen: the one that is there."""
+        yield from _prose(f"{key.meaning}:")
+        for kind, struct in kinds.items():
+            table = {"kind": kind, **{k.name: self.example(name, kind, k) for k in keys.of(struct)}}
+            mine = chosen.get("kind") == kind
+            yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))
 
     def requirements(self) -> Iterator[str]:
         """Those that are there, or two of the many."""

@@ -16,15 +16,18 @@ from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.scenario import disturbance_bounds, keys, reading
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.observer_tables import NonlinearObserver
+from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.clock import Anchored
 from ptsmc_jax.simulation.rollout import Parts
 
 _AXIS = "observer_gain_"
+_OF_FILTERS = ("filter_bandwidth", "command_corner")
 
 
 def units(plant: str) -> dict[str, str]:
@@ -34,6 +37,7 @@ def units(plant: str) -> dict[str, str]:
         *((law, {name: name for name in law.gains}) for law in tables["controller"].values()),
         *((observer, {"gain": "observer_gain"}) for observer in tables["observer"].values()),
         *((one, {"bandwidth": "filter_bandwidth"}) for one in FILTERS.values()),
+        (CommandFilter, {"corner": "command_corner"}),
     ]
     found: dict[str, str] = {}
     for table, gains in named:
@@ -65,7 +69,7 @@ def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
 
 def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
     """Gains of the law."""
-    return {k: v for k, v in gains.items() if not k.startswith("observer_") and k != "filter_bandwidth"}
+    return {k: v for k, v in gains.items() if not k.startswith("observer_") and k not in _OF_FILTERS}
 
 
 def named(scenario: Scenario) -> tuple[str, ...]:
@@ -100,6 +104,9 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         assert isinstance(parts.sensors, Sensors)
         sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
         parts = replace(parts, sensors=sensors)
+    if "command_corner" in gains:
+        assert parts.command_filter is not None
+        parts = replace(parts, command_filter=replace(parts.command_filter, corner=gains["command_corner"]))
     _check_clock(parts)
     return parts
 
@@ -134,6 +141,8 @@ def gains_of(parts: Parts) -> dict[str, float]:
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
     if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    if parts.command_filter is not None:
+        gains["command_corner"] = float(parts.command_filter.corner)
     return {**gains, **{f"{_AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
 
 
@@ -152,6 +161,10 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
         changes["observer__gain"] = each
     if "filter_bandwidth" in gains:
         changes["filter__bandwidth"] = gains["filter_bandwidth"]
+    if "command_corner" in gains:
+        table = scenario.devices.command_filter
+        assert table is not None
+        changes["hardware__command_filter"] = {**plain(table), "corner": gains["command_corner"]}
     if "t_f" in gains:
         assert scenario.loop.t_end is not None
         changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)

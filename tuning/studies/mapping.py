@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from contourpy import contour_generator
 
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.observers.base import Linear
 from ptsmc_jax.observers.none import NoObserver
-from ptsmc_jax.scenario import Study, own, parsing, study
+from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -67,10 +68,14 @@ class Cell:
     delay_margin: float = np.nan  # [s]
     hold_gain_margin: float = np.nan  # after it
     hold_delay_margin: float = np.nan  # [s]
+    hold_radius: float = np.nan
 
 
 def axis(text: str, option: str) -> Axis:
-    """An axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9; raises AxisError."""
+    """An axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9, or of one number of several, KEY[0]=..
+
+    Raises AxisError.
+    """
     key, _, span = text.partition("=")
     parts = span.split(":")
     wanted = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
@@ -116,13 +121,23 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
 
 
 def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
-    """The scenario with other values of these keys; a key with a number per axis gets the value on each."""
+    """The scenario with other values of these keys; a key with a number per axis or mode gets the value on each.
+
+    A key with a number in brackets, flexible.frequency[0], on that one alone.
+    """
     changes: dict[str, Any] = {}
     for key, value in values.items():
         table, _, name = key.partition(".")
-        current = getattr(getattr(scenario, table, None), name, None)
+        name, _, place = name.partition("[")
+        current = changes.get(f"{table}__{name}", getattr(getattr(scenario, table, None), name, None))
         number: Any = int(value) if key in WHOLE else value
-        changes[f"{table}__{name}"] = [value] * len(current) if isinstance(current, tuple) else number
+        if isinstance(current, tuple | list):
+            one = place.removesuffix("]")
+            chosen = {int(one)} if one.isdecimal() else set(range(len(current)))
+            if not chosen <= set(range(len(current))):
+                raise ScenarioError(f"{key} names a number that {table}.{name} = {errors.brief(current)} has not")
+            number = [value if k in chosen else old for k, old in enumerate(current)]
+        changes[f"{table}__{name}"] = number
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
         loop, t_f = scenario.loop, values.get("controller.t_f", scenario.controller.t_f)
         assert loop.t_end is not None
@@ -162,9 +177,10 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
     parts = common(ready.parts)
     if ready.scenario.loop.mode == "sampled" and isinstance(parts.controller, Prescribed):
         ends = margins.at_ends(parts)
-        (at, radius), (hold, _) = ends["hand_over"], ends["hold"]
+        (at, radius), (hold, after) = ends["hand_over"], ends["hold"]
         known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
         known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
+        known["hold_radius"] = after
         read = parts.sensors is not None and hasattr(parts.sensors, "reading")
         if read and isinstance(parts.observer, NoObserver | Linear) and radius < 1.0:
             expected = covariance.noise(parts)
@@ -199,6 +215,26 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     return found
 
 
+def spillover(scenario: Scenario, x: Axis, y: Axis, cells: list[Cell]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Where the modes that the law does not know cost the loop its stability, by linear theory: label -> (x, y).
+
+    The border between pairs with a pole inside and outside the unit circle, at the hand-over and in hold.
+    """
+    if getattr(scenario, "flexible", None) is None:
+        return {}
+    across, up = (np.log(one.values) if one.logarithmic else np.asarray(one.values) for one in (x, y))
+    found = {}
+    for name, label in (("radius", "border by linear theory, at the hand-over"), ("hold_radius", "the same in hold")):
+        grid = np.array([getattr(cell, name) for cell in cells]).reshape(up.size, across.size)
+        off = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
+        pieces: Any = contour_generator(across, up, off).lines(margins.NEUTRAL)
+        if pieces:
+            points = np.concatenate([np.vstack([piece, [[np.nan, np.nan]]]) for piece in pieces])
+            ends = (np.exp(v) if one.logarithmic else v for one, v in zip((x, y), points.T, strict=True))
+            found[label] = tuple(ends)
+    return found
+
+
 def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
     """Fill a result folder."""
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
@@ -223,7 +259,7 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
             (y.key, y.values, y.logarithmic),
             grids,
             lost,
-            lines(scenario, x, y),
+            lines(scenario, x, y) | spillover(scenario, x, y, cells),
             scenario.plant.kind,
         )
         style.save({"map": made}, folder / "figures")

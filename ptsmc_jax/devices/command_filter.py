@@ -1,0 +1,96 @@
+"""Filters of the commanded torque, between the law and its actuators, that keep it off what rings in the body.
+
+Each is that of continuous time by the bilinear rule, its corner W met exactly: g = tan(W h / 2) for a period h (Tustin
+with prewarping; Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998). It integrates from one sample to
+the next, whatever the period's length is, and begins at rest: a roll-off has no output at the first sample. The flight
+computer knows its filter: observers are told the filtered command. Vectors (m,) in N m.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]
+
+
+class Kept(NamedTuple):
+    """What a filter carries from sample to sample: its integrators, with what they take up in half the next period."""
+
+    first: Array  # (m,) [N m]
+    second: Array  # (m,) [N m]; of a first-order filter not used
+
+
+@dataclass(frozen=True)
+class CommandFilter:
+    """What the flight computer asks of a filter of its command."""
+
+    corner: Leaf  # W [rad/s]
+
+    def begin(self, inputs: int) -> Kept:
+        """At rest."""
+        return Kept(jnp.zeros(inputs), jnp.zeros(inputs))
+
+    def half(self, dt: Scalar) -> Scalar:
+        """The g = tan(W dt / 2) [-] for a period dt [s]; W dt below pi."""
+        return jnp.tan(0.5 * self.corner * dt)
+
+    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+        """Filtered command (m,) [N m] of a sample, and what the next one finds.
+
+        before, dt: lengths of the periods that end and begin at the sample [s].
+        """
+        raise NotImplementedError
+
+
+@pytree
+@dataclass(frozen=True)
+class FirstOrder(CommandFilter):
+    """Roll-off W / (s + W): 3 dB and 45 degrees at the corner, then 20 dB a decade."""
+
+    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+        """The low pass y, y' = W (u - y)."""
+        g = self.half(before)
+        y = (kept.first + g * u) / (1.0 + g)
+        return y, Kept(y + self.half(dt) * (u - y), kept.second)
+
+
+@dataclass(frozen=True)
+class _Second(CommandFilter):
+    """Two integrators: b' = W h, l' = W b, h = u - 2 z b - l, as one of all second-order filters has them."""
+
+    damping: Leaf  # z [-]
+
+    def _integrated(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Vector, Kept]:
+        """Band b and low pass l of this sample."""
+        g, next_g = self.half(before), self.half(dt)
+        band = (kept.first + g * (u - kept.second)) / (1.0 + g * (g + 2.0 * self.damping))
+        low = kept.second + g * band
+        high = u - 2.0 * self.damping * band - low
+        return band, low, Kept(band + next_g * high, low + next_g * band)
+
+
+@pytree
+@dataclass(frozen=True)
+class SecondOrder(_Second):
+    """Roll-off W^2 / (s^2 + 2 z W s + W^2): 90 degrees at the corner, then 40 dB a decade."""
+
+    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+        """The low pass."""
+        _, low, kept = self._integrated(kept, u, before, dt)
+        return low, kept
+
+
+@pytree
+@dataclass(frozen=True)
+class Notch(_Second):
+    """Notch (s^2 + W^2) / (s^2 + 2 z W s + W^2): nothing passes at its corner, z says how wide it is."""
+
+    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+        """What is left without the band, u - 2 z b."""
+        band, _, kept = self._integrated(kept, u, before, dt)
+        return u - 2.0 * self.damping * band, kept

@@ -1,0 +1,301 @@
+"""How hardware that flies differs from what flight software takes it for: what trials may have, and how it is drawn.
+
+`OF_MISFITS` has what parts may have, by the name of its row, that of a key of [dispersion], of the stream of its draws
+and of its columns; `MISFITS` how each is drawn: numbers of the quantity = at(coordinates, nominal parts).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.devices.sensors import Sensors
+from ptsmc_jax.dispersions.base import Drawn, Numbers, Quantity, UnfitError, numbered, positive
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.clock import Graded
+
+
+def _actuators(parts: Parts) -> Actuators:
+    return Actuators() if parts.actuators is None else parts.actuators
+
+
+def channels(parts: Parts) -> Float[Array, "m channels"]:
+    """Directions (m, channels) [-] in which flight software takes its channels to act: body axes, or wheels."""
+    wheels = _actuators(parts).wheels
+    return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
+
+
+def _size(parts: Parts) -> int:
+    return 0 if isinstance(parts.clock, Graded) else channels(parts).shape[1]
+
+
+def _paired(name: str, count: int) -> list[str]:
+    """Names of vectors of three: number of the vector, then of the component."""
+    return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
+
+
+# --- what parts may have ---
+
+
+def _of_actuators(name: str, key: str, columns: Callable, nominal: Callable, write: Callable, checked: Any) -> Quantity:
+    def read(parts: Parts) -> Numbers:
+        found = getattr(_actuators(parts), key)
+        return jnp.ravel((nominal(parts) if found is None else found).T)
+
+    def written(parts: Parts, given: Numbers) -> Parts:
+        return replace(parts, actuators=replace(_actuators(parts), **{key: write(given)}))
+
+    return Quantity(lambda parts: columns(name, _size(parts)), read, written, checked)
+
+
+def _unit_vectors(given: np.ndarray) -> np.ndarray:
+    """Directions (rows, 3 channels), unit vectors but for rounding."""
+    norms = np.linalg.norm(given.reshape(len(given), -1, 3), axis=2)
+    UnfitError.check(
+        (np.abs(norms - 1.0) <= 1e-6).all(axis=1), lambda k: "unit vectors, three numbers for each channel"
+    )
+    return given
+
+
+def _failure() -> Quantity:
+    def read(parts: Parts) -> Numbers:
+        fails = _actuators(parts).fails
+        if fails is None:
+            return jnp.array([jnp.inf, 0.0])
+        return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
+
+    def write(parts: Parts, given: Numbers) -> Parts:
+        wheel = jnp.arange(channels(parts).shape[1]) + 1.0
+        return replace(
+            parts, actuators=replace(_actuators(parts), fails=jnp.where(wheel == given[1], given[0], jnp.inf))
+        )
+
+    def whole(given: np.ndarray) -> np.ndarray:
+        UnfitError.check(given[:, 1] == np.round(given[:, 1]), lambda k: "a time and the number of a wheel, from 1 on")
+        return given
+
+    def columns(parts: Parts) -> list[str]:
+        wheels = None if parts.actuators is None else parts.actuators.wheels
+        return [] if wheels is None else ["wheel_failure_time", "wheel_failure_wheel"]
+
+    return Quantity(columns, read, write, whole)
+
+
+def _of_sensors(key: str, columns: list[str], nominal: list[float], checked: Any = lambda given: given) -> Quantity:
+    def read(parts: Parts) -> Numbers:
+        found = getattr(parts.sensors, key)
+        return jnp.asarray(nominal) if found is None else found
+
+    return Quantity(
+        lambda parts: columns if isinstance(parts.sensors, Sensors) else [],
+        read,
+        lambda parts, given: replace(parts, sensors=replace(parts.sensors, **{key: given})),
+        checked,
+    )
+
+
+def _modes(parts: Parts) -> int:
+    """How many flexible modes the true plant has."""
+    return getattr(parts.plant, "frequency", np.zeros(0)).shape[-1]
+
+
+def _frequency() -> Quantity:
+    def write(parts: Parts, given: Numbers) -> Parts:
+        plant: Any = parts.plant
+        return replace(parts, plant=replace(plant, frequency=given))
+
+    def read(parts: Parts) -> Numbers:
+        plant: Any = parts.plant
+        return plant.frequency
+
+    return Quantity(lambda parts: numbered("mode_frequency_", _modes(parts)), read, write, positive)
+
+
+def _coupling() -> Quantity:
+    def write(parts: Parts, given: Numbers) -> Parts:
+        plant: Any = parts.plant
+        return replace(parts, plant=replace(plant, coupling=given.reshape(-1, 3)).settled())
+
+    def read(parts: Parts) -> Numbers:
+        plant: Any = parts.plant
+        return jnp.ravel(plant.coupling)
+
+    return Quantity(lambda parts: _paired("mode_coupling", _modes(parts)), read, write)
+
+
+_OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
+OF_MISFITS: dict[str, Quantity] = {
+    "actuator_scale": _of_actuators(
+        "actuator_scale", "scale", lambda name, n: numbered(f"{name}_", n), lambda parts: jnp.ones(_size(parts)),
+        lambda given: given, lambda given: given,
+    ),
+    "actuator_misalignment": _of_actuators(
+        "actuator_misalignment", "directions", _paired, channels, lambda given: given.reshape(-1, 3).T, _unit_vectors
+    ),
+    "star_tracker_misalignment": _of_sensors("misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3),
+    "gyro_scale": _of_sensors("rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
+    "star_tracker_outage": _of_sensors("outage", _OUTAGE, [np.inf, np.inf]),
+    "wheel_failure": _failure(),
+    "mode_frequency": _frequency(),
+    "mode_coupling": _coupling(),
+}  # fmt: skip
+
+
+# --- how they are drawn ---
+
+
+@runtime_checkable
+class Misfit(Protocol):
+    """What every one has."""
+
+    @property
+    def count(self) -> int:
+        """How many coordinates there are."""
+        ...
+
+    @property
+    def drawn(self) -> Drawn:
+        """How they are drawn."""
+        ...
+
+    def at(self, c: Float[Array, " coordinates"], parts: Parts) -> Float[Array, " n"]:
+        """The numbers (n,) of its quantity, from coordinates c [-] about the nominal parts."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What those have that are numbers about their nominal ones, `numbers` a class of `dispersions.numbers`."""
+
+    numbers: Any
+
+    @property
+    def count(self) -> int:
+        """How many numbers there are."""
+        return self.numbers.count
+
+    @property
+    def drawn(self) -> Drawn:
+        """How their coordinates are drawn."""
+        return self.numbers.drawn
+
+
+@pytree
+@dataclass(frozen=True)
+class Factors(_Drawn):
+    """Factors about 1, of which each quantity has its own."""
+
+    def at(self, c: Float[Array, " n"], parts: Parts) -> Float[Array, " n"]:
+        """The factors (n,) of coordinates c [-]."""
+        return self.numbers.at(c, jnp.ones(self.count))
+
+
+@pytree
+@dataclass(frozen=True)
+class Turn(_Drawn):
+    """A small rotation vector about zero."""
+
+    def at(self, c: Float[Array, "3"], parts: Parts) -> Float[Array, "3"]:
+        """The rotation vector (3,) [rad] of coordinates c [-]."""
+        return self.numbers.at(c, jnp.zeros(3))
+
+
+@pytree
+@dataclass(frozen=True)
+class TurnedChannels(_Drawn):
+    """A small rotation vector for each channel."""
+
+    def at(self, c: Float[Array, " n"], parts: Parts) -> Float[Array, " n"]:
+        """Their directions, unit vectors one after the other (3 channels,) [-], of coordinates c [-]."""
+        turns, axes = self.numbers.at(c, jnp.zeros(self.count)).reshape(-1, 3), channels(parts)
+        each = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[:, k]) for k in range(axes.shape[1])]
+        return jnp.concatenate(each)
+
+
+@pytree
+@dataclass(frozen=True)
+class FrequencyFactors(_Drawn):
+    """A factor on the frequency of each mode."""
+
+    def at(self, c: Float[Array, " n"], parts: Parts) -> Float[Array, " n"]:
+        """The frequencies (n,) [rad/s] of coordinates c [-]."""
+        plant: Any = parts.plant
+        return plant.frequency * self.numbers.at(c, jnp.ones(self.count))
+
+
+@pytree
+@dataclass(frozen=True)
+class CouplingFactors(_Drawn):
+    """A factor on the coupling row of each mode."""
+
+    def at(self, c: Float[Array, " modes"], parts: Parts) -> Float[Array, " n"]:
+        """The rows (3 modes,) [sqrt(kg) m] of coordinates c [-]."""
+        plant: Any = parts.plant
+        return jnp.ravel(plant.coupling * self.numbers.at(c, jnp.ones(self.count))[:, None])
+
+
+@pytree
+@dataclass(frozen=True)
+class Outage:
+    """An interval without samples of the star tracker, as long in every trial, which begins at any time."""
+
+    earliest: Leaf  # [s]
+    latest: Leaf  # [s]
+    duration: Leaf  # [s]
+    drawn: ClassVar[Drawn] = "uniform"
+    count: ClassVar[int] = 1
+
+    def at(self, c: Float[Array, "1"], parts: Parts) -> Float[Array, "2"]:
+        """Begin and end (2,) [s], begin = earliest + c (latest - earliest)."""
+        begin = self.earliest + c[0] * (self.latest - self.earliest)
+        return jnp.stack([begin, begin + self.duration])
+
+
+@pytree
+@dataclass(frozen=True)
+class Failure:
+    """One of the wheels, any, gives no torque from some time on."""
+
+    earliest: Leaf  # [s]
+    latest: Leaf  # [s]
+    drawn: ClassVar[Drawn] = "uniform"
+    count: ClassVar[int] = 2
+
+    def at(self, c: Float[Array, "2"], parts: Parts) -> Float[Array, "2"]:
+        """Time [s] and number of the wheel, (2,): earliest + c_1 (latest - earliest), 1 + floor(c_2 wheels)."""
+        wheel = 1.0 + jnp.floor(c[1] * channels(parts).shape[1])
+        return jnp.stack([self.earliest + c[0] * (self.latest - self.earliest), wheel])
+
+
+def _between(kind: type, *keys: str) -> Callable:
+    """Made of a table's times [s]; without `latest` until the end of the run."""
+
+    def made(table: Any, parts: Parts) -> Any:
+        values = [parts.t_end if getattr(table, key) is None else getattr(table, key) for key in keys]
+        return kind(*(jnp.asarray(v, float) for v in values))
+
+    return made
+
+
+def _about(kind: type, size: Callable[[Parts], int]) -> Callable:
+    """Made of a table that says how so many numbers are drawn."""
+    return lambda table, parts: kind(table.build(size(parts)))
+
+
+# made of the table of [dispersion], about these parts
+MISFITS: dict[str, Callable[[Any, Parts], Misfit]] = {
+    "actuator_scale": _about(Factors, _size),
+    "actuator_misalignment": _about(TurnedChannels, lambda parts: 3 * _size(parts)),
+    "star_tracker_misalignment": _about(Turn, lambda parts: 3),
+    "gyro_scale": _about(Factors, lambda parts: 3),
+    "star_tracker_outage": _between(Outage, "earliest", "latest", "duration"),
+    "wheel_failure": _between(Failure, "earliest", "latest"),
+    "mode_frequency": _about(FrequencyFactors, _modes),
+    "mode_coupling": _about(CouplingFactors, _modes),
+}

@@ -1,0 +1,185 @@
+"""Misfits of the hardware: each trial against a run by hand from its row, and what each of them does to a flight."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo, runs
+from ptsmc_jax.devices import actuators
+from ptsmc_jax.dispersions import misfits, variation
+from ptsmc_jax.plants import flexible_body
+from ptsmc_jax.simulation import rollout
+from tests.helpers import vector
+
+FLIGHT = {
+    "flexible": {"frequency": [3.0, 5.0], "damping": [0.01, 0.01], "coupling": [[1.2, 0.0, 0.3], [0.1, 0.9, 0.0]]},
+    "controller": {"t_f": 5.0, "delta": 0.5, "error": "multiplicative"},
+    "initial": {"rotvec_deg": [20.0, -10.0, 5.0]},
+    "loop": {"mode": "sampled", "period": 0.25, "t_end": 7.0},
+    "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6},
+}
+DRAWN = {
+    "actuator_scale": {"kind": "relative_normal", "std": 0.05},
+    "actuator_misalignment": {"kind": "normal", "std_deg": 1.0},
+    "star_tracker_misalignment": {"kind": "uniform", "half_width_deg": 0.5},
+    "gyro_scale": {"kind": "relative_uniform", "half_width": 0.02},
+    "mode_frequency": {"kind": "relative_normal", "std": 0.1},
+    "mode_coupling": {"kind": "relative_uniform", "half_width": 0.2},
+}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DRAWN}))
+    assert set(ready.dispersion.misfits) == set(misfits.MISFITS) - {"star_tracker_outage", "wheel_failure"}
+    return ready, montecarlo.run(ready.parts, ready.dispersion, 5, np.arange(3))
+
+
+def numbers(flown, trial, name, *shape):
+    """The columns of a trial's row that begin with a name, in their order."""
+    kept = [v[trial] for key, v in flown.drawn.items() if key.rpartition("_")[0] == name]
+    return vector(np.array(kept).reshape(shape))
+
+
+def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
+    ready, flown = drawn
+    body = ready.parts.plant
+    for trial in range(3):
+        plant = flexible_body.flexible(
+            body.inertia, numbers(flown, trial, "mode_frequency", 2), body.damping,
+            numbers(flown, trial, "mode_coupling", 2, 3),
+        )  # fmt: skip
+        device = actuators.Actuators(
+            scale=numbers(flown, trial, "actuator_scale", 3),
+            directions=numbers(flown, trial, "actuator_misalignment", 3, 3).T,
+        )
+        sensors = replace(
+            ready.parts.sensors,
+            misalignment=numbers(flown, trial, "star_tracker_misalignment", 3),
+            rate_scale=numbers(flown, trial, "gyro_scale", 3),
+        )
+        by_hand = replace(ready.parts, plant=plant.settled(), actuators=device, sensors=sensors)
+        found = montecarlo.run(by_hand, variation.Dispersion(), 5, np.asarray([trial])).metrics
+        for name in ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered"):
+            np.testing.assert_allclose(
+                getattr(flown.metrics, name)[trial], getattr(found, name)[0], rtol=1e-12, err_msg=name
+            )
+    assert np.ptp(flown.metrics.window_error) > 1e-5
+
+
+def test_the_body_gets_what_scaled_and_turned_actuators_give_and_flight_software_knows_nothing_of_it(drawn):
+    ready, _ = drawn
+    run = runs.fly(ready, 5, 1)
+    device = run.parts.actuators
+    assert device is not None
+    given = run.log.commanded[:-1] * np.asarray(device.scale)
+    np.testing.assert_allclose(run.log.u[:-1], given @ np.asarray(device.directions).T, rtol=0, atol=1e-14)
+    turned = np.asarray(device.directions)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=0), 1.0, rtol=1e-14)
+    assert 1e-3 < np.abs(turned - np.eye(3)).max() < 0.1
+    assert device.known == actuators.Actuators()
+
+
+def test_a_misfit_of_nothing_changes_no_digit():
+    none = {key: {"kind": v["kind"], **{k: 0.0 for k in v if k != "kind"}} for key, v in DRAWN.items()}
+    plain = scenario.study(scenario.from_tables(FLIGHT))
+    zero = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": none}))
+    one = rollout.simulate_jit(plain.parts, 5, 0)
+    other = montecarlo.run(replace(zero.parts, substeps=plain.parts.substeps), zero.dispersion, 5, np.arange(1))
+    for name in ("window_error", "peak_torque", "effort", "chattering"):
+        # the same operations but for factors of one; compiled together with others they may be fused otherwise
+        np.testing.assert_allclose(getattr(other.metrics, name)[0], getattr(one.metrics, name), rtol=1e-13)
+
+
+def test_a_turned_star_tracker_turns_the_body_the_other_way_by_half_the_angle_in_the_error():
+    """No noise, no disturbance, rest: the law brings what it sees to the target."""
+    tables = {
+        "controller": {"t_f": 5.0, "delta": 0.5, "error": "multiplicative", "k1": 4.0, "surface_rate": 2.0},
+        "initial": {"rotvec_deg": [2.0, 0.0, 0.0]},
+        "disturbance": {"kind": "none"},
+        "loop": {"mode": "sampled", "period": 0.25, "t_end": 20.0},
+        "hardware": {"attitude_noise": 0.0, "rate_noise": 0.0},
+    }
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    turn = np.array([1e-3, -2e-3, 5e-4])
+    found = rollout.simulate_jit(replace(parts, sensors=replace(parts.sensors, misalignment=vector(turn))), record=True)
+    assert found.log is not None
+    np.testing.assert_allclose(Rotation.from_quat(np.asarray(found.log.x.q[-1])).as_rotvec(), -turn, rtol=0, atol=1e-9)
+
+
+def test_wheels_that_are_scaled_and_turned_keep_the_total_momentum():
+    tables = {
+        **{key: FLIGHT[key] for key in ("controller", "initial", "loop")},
+        "disturbance": {"kind": "none"},
+        "wheels": {"momentum": [0.5, -0.2, 0.1, 0.3]},
+        "dispersion": {key: DRAWN[key] for key in ("actuator_scale", "actuator_misalignment")},
+    }
+    ready = scenario.study(scenario.from_tables(tables))
+    run = runs.fly(replace(ready, parts=replace(ready.parts, substeps=8)), 0, 1)
+    log, device = run.log, run.parts.actuators
+    assert device is not None
+    assert device.directions is not None
+    assert device.directions.shape == (3, 4)
+    assert log.wheels is not None
+    body = np.asarray(log.x.w) @ np.asarray(run.parts.plant.inertia).T + log.wheels[0] @ np.asarray(device.directions).T
+    total = Rotation.from_quat(np.asarray(log.x.q)).apply(body)
+    np.testing.assert_allclose(total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8)  # steps of RK4
+    assert np.abs(log.wheels[0] - log.wheels[0][0]).max() > 0.1
+
+
+WHEELED = {
+    **{key: FLIGHT[key] for key in ("controller", "initial", "loop", "hardware")},
+    "wheels": {"momentum": [0.5, -0.2, 0.1, 0.3]},
+    "filter": {"kind": "steady_state"},
+}
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
+    failing = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": {"wheel_failure": failing}}))
+    run = runs.fly(ready, 0, 2)
+    row = {key: float(v) for key, v in ready.dispersion.values(run.parts).items() if key.startswith("wheel_")}
+    when, wheel = row["wheel_failure_time"], round(row["wheel_failure_wheel"]) - 1
+    assert 1.0 <= when <= 3.0
+    log = run.log
+    assert log.wheels is not None
+    after = log.t >= when
+    assert np.all(log.wheels[1][after][:-1, wheel] == 0.0)
+    assert np.all(np.abs(log.wheels[1][~after][:, wheel]) > 0.0)
+    assert np.ptp(log.wheels[0][after][:, wheel]) == 0.0
+    # the torque on the body is what was asked for, w x A h besides, as long as all wheels work or the loss is known
+    stored = log.wheels[0] @ np.asarray(run.parts.actuators.wheels.axes).T  # pyright: ignore[reportOptionalMemberAccess]
+    asked = log.commanded + np.cross(log.x.w, stored)  # at the true rate; flight software takes that of the gyro
+    off = np.linalg.norm(log.u - asked, axis=1)[:-1]
+    assert np.all(off[~after[:-1]] < 1e-5)
+    assert np.all(off[after[:-1]] < 1e-5) == known
+
+
+def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
+    lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": {"star_tracker_outage": lasting}}))
+    run = runs.fly(ready, 0, 0)
+    assert {key: float(v) for key, v in ready.dispersion.values(run.parts).items()}["star_tracker_outage_begin"] == 0.0
+    parts = ready.parts
+    assert parts.sensors.filter is not None
+    idle = replace(parts.sensors.filter, attitude_gain=0.0 * parts.sensors.filter.attitude_gain,
+                   bias_gain=0.0 * parts.sensors.filter.bias_gain)  # fmt: skip
+    other = rollout.simulate_jit(replace(parts, sensors=replace(parts.sensors, filter=idle)), 0, 0)
+    np.testing.assert_allclose(run.metrics["window_error"], other.metrics.window_error, rtol=1e-12)
+    whole = rollout.simulate_jit(parts, 0, 0)
+    assert abs(float(whole.metrics.window_error) / run.metrics["window_error"] - 1.0) > 1e-6
+
+
+def test_streams_of_their_own():
+    """What is drawn of one name does not depend on what else is drawn."""
+    ready = [
+        scenario.study(scenario.from_tables({**FLIGHT, "dispersion": some})).dispersion
+        for some in (DRAWN, {"gyro_scale": DRAWN["gyro_scale"]})
+    ]
+    one, other = (dispersion.coordinates(jnp.uint32(5), jnp.uint32(2))["gyro_scale"] for dispersion in ready)
+    np.testing.assert_array_equal(one, other)
