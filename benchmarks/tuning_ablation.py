@@ -92,7 +92,7 @@ def main() -> None:
     configure()
     from ptsmc_jax import scenario
     from tuning.search import evolution, optimise
-    from tuning.studies import tuner
+    from tuning.studies import posing
 
     seeds, wanted = int(sys.argv[1]) if len(sys.argv) > 1 else 20, sys.argv[2:] or [*FILES, "chain"]
     KEPT.parent.mkdir(exist_ok=True)
@@ -109,7 +109,7 @@ def main() -> None:
         loaded = scenario.from_tables(CHAIN) if name == "chain" else scenario.read(SCENARIOS / f"{FILES[name]}.toml")
         table = loaded.tune
         assert table is not None
-        posed = tuner.pose(loaded, 0)
+        posed = posing.pose(loaded, 0)
         evaluate = posed.evaluate
         for seed in range(seeds):
             for variant, inside in variants().items():

@@ -18,16 +18,16 @@ from ptsmc_jax.configure import configure
 def fresh_trials(loaded, names, values, requirements) -> str:
     """Tuned gains on fresh trials of three seeds: RMS, what it is beside the floor, and the largest peak torque."""
     from tuning.search import gains
-    from tuning.studies import tuner
+    from tuning.studies import judging
 
     made = gains.in_scenario(loaded, dict(zip(names, values.tolist(), strict=True)))
     rms, above, off, peaks = [], [], [], []
     for seed in range(3):
-        flown = tuner.judge(made, tuner.seed_of_judge(seed), requirements)
+        flown = judging.judge(made, judging.seed_of_judge(seed), requirements)
         squares = flown.metrics.window_error[flown.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
-        floor = tuner.floor_of(made, tuner.seed_of_judge(seed))
+        floor = judging.floor_of(made, judging.seed_of_judge(seed))
         if floor:
             above.append(rms[-1] / floor)
             off.append((rms[-1] - floor) / error)
@@ -43,7 +43,7 @@ def main() -> None:
     configure()
     from ptsmc_jax import scenario
     from tuning.search import evolution, gains, optimise
-    from tuning.studies import tuner
+    from tuning.studies import judging, posing
 
     path, (first, end) = sys.argv[1], (0, 20)
     if len(sys.argv) > 2:
@@ -55,7 +55,7 @@ def main() -> None:
         loaded = scenario.replace(loaded, tune__free=sys.argv[3].split(","), tune__bounds=None)
     table = loaded.tune
     assert table is not None
-    posed = tuner.pose(loaded, 0)
+    posed = posing.pose(loaded, 0)
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
@@ -81,13 +81,13 @@ def main() -> None:
         near = [one.value <= 1.01 * reference for one in found]
         print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
               f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
-    fresh = tuner.seed_of_judge(0)
-    paper = tuner.judge(gains.papers(loaded), fresh, ready.requirements)
+    fresh = judging.seed_of_judge(0)
+    paper = judging.judge(gains.papers(loaded), fresh, ready.requirements)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
-    tuned = tuner.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
+    tuned = judging.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]
     peak = [float(np.mean(one.metrics.peak_torque[one.finished])) for one in (paper, tuned)]
-    floor = tuner.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
+    floor = judging.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
     print(f"on {tuned.status.size} fresh trials: {rms[1]:.4e}, {rms[1] / floor:.3f} times the floor; "
           f"{rms[0] / rms[1]:.2f} times the paper's accuracy at {peak[1] / peak[0]:.3f} of its mean peak torque, "
           f"largest {np.max(tuned.metrics.peak_torque[tuned.finished]):.4f} N m")  # fmt: skip

@@ -68,7 +68,7 @@ HOUSE = {
     "tuning": {
         ".": "errors",
         "search": """
-            abreast gains journal own_parts
+            abreast gains journal own_parts progress
             design flights shares
             margin_rows
             objective
@@ -80,8 +80,9 @@ HOUSE = {
             evolution
         """,
         "studies": """
-            campaign_folder mapping reproduction single stability table
-            campaign_summary tuner
+            campaign_folder judging mapping reproduction single stability table
+            campaign_summary posing
+            tuner
             compare pareto tune_files
         """,
         "output": """

@@ -16,7 +16,7 @@ from ptsmc_jax.theory import margins
 from tests.helpers import SHORT, short
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
-from tuning.studies import stability, tuner
+from tuning.studies import posing, stability
 
 BODY = {
     "controller": {"t_f": 8.0, "delta": 0.4, "sign_width": 0.02, "k1": 2.0},
@@ -121,7 +121,7 @@ def drawn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(margin_verdicts, "TRIALS", 4)
         patch.setattr(margin_rows, "CASES", 2)
-        yield tuner.pose(scenario.from_tables(tables), 3)
+        yield posing.pose(scenario.from_tables(tables), 3)
 
 
 def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(drawn):

@@ -24,7 +24,7 @@ from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
 from tests.helpers import FULL_INERTIA, ROOT, finer, parts, short, vector
-from tuning.studies import tuner
+from tuning.studies import posing
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
@@ -415,5 +415,5 @@ def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypa
         return visited(parts)
 
     monkeypatch.setattr(solutions, "visited", spied)
-    tuner.pose(scenario.from_tables(tables), 0)
+    posing.pose(scenario.from_tables(tables), 0)
     assert looked_at == [(0.5, 10.5)]

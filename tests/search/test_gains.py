@@ -18,7 +18,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, vector
 from tuning.search import gains, shares
-from tuning.studies import tuner
+from tuning.studies import judging, posing
 
 BASE = {
     "spacecraft": {"inertia": [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]},
@@ -54,7 +54,7 @@ OTHERS = {
 def wide(tables=None):
     """The scenario and its parts with room for all gains."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
-    return scenario, tuner.pose(scenario, 0).ready
+    return scenario, posing.pose(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", short(OTHERS, ["t_f"]))
@@ -120,7 +120,7 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
         "tune": {"free": ["t_f", "eta", "observer_gain"]},
     }
     scenario = from_tables(tables)
-    ready = tuner.pose(scenario, 0).ready
+    ready = posing.pose(scenario, 0).ready
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))
@@ -251,7 +251,7 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
     own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
-    found, refused = tuner.beside(own)
+    found, refused = judging.beside(own)
     assert found == {"before": own}
     assert refused is not None
     assert refused.startswith("initial.rotvec_deg is")
@@ -259,10 +259,10 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     tiny = from_tables(
         {"controller": quick, "loop": {"mode": "sampled", "period": 0.001, "t_end": 0.05, "window": 0.01}}
     )
-    found, refused = tuner.beside(tiny)
+    found, refused = judging.beside(tiny)
     assert refused is None
     assert found["paper"].controller.delta == 0.02
-    assert list(tuner.beside(found["paper"])[0]) == ["paper"]
+    assert list(judging.beside(found["paper"])[0]) == ["paper"]
 
 
 @pytest.mark.parametrize(

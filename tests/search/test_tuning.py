@@ -20,7 +20,7 @@ from tests.helpers import FIRST_FLIGHT, chain_parts, parts, vector
 from tuning.output import search_sentences
 from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, shares, starts, worst
 from tuning.search.evaluate import Evaluator, Sloped
-from tuning.studies import tune_files, tuner
+from tuning.studies import judging, posing, tune_files
 
 TURNED = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 SPREAD = variation.Dispersion(state=numbers.Uniform(vector([20.0, 0.0])))
@@ -208,7 +208,7 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
 def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
-    assert [tuner._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
+    assert [posing._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
     assert confirm.fresh_trials([share]) == confirm.FRESH
     assert confirm.fresh_trials([share, sure]) == 2 * 852
     assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 852]
@@ -216,7 +216,7 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"objective": kind}}).tune
         assert table is not None
-        assert tuner._tail(table, 64) == tail
+        assert posing._tail(table, 64) == tail
 
 
 def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
@@ -341,10 +341,10 @@ def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
 
 def test_judged_is_the_very_law_on_the_flight_clock():
     own = scenario.read(FIRST_FLIGHT)
-    flown = tuner.as_flown(own)
+    flown = judging.as_flown(own)
     assert flown.loop.clock == "flight"
     assert flown.controller == own.controller
-    assert tuner.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+    assert judging.as_flown(scenario.from_tables({})) == scenario.from_tables({})
 
 
 @pytest.mark.parametrize(("law", "words"), [
@@ -353,7 +353,7 @@ def test_judged_is_the_very_law_on_the_flight_clock():
     ({"kind": "pd"}, "flight clock"),
 ])  # fmt: skip
 def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
-    assert tuner.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
+    assert judging.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
 
 
 @pytest.mark.parametrize(("width", "free", "sloped"), [
@@ -361,7 +361,7 @@ def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
 ])  # fmt: skip
 def test_only_gains_flown_with_the_exact_sign_are_looked_for_without_slopes(width, free, sloped):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
-    posed = tuner.pose(scenario.from_tables(tables), 0)
+    posed = posing.pose(scenario.from_tables(tables), 0)
     assert posed.sloped == sloped
     assert float(posed.problem.parts.controller.sign_width) == width
 

@@ -19,7 +19,7 @@ from tests.output.pages import checked
 from tuning.errors import UsageError
 from tuning.output import page, sentences
 from tuning.search import gains
-from tuning.studies import compare, tuner
+from tuning.studies import compare, judging, tuner
 
 TABLES = tomllib.loads(SHORT)
 
@@ -175,7 +175,7 @@ def eight():
 
 def contender(trials, **changes):
     base = scenario.from_tables(TABLES)
-    verdicts = tuner.verdicts_of(base, trials, 0)
+    verdicts = judging.verdicts_of(base, trials, 0)
     return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts), None)
 
 
@@ -218,14 +218,14 @@ def rivals(monkeypatch, eight, interrupt=None):
         return eight
 
     monkeypatch.setattr(tuner, "tune", tune)
-    monkeypatch.setattr(tuner, "judge", judge)
+    monkeypatch.setattr(judging, "judge", judge)
     return asked
 
 
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
-    assert asked == [("judge", "paper", tuner.seed_of_judge(5)),
+    assert asked == [("judge", "paper", judging.seed_of_judge(5)),
                      *(("tune", law, 5) for law in compare.laws())]  # fmt: skip
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}

@@ -14,7 +14,7 @@ from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
 from tests.output.pages import checked
 from tuning.output import sentences, terminal
-from tuning.studies import pareto, tuner
+from tuning.studies import judging, pareto
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
@@ -118,7 +118,7 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
         made = scenario.replace(
             scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
         )
-        flown = tuner.judge(made, summary["seed"], ())
+        flown = judging.judge(made, summary["seed"], ())
         np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
         np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
     assert f"{len(kept)} points, each judged on 60 fresh trials" in told

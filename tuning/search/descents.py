@@ -17,9 +17,10 @@ from tuning.search.abreast import Ask, in_step
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import FAILED, Problem, failures, fewer_trials
+from tuning.search.progress import Report
 from tuning.search.refine import GENERATIONS, WIDELY, refine
 from tuning.search.shares import TIMES
-from tuning.search.starts import CHOOSING, STEEP, SWEPT, Report, charged, promising, spread, starting_points
+from tuning.search.starts import CHOOSING, STEEP, SWEPT, charged, promising, spread, starting_points
 from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # starts, from whose best points they go on

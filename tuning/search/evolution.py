@@ -9,7 +9,7 @@ from tuning.search.descent import SLACK, Best
 from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator
 from tuning.search.optimise import Search
-from tuning.search.starts import Report
+from tuning.search.progress import Report
 
 POPULATION = 40  # points for each gain
 GENERATIONS = 80

@@ -17,8 +17,8 @@ from tuning.search.descent import BROKEN
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem, coordinates_of, whole_rows, with_trials
+from tuning.search.progress import Report
 from tuning.search.refine import NEARBY
-from tuning.search.starts import Report
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 

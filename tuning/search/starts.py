@@ -10,6 +10,7 @@ from scipy.stats import qmc
 
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import Problem
+from tuning.search.progress import Report
 
 SWEPT = 64  # points flown, among which starts are chosen
 CALL = 16  # of them between two reports
@@ -18,8 +19,6 @@ APART = (0.5, 0.35, 0.2, 0.0)  # in the unit cube, along the gain in which two p
 STEEP = 10.0  # times the charge, where many points are close to a limit
 CHOOSING = "choosing starts"
 NEARLY = 0.05  # of a limit
-# what is being done, steps done, in all, best goal, how far beyond a limit
-Report = Callable[[str, int, int, float, float], None]
 
 
 def starting_points(

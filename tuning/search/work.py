@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 
 from tuning.search.evaluate import Evaluator
-from tuning.search.starts import Report
+from tuning.search.progress import Report
 
 WHOLE = 100  # what all of the work is told as
 SLOPED = 5.0  # what a rollout with slopes takes beside one without (benchmarks/gradients.py)

@@ -24,8 +24,9 @@ from ptsmc_jax.simulation.requirements import Verdict
 from tuning.errors import UsageError
 from tuning.search import gains, trust
 from tuning.search.journal import Journal
-from tuning.search.starts import Report
-from tuning.studies import tuner
+from tuning.search.objective import T_F
+from tuning.search.progress import Report
+from tuning.studies import judging, tuner
 
 OURS = "prescribed_time"
 KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
@@ -141,7 +142,7 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
 
 def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
     """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
-    if tune.objective != tuner.T_F:
+    if tune.objective != T_F:
         return replace(other, tune=same)
     default = replace(other, tune={}).tune
     assert default is not None
@@ -153,15 +154,15 @@ def compare(
     scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None, against: Rivals = Rivals()
 ) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
-    fresh_seed = tuner.seed_of_judge(seed)
+    fresh_seed = judging.seed_of_judge(seed)
     rivals = contenders(scenario, against)
     for law, posed in rivals.items():
         try:
             study(posed)
         except ScenarioError as error:  # before hours of search, not after
             raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
-    others, refused = tuner.beside(scenario)
-    made = {"paper": _papers(tuner.as_flown(others["paper"]), fresh_seed)} if "paper" in others else {}
+    others, refused = judging.beside(scenario)
+    made = {"paper": _papers(judging.as_flown(others["paper"]), fresh_seed)} if "paper" in others else {}
     stopped = False
     for law, posed in rivals.items():
 
@@ -179,8 +180,8 @@ def compare(
 
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
     ready = study(flown)
-    trials = tuner.judge(flown, fresh_seed, ready.requirements)
-    verdicts, floor = tuner.verdicts_of(flown, trials, fresh_seed), tuner.floor_of(flown, fresh_seed)
+    trials = judging.judge(flown, fresh_seed, ready.requirements)
+    verdicts, floor = judging.verdicts_of(flown, trials, fresh_seed), judging.floor_of(flown, fresh_seed)
     return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
 
 
@@ -235,7 +236,7 @@ def summary(made: Comparison) -> dict[str, Any]:
         "seed": made.fresh_seed,
         "trials": int(first.trials.status.size),
         "paper_refused": made.paper_refused,
-        "judged_on": tuner.judged_on(made.contenders.get(OURS, first).flown),
+        "judged_on": judging.judged_on(made.contenders.get(OURS, first).flown),
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(one) for law, one in made.contenders.items()},
         "cautions": list(dict.fromkeys(said for one in made.contenders.values() for said in cautions.of(one.flown))),

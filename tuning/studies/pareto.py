@@ -28,9 +28,9 @@ from tuning.search.descents import Descents
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
 from tuning.search.optimise import MARGIN, Search, search
+from tuning.search.progress import Report
 from tuning.search.refine import NEARBY
-from tuning.search.starts import Report
-from tuning.studies import tuner
+from tuning.studies import judging, posing, tuner
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
@@ -94,9 +94,9 @@ def trace(
     limited, own_limit = _limited(scenario)
     table = limited.tune
     assert table is not None
-    posed = tuner.pose(limited, seed, journal)
+    posed = posing.pose(limited, seed, journal)
     ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
-    others, refused = tuner.beside(limited)
+    others, refused = judging.beside(limited)
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:
@@ -120,14 +120,14 @@ def trace(
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
     climbed = _climb([under(limit) for limit in ladder], [free.share, least.share], posed, tell)
     climbed = {float(ladder[k]): found for k, found in climbed.items()}
-    fresh_seed = tuner.seed_of_judge(seed)
+    fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
     fixed = {}
     for name, other in others.items():
-        trials, values = tuner.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
+        trials, values = judging.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
         fixed[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
     count = next(iter(judged.values()))[1].status.size if judged else 0
-    floor = tuner.floor_of(scenario, fresh_seed)
+    floor = judging.floor_of(scenario, fresh_seed)
     return Front(_marked(judged), fixed, refused, fresh_seed, count, floor, evaluate.rollouts, evaluate.gradients)
 
 
@@ -157,7 +157,7 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: tuner.Posed, tell: Report) -> dict[int, Best]:
+def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
     """What is found on each rung, down the ladder and up again, each from what is known by then.
 
     One rung of those that a limit does not hold back, and whose gains are the same.
@@ -177,7 +177,7 @@ def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: tuner.Pose
     return apart
 
 
-def _step(posed: tuner.Posed, problem: Problem, known: np.ndarray) -> Best | None:
+def _step(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
     """The best gains that keep these limits, from the most promising known ones."""
     flown = posed.evaluate.fly(problem, known)
     chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]]
@@ -195,7 +195,7 @@ def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[fl
         tell("judging on fresh trials", k, len(found), np.nan, 0.0)
         named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(best.share))), tuner.DIGITS)
         tuned = gains.in_scenario(scenario, named)
-        trials = tuner.judge(tuned, fresh_seed, requirements)
+        trials = judging.judge(tuned, fresh_seed, requirements)
         judged[limit] = _point(limit, named, best.value, trials, tuned, fresh_seed), trials
     return judged
 
@@ -205,7 +205,7 @@ def _point(limit, named, trained, trials: Trials, scenario: Scenario, fresh_seed
     peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
     asked = scenario.requirements[TORQUE]
     quantile = (asked.quantile if isinstance(asked, Limit) else None) or 1.0
-    verdicts = tuner.verdicts_of(scenario, trials, fresh_seed)
+    verdicts = judging.verdicts_of(scenario, trials, fresh_seed)
     return Point(
         limit=limit,
         gains=dict(named),

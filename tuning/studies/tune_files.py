@@ -18,7 +18,8 @@ from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
 from tuning.search import trust
 from tuning.search.descents import Step
-from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning, judged_on
+from tuning.studies.judging import judged_on
+from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 

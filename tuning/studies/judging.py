@@ -1,0 +1,75 @@
+"""Gains judged as they are flown: on fresh trials and the flight clock, beside the paper's and those before."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ptsmc_jax.campaigns import margin_verdicts, montecarlo, runs
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.numerics import draws
+from ptsmc_jax.scenario import Study, replace, study
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from tuning.search import confirm, gains
+
+
+def seed_of_judge(seed: int) -> int:
+    """The seed of the fresh trials."""
+    return draws.derive(seed, "fresh trials")
+
+
+def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
+    """What tuned gains are set beside: "paper", the paper's, and "before", the scenario's own where they differ.
+
+    And why the scenario cannot be flown with the paper's, which are then not among them.
+    """
+    try:
+        found, refused = {"paper": gains.papers(scenario)}, None
+        study(as_flown(found["paper"]))
+    except ScenarioError as error:
+        return {"before": scenario}, str(error)
+    return found | ({"before": scenario} if gains.differ(scenario, found["paper"]) else {}), refused
+
+
+def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
+    """A scenario's gains on fresh trials, as flown; as many as every quantile that is asked for takes."""
+    flown = study(as_flown(scenario))
+    trials = np.arange(trials_of(flown, confirm.fresh_trials(requirements)))
+    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
+
+
+def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
+    """RMS window error that no controller can beat where a scenario is judged, see `runs.floor`."""
+    return runs.floor(study(as_flown(scenario)), fresh_seed)
+
+
+def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Verdict]:
+    """One for each of the scenario's requirements over these trials, and for each margin asked of its loop."""
+    ready = study(as_flown(scenario))
+    requirements = ready.requirements
+    alone = trials.status.size == 1  # nothing is drawn: no share of the trials to speak of
+    finished = trials.finished[0] if alone else trials.finished
+    values = [getattr(trials.metrics, r.metric) for r in requirements]
+    flown = [r.verdict(v[0] if alone else v, finished) for r, v in zip(requirements, values, strict=True)]
+    return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
+
+
+def as_flown(scenario: Scenario) -> Scenario:
+    """The scenario on the flight clock; a continuous loop as it is."""
+    return replace(scenario, loop__clock="flight") if scenario.loop.mode == "sampled" else scenario
+
+
+def judged_on(flown: Scenario) -> str:
+    """What a scenario was flown on to be judged, in words."""
+    if flown.loop.mode != "sampled":
+        return "the continuous loop"
+    width = getattr(flown.controller, "sign_width", None)
+    if width is None:
+        return "flight clock"
+    return "flight clock, " + (f"sign {width:g} wide" if width else "exact sign")
+
+
+def trials_of(ready: Study, wanted: int) -> int:
+    """How many trials differ at all: one where nothing is drawn."""
+    return wanted if ready.drawn else 1

@@ -1,0 +1,90 @@
+"""The tuning problem of a scenario over its training trials, and what evaluates it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ptsmc_jax.scenario import Study, study, tables
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.timing import Reach, reach_of
+from ptsmc_jax.simulation.requirements import Requirement, least_within
+from tuning.search import confirm, gains, margin_rows, objective
+from tuning.search import shares as gain_bounds
+from tuning.search.evaluate import Evaluator
+from tuning.search.journal import Journal
+from tuning.search.objective import T_F, Problem
+from tuning.studies import judging
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A scenario's tuning problem over its training trials, and what evaluates it."""
+
+    ready: Study
+    problem: Problem
+    evaluate: Evaluator
+    own: np.ndarray  # (gains,) of the scenario
+    sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
+
+
+def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
+    """The tuning problem of a scenario."""
+    table = scenario.tune
+    assert table is not None
+    ready = study(scenario, reach=_reach(scenario, table))
+    bounds = gain_bounds.of_scenario(scenario, ready.parts)
+    trained = judging.trials_of(ready, confirm.training_trials(ready.requirements, table.trials))
+    problem = objective.problem(
+        ready.parts,
+        ready.dispersion,
+        seed,
+        np.arange(trained),
+        bounds.names,
+        ready.requirements,
+        least=tuple(_least(r, trained) for r in ready.requirements),
+        goal=T_F if table.objective == T_F else "window_error",
+        tail=_tail(table, trained),
+        torque_weight=table.torque_weight,
+        margins=margin_rows.ask(ready, bounds.names, seed),
+    )
+    own = np.asarray(gains.own(ready.parts, bounds.names))
+    exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
+    return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact)
+
+
+def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
+    own = reach_of(scenario)
+
+    def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
+        low, high = table.bounds.get(name, (lower, lower))
+        return min(low, lower), max(high, lower if upper is None else upper)
+
+    smallest_delta, delta = interval("delta", own.delta)
+    smallest_t_f, t_f = interval("t_f", own.t_f)
+    gain, largest_gain = interval("observer_gain", own.gain, own.largest_gain)
+    return Reach(
+        smallest_t_f=smallest_t_f,
+        t_f=t_f,
+        delta=delta,
+        smallest_delta=smallest_delta,
+        gain=gain,
+        largest_gain=largest_gain,
+        k1=interval("k1", own.k1)[1],
+        sign_width=interval("sign_width", own.sign_width)[0],
+        surface_rate=interval("surface_rate", own.surface_rate)[1],
+    )
+
+
+def _least(requirement: Requirement, trials: int) -> int | None:
+    """How many training trials must keep a limit."""
+    if requirement.quantile is None:
+        return None
+    return least_within(trials, requirement.quantile, requirement.confidence) or trials
+
+
+def _tail(table: tables.Tune, trials: int) -> int | None:
+    """How many of the worst training trials are averaged."""
+    if table.objective in ("rms", T_F):
+        return None
+    assert table.level is not None or table.objective == "worst"
+    return 1 if table.level is None else max(1, round((1.0 - table.level) * trials))
