@@ -211,7 +211,7 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     assert [posing._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
     assert confirm.fresh_trials([share]) == confirm.FRESH
     assert confirm.fresh_trials([share, sure]) == 2 * 852
-    assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 852]
+    assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 2 * 852]
     tables = {"rms": None, "worst": 1, "cvar": 6}
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"objective": kind}}).tune
