@@ -61,7 +61,9 @@ class Loop:
     period: Leaf  # h [s]
     delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
 
-    def closed_at_sensors(self, xp: Any = jnp) -> tuple[Float[ArrayLike, "n n"], Float[ArrayLike, "m n"]]:
+    def closed_at_sensors(
+        self, xp: Any = jnp
+    ) -> tuple[Float[Array | np.ndarray, "n n"], Float[Array | np.ndarray, "m n"]]:
         """A (n, n) and C (m, n) with x_seen closed, in the units of the coordinates: rad, rad/s, [N m]."""
         others = ((0, 0), (0, self.a.shape[0] - self.seen.shape[1]))
         return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
