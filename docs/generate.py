@@ -22,9 +22,9 @@ MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. 
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
 SCENARIOS = """\
 A scenario is a TOML file of tables; every table and every key is optional. What is not said has the default, for a
-spacecraft the paper's Case I. `flexible`, `hardware`, `wheels`, `filter`, `dispersion`, `requirements` and `tune`
-are off where they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name.
-`ptsmc new` writes all this into a file, to be changed.
+spacecraft the paper's Case I. `flexible`, `hardware`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and
+`tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused
+by name. `ptsmc new` writes all this into a file, to be changed.
 
 A table with a `kind` has the keys of that kind. Commands that fly leave the scenario that they flew, every default
 filled in, as `scenario.toml` beside their results. What follows from several keys together, such as `delta` of at
@@ -41,10 +41,21 @@ ERRORS = """\
 The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
 part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and
 input. `peak_wheel_momentum` and `peak_wheel_torque` are there with `[wheels]` only, `peak_modal` and `residual_modal`
-with `[flexible]`. Numbers of one's own: `ptsmc montecarlo --metrics`."""
+with `[flexible]`. Numbers of one's own: `ptsmc montecarlo --metrics`.
+
+The pointing error indices are there with `[pointing]` only, whose observation begins `after` t_f and lasts to t_end, in
+windows one after the other; a last part that fills none counts for APE and AKE only. An error about an axis is a
+component of the rotation vector from the reference to the body, in body axes; a half-cone is the angle between where
+the boresight points and where it should, and what is a mean or a difference of such is one of arcs on the sphere, laid
+flat. They are taken at the ends of control periods, at the observation's begin and at the ends of windows, means over
+all of the time; half-cones of RPE, PDE and RKE are known to 0.5 %, and said so much too large. PDE is the largest
+difference between the means of any two windows. What the law is told (AKE, MKE, RKE: with noise or a filter only) holds
+from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of the time."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
-such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. And, of the sampled loop, any
+such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing
+error](guide.md#pointing-budgets) at a time, `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9,
+interpretation = "mixed" }`. And, of the sampled loop, any
 margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are the least allowed,
 `modulus_margin` [dB] is the largest peak of the sensitivity. The keys of a table:"""
 

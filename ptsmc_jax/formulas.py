@@ -105,7 +105,7 @@ def per_sample(density: float, period: float) -> float:
 
     density: of a rate in rad/s/sqrt(Hz), which is rad/sqrt(s), a gyro's angle random walk (IEEE Std 952).
     """
-    return density / np.sqrt(period)
+    return float(density / np.sqrt(period))
 
 
 def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, interval: float) -> float:

@@ -30,12 +30,18 @@ HOUSE = {
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": "attitude_filter command_filter reaction_wheels ticks | actuators sensors",
-        "simulation": "catalogues clock interval | assembly metric_rows requirements | computer metrics | rollout",
+        "simulation": """
+            catalogues clock pointing
+            interval
+            assembly metric_rows requirements
+            computer metrics
+            rollout
+        """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
         "scenario": """
             errors systems values
-            attitude_keys dispersion_tables gain_record keys scales
+            attitude_keys dispersion_tables gain_record keys pointing_table scales
             command_filter_tables
             device_tables gain_bounds own start_checks
             disturbance_bounds
@@ -87,7 +93,7 @@ HOUSE = {
         """,
         "output": """
             cells page_captions page_charts progress_lines
-            margin_sentences
+            margin_sentences pointing_sentences
             search_sentences sentences
             page terminal
             campaign_terminal

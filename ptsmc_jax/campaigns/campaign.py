@@ -165,7 +165,11 @@ def finished(frame: pl.DataFrame) -> np.ndarray:
 def verdicts(requirements: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
     """One for each requirement over these rows; a failed trial breaks every one."""
     ok = finished(frame)
-    return [r.verdict(frame[r.metric].to_numpy().astype(float), ok) for r in requirements]
+
+    def column(name: str | None) -> np.ndarray | None:
+        return None if name is None else frame[name].to_numpy().astype(float)
+
+    return [r.verdict(frame[r.metric].to_numpy().astype(float), ok, column(r.timed)) for r in requirements]
 
 
 def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:

@@ -94,7 +94,10 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     status, reason = rollout.STATUS[int(result.status)]
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
     finished = np.asarray(int(result.status) in rollout.FINISHED)
-    verdicts = [r.verdict(np.asarray(metrics[r.metric]), finished) for r in ready.requirements]
+    verdicts = [
+        r.verdict(np.asarray(metrics[r.metric]), finished, None if r.timed is None else np.asarray(metrics[r.timed]))
+        for r in ready.requirements
+    ]
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
 
 

@@ -2,10 +2,12 @@
 
 import bisect
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
+MANY = 30  # shares that are not zero, from which on their mean is taken as nearly normal
 SOBOL_BINS = 32  # of an input, by equal shares of the trials
 ALIKE = 0.9999  # rank correlation of two inputs that are one
 
@@ -24,6 +26,64 @@ def share_interval(successes: int, trials: int, confidence: float) -> tuple[floa
 def share_bound(successes: int, trials: int, confidence: float) -> float:
     """One-sided lower bound of a share, beta(1 - confidence; k, trials - k + 1): Clopper and Pearson."""
     return float(stats.beta.ppf(1.0 - confidence, successes, trials - successes + 1)) if successes > 0 else 0.0
+
+
+def mean_bound(shares: np.ndarray, confidence: float) -> float:
+    """One-sided upper bound of the mean of shares, (n,) independent numbers from 0 to 1.
+
+    Where at least `MANY` of them are not zero, Student's with Hall's correction for skewness (J. R. Stat. Soc. B 54,
+    1992), whose cover is what it says to a per cent. Where fewer are, Gaffke's (2005), which has never been seen to
+    cover less than it says, and mostly covers more: the quantile of sum D_i x_i + D_(n+1), D uniform on the simplex
+    (Learned-Miller, Thomas, A New Confidence Interval for the Mean of a Bounded Random Variable, arXiv:1905.06208). Of
+    zeros and ones that is Clopper and Pearson's.
+
+    >>> f"{mean_bound(np.zeros(852), confidence=0.9):.6f} {1 - 0.1 ** (1 / 852):.6f}"
+    '0.002699 0.002699'
+    >>> f"{mean_bound(np.append(np.zeros(990), np.full(10, 0.3)), confidence=0.95):.4f}"
+    '0.0065'
+    """
+    count, some = shares.size, shares[shares > 0.0]
+    if np.all(some == 1.0):
+        return 1.0 - share_bound(count - some.size, count, confidence)
+    if some.size >= MANY:
+        return float(_hall(shares, confidence))
+
+    def sure(x: float) -> float:
+        return _below_zero(np.concatenate([some - x, [1.0 - x]]), count - some.size, -x) - confidence
+
+    found: Any = optimize.brentq(sure, float(some.sum()) / count * (1.0 + 1e-9), 1.0 - 1e-12)
+    return float(found)
+
+
+def _hall(x: np.ndarray, confidence: float) -> float:
+    """Upper bound of a mean: T + a T^2 / 3 + a^2 T^3 / 27 + a / 6, a the skewness over sqrt(n), is nearly normal."""
+    n, mean, spread = x.size, float(x.mean()), float(x.std())
+    if spread == 0.0:
+        return mean
+    a = float(np.mean((x - mean) ** 3)) / spread**3 / np.sqrt(n)
+    z = float(stats.norm.ppf(1.0 - confidence))
+    t = z if abs(a) < 1e-8 else 3.0 / a * (np.cbrt(1.0 + a * (z - a / 6.0)) - 1.0)
+    return min(1.0, mean - float(x.std(ddof=1)) / np.sqrt(n) * float(t))
+
+
+def _below_zero(weights: np.ndarray, more: int, weight: float) -> float:
+    """Chance that weights times exponential numbers, and so many `more` of one weight, sum up to less than zero.
+
+    The weights D above are such numbers over their sum. By the saddlepoint formula of Lugannani and Rice (Adv. Appl.
+    Prob. 12, 1980), which puts the bound at most 0.3 % too high.
+    """
+    s: Any = optimize.brentq(
+        lambda s: np.sum(weights / (1.0 - s * weights)) + more * weight / (1.0 - s * weight),
+        (1.0 - 1e-12) / min(weights.min(), weight),
+        (1.0 - 1e-12) / weights.max(),
+        xtol=1e-14,
+    )
+    generating = -np.sum(np.log1p(-s * weights)) - more * np.log1p(-s * weight)
+    bend = np.sum((weights / (1.0 - s * weights)) ** 2) + more * (weight / (1.0 - s * weight)) ** 2
+    w, u = np.sign(s) * np.sqrt(max(-2.0 * generating, 0.0)), s * np.sqrt(bend)
+    if abs(u) < 1e-4:  # at the mean, where both terms grow without end
+        return 0.5
+    return float(stats.norm.cdf(w) + stats.norm.pdf(w) * (1.0 / w - 1.0 / u))
 
 
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:

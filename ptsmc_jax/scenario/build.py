@@ -39,6 +39,7 @@ def setup(scenario: Scenario) -> Setup:
         actuators=devices,
         walk_rate=walk,
         command_filter=None if filtering is None else filtering.build(),
+        pointing=scenario.observation(),
     )
 
 

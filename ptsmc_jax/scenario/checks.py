@@ -42,8 +42,14 @@ def _check_requirements(scenario: Scenario) -> None:
         table = scenario.metrics[key].table if key in scenario.metrics else None
         if table is not None and getattr(scenario, table, None) is None:
             raise ScenarioError(f"requirements.{key} needs [{table}], but there is no [{table}] table")
-        if isinstance(value, tables.Limit) and value.confidence is not None and value.quantile is None:
-            raise ScenarioError(f"requirements.{key}.confidence is {value.confidence}, but goes with a quantile only")
+        if key.startswith(catalogues.WITHIN):
+            ask = '{ limit = .., probability = .., interpretation = "mixed" }'
+            name = f"requirements.{key.removeprefix(catalogues.WITHIN)}"
+            raise ScenarioError(f"requirements.{key} is a share of the time, to be large; allowed is {name} = {ask}")
+        if key.startswith(catalogues.KNOWLEDGE) and not measures(scenario):
+            raise ScenarioError(f"requirements.{key} needs noise in [hardware]: the law sees the true state")
+        if isinstance(value, tables.Limit):
+            _check_limit(key, value)
         if key in catalogues.MARGINS and scenario.loop.mode != "sampled":
             raise ScenarioError(f'requirements.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
         if key in catalogues.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
@@ -51,6 +57,34 @@ def _check_requirements(scenario: Scenario) -> None:
                 f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
                 "allowed is a width greater than 0"
             )
+
+
+def measures(scenario: Scenario) -> bool:
+    """Whether the law sees something else than the true state."""
+    noises = ("attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk", "state_noise")
+    return scenario.estimator.on or any(getattr(scenario.hardware, noise, None) is not None for noise in noises)
+
+
+def _check_limit(metric: str, limit: tables.Limit) -> None:
+    """What the keys of a requirement in full say together."""
+    key = f"requirements.{metric}"
+    if limit.quantile is not None and limit.probability is not None:
+        raise ScenarioError(f"{key} has both quantile and probability, but must have one of them: they are the same")
+    if limit.confidence is not None and limit.share is None:
+        raise ScenarioError(f"{key}.confidence is {limit.confidence}, but goes with a quantile or a probability only")
+    if limit.interpretation in (None, "ensemble"):
+        return
+    said = f"{key}.interpretation is {errors.show(limit.interpretation)}"
+    if metric not in catalogues.AT_A_TIME:
+        known = ", ".join(catalogues.AT_A_TIME)
+        raise ScenarioError(f'{said}, but must be "ensemble": shares of time are known of {known}')
+    if limit.probability is None:
+        raise ScenarioError(f"{said}, but there is no probability beside it, the share of the time")
+    if limit.interpretation == "temporal" and limit.confidence is not None:
+        raise ScenarioError(
+            f"{said}, which every run that is flown must keep, but confidence is {limit.confidence}; "
+            'allowed is none, or "ensemble" or "mixed"'
+        )
 
 
 def _check_loop(scenario: Scenario) -> None:

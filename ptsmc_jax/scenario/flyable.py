@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
-from ptsmc_jax.scenario import build, own_checks, reading, timing
+from ptsmc_jax.scenario import build, checks, own_checks, reading, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -36,15 +36,30 @@ class Study:
 
 def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
     """The metrics that a scenario's runs have, by name."""
-    entries = scenario.metrics
-    return {name: e for name, e in entries.items() if e.table is None or getattr(scenario, e.table, None) is not None}
+    timed = {r.timed for r in requirements(scenario)}
+
+    def there(name: str, entry: catalogues.Entry) -> bool:
+        if name.startswith(catalogues.WITHIN) and name not in timed:
+            return False
+        if name.startswith(catalogues.KNOWLEDGE) and not checks.measures(scenario):
+            return False
+        return entry.table is None or getattr(scenario, entry.table, None) is not None
+
+    return {name: entry for name, entry in scenario.metrics.items() if there(name, entry)}
 
 
 def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """What a scenario asks of its runs."""
     units = scenario.metrics
     return tuple(
-        Requirement(name, value.limit, units[name].unit, value.quantile, value.confidence)
+        Requirement(
+            name,
+            value.limit,
+            units[name].unit,
+            value.share,
+            value.confidence,
+            interpretation=value.interpretation or "ensemble",
+        )
         if isinstance(value, t.Limit)
         else Requirement(name, float(value), units[name].unit)
         for name, value in scenario.requirements.items()

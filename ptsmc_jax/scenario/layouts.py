@@ -16,7 +16,16 @@ SCENARIOS: dict[str, type[Scenario]] = {
     "system": SystemScenario,
 }
 TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {kind: made.TABLES for kind, made in SCENARIOS.items()}
-OPTIONAL = ("flexible", "hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
+OPTIONAL = (
+    "flexible",
+    "hardware",
+    "wheels",
+    "filter",
+    "pointing",
+    "dispersion",
+    "requirements",
+    "tune",
+)  # off where absent
 KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # of a key that is a table
 _RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
 _TURN: Kinds = {"normal": dt.NormalTurn, "uniform": dt.UniformTurn}

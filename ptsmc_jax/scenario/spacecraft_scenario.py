@@ -15,6 +15,7 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Table, Three
@@ -91,6 +92,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     flexible: Flexible | None = None
     wheels: WheelLimits | None = None
     filter: FilterTable | None = None
+    pointing: Pointing | None = None
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {
         "plant": SpacecraftPlant,
@@ -105,6 +107,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "hardware": Hardware,
         "wheels": WHEELS,
         "filter": FILTERS,
+        "pointing": Pointing,
         "dispersion": dispersion_tables.Dispersion,
         "tune": Tune,
     }
@@ -179,6 +182,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         self.estimator.check(self)
         if self.wheels is not None:
             self.wheels.check()
+        if self.pointing is not None:
+            self.pointing.check(self)
+
+    def observation(self) -> Any:
+        """What pointing error indices are taken of."""
+        return None if self.pointing is None else self.pointing.build(self)
 
     def model(self) -> Any:
         """The body that the law knows."""

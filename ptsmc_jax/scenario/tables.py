@@ -37,17 +37,26 @@ class Loop(Table, frozen=True):
 
 
 class Limit(Table, frozen=True):
-    """A requirement in full: metric <= limit in a share of the trials.
+    """A requirement in full: metric <= limit in a share of the trials, or of the time.
 
     Attributes:
         limit: the largest value allowed, a number or with its unit, "0.05 deg"
         quantile: the share of the trials in which it must hold; default: all that are flown
-        confidence: of the one-sided bound (Clopper and Pearson) by which that share must be shown; default: none asked
+        probability: of what `interpretation` says; of an ensemble it is the quantile
+        confidence: of the one-sided bound by which that share must be shown; default: none asked
+        interpretation: of the runs, at all times (default); of the time, in every run; of the time of all runs
     """
 
     limit: NotNegative
     quantile: Quantile | None = None
+    probability: Quantile | None = None
     confidence: Quantile | None = None
+    interpretation: Literal["ensemble", "temporal", "mixed"] | None = None
+
+    @property
+    def share(self) -> float | None:
+        """What is asked for, by either name."""
+        return self.quantile if self.probability is None else self.probability
 
 
 FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains),
@@ -166,6 +175,10 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Of the run, `loop.t_end` [s]."""
         assert self.loop.t_end is not None, "a scenario that is not resolved"
         return self.loop.t_end
+
+    def observation(self) -> Any:
+        """What pointing error indices are taken of, a part of `simulation.pointing`; None: nothing."""
+        return None
 
     def resolved(self) -> Any:
         """With the defaults of its plant that depend on other keys."""

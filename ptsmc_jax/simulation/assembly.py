@@ -9,6 +9,7 @@ from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
+from ptsmc_jax.simulation.pointing import Pointing
 
 _Setup = TypeVar("_Setup", bound="Setup")
 
@@ -31,6 +32,7 @@ class Setup:
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     command_filter: CommandFilter | None = None  # between the law and the actuators
+    pointing: Pointing | None = None  # what pointing error indices are taken of
 
     def __post_init__(self) -> None:
         """A plain function, or a lambda, is a disturbance and a reference too."""

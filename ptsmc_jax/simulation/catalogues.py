@@ -15,6 +15,21 @@ class Entry(NamedTuple):
     table: str | None = None
 
 
+# pointing error indices (ECSS-E-ST-60-10C), see `pointing`: of each the largest in the observation is told
+INDICES = {
+    "ape": "APE, the error",
+    "mpe": "MPE, the error's mean over a window",
+    "rpe": "RPE, the error less its window's mean",
+    "pde": "PDE, the difference of the means of two windows",
+    "ake": "AKE, the error of what the law is told",
+    "mke": "MKE, its mean over a window",
+    "rke": "RKE, that error less its window's mean",
+}
+AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
+AT_A_TIME = tuple(f"{index}_{axis}" for index in ("ape", "ake") for axis in AXES)  # of which there are shares of time
+KNOWLEDGE = ("ake", "mke", "rke", "within_ake")
+WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
+
 CATALOGUE = {
     "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),
     "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
@@ -36,6 +51,15 @@ CATALOGUE = {
         "sqrt(kg) m", "largest size of the flexible modes' motion, (sum of e^2 + (e'/W)^2)^1/2", "flexible"
     ),
     "residual_modal": Entry("sqrt(kg) m", "the same from t_f to t_end", "flexible"),
+    **{
+        f"{index}_{axis}": Entry("rad", f"{what}, {where}: largest in the observation", "pointing")
+        for index, what in INDICES.items()
+        for axis, where in AXES.items()
+    },
+    **{
+        f"{WITHIN}{name}": Entry("-", f"share of the observation in which {name} is within its limit", "pointing")
+        for name in AT_A_TIME
+    },
 }
 # The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
 STATE_CATALOGUE = {

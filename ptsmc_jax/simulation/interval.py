@@ -6,14 +6,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax.simulation.pointing import Course, Pointing
+
 
 class Criteria(NamedTuple):
-    """Times that the metrics refer to [s] and the settling angle [rad]."""
+    """Times that the metrics refer to [s], the settling angle [rad], and what pointing is observed."""
 
     t_f: Array
     t_end: Array
     window: Array
     settling_angle: Array
+    pointing: Pointing | None = None
 
 
 class Snapshot(NamedTuple):
@@ -31,6 +34,7 @@ class Start(NamedTuple):
     snapshot: Snapshot
     inputs: int  # of the plant
     wheel_momentum: Array | None  # (wheels,) [N m s]; None: no wheels
+    told: bool = False  # the law sees something else than the true state
 
 
 class Arrival(NamedTuple):
@@ -68,6 +72,8 @@ class Interval(NamedTuple):
     limited: Array  # bool: a limit of the actuators cuts the command
     wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
     wheel_torque: Array | None = None  # (times, wheels) at both ends [N m]
+    pointing: Callable[[], Course] | None = None  # error of the attitude in it, where that is observed
+    knowledge: Callable[[], Course] | None = None  # error of what the law is told of it, as long as that is the newest
 
     @property
     def length(self) -> Array:

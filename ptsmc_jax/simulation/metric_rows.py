@@ -1,7 +1,7 @@
 """Every metric, a row each: what it remembers at t = 0, after each interval, and the value at the end of the run."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
+from ptsmc_jax.simulation import pointing
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, integral_in_window
 
 
@@ -130,6 +131,72 @@ def _late_ringing(largest: Array, interval: Interval, criteria: Criteria) -> Arr
     return jnp.where(interval.t_next >= criteria.t_f, jnp.where(early, ringing, jnp.maximum(largest, ringing)), largest)
 
 
+def _tally(start: Start, criteria: Criteria) -> pointing.Tally | None:
+    return None if criteria.pointing is None else pointing.begin(jnp.zeros_like(criteria.t_f))
+
+
+def _observed(tally: Any, course: pointing.Course, name: str, interval: Interval, criteria: Criteria) -> pointing.Tally:
+    assert criteria.pointing is not None
+    asked = criteria.pointing
+    limits = jnp.stack([jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES])
+    begins = criteria.t_f + asked.after
+    return pointing.update(tally, course, interval.t, interval.t_next, begins, asked.window, limits)
+
+
+def _pointing(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
+    return tally if tally is None else _observed(tally, interval.pointing(), "ape", interval, criteria)  # pyright: ignore[reportOptionalCall]
+
+
+def _knowledge(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
+    return tally if tally is None else _observed(tally, interval.knowledge(), "ake", interval, criteria)  # pyright: ignore[reportOptionalCall]
+
+
+def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
+    assert criteria.pointing is not None
+    return tally.within / (criteria.t_end - criteria.t_f - criteria.pointing.after)
+
+
+def _from(first: str, index: Callable[[pointing.Tally, Criteria], Array], axis: int) -> Callable:
+    """The value of a metric that the tally kept under the name `first` knows; NaN without one."""
+
+    def value(memory: Any, running: Running, criteria: Criteria) -> Array:
+        tally = running.memories[first]
+        return jnp.full_like(criteria.t_f, jnp.nan) if tally is None else index(tally, criteria)[axis]
+
+    return value
+
+
+# index -> what a tally knows of it, (4,)
+POINTING = {
+    "ape": lambda tally, criteria: tally.largest,
+    "mpe": lambda tally, criteria: tally.mean,
+    "rpe": lambda tally, criteria: tally.relative,
+    "pde": lambda tally, criteria: pointing.drift(tally),
+    "within_ape": _time_within,
+}
+KNOWLEDGE = {
+    "ake": POINTING["ape"],
+    "mke": POINTING["mpe"],
+    "rke": POINTING["rpe"],
+    "within_ake": _time_within,
+}
+
+
+def _pointing_rows() -> dict[str, Metric]:
+    """A row for each index and axis; those of one error share the tally that the first of them keeps."""
+    found = {}
+    for indices in (POINTING, KNOWLEDGE):
+        first = f"{next(iter(indices))}_{pointing.AXES[0]}"
+        for index, of in indices.items():
+            for k, axis in enumerate(pointing.AXES):
+                none, value = (lambda start, criteria: None), _from(first, of, k)
+                found[f"{index}_{axis}"] = Metric(begin=none, value=value, may_lack=True)
+    found["ape_x"] = replace(found["ape_x"], begin=_tally, update_late=_pointing)
+    told = lambda start, criteria: _tally(start, criteria) if start.told else None  # noqa: E731
+    found["ake_x"] = replace(found["ake_x"], begin=told, update_late=_knowledge)
+    return found
+
+
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
@@ -182,4 +249,5 @@ METRICS = {
     ),
     "peak_modal": Metric(begin=_ringing_at_start, update=_ringing),
     "residual_modal": Metric(begin=_ringing_at_start, update=_late_ringing),
+    **_pointing_rows(),
 }

@@ -64,6 +64,7 @@ def unbounded(found: Metrics, begun: Running) -> Array:
     lacking = {
         name: jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(memory)]))
         for name, memory in begun.memories.items()
+        if not METRICS[name].may_lack
     }
     return jnp.any(
         jnp.stack(

@@ -5,12 +5,12 @@ On metrics of what is flown, and on margins of its loop, most of which are to be
 
 import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.simulation.catalogues import CATALOGUE
+from ptsmc_jax.simulation.catalogues import CATALOGUE, WITHIN
 
 
 def least_within(trials: int, quantile: float | None, confidence: float | None) -> int | None:
@@ -55,6 +55,14 @@ def over(values: Any, limit: Any, *, at_least: bool) -> Any:
     return 2.0 - share.clip(max=2.0) if at_least else share
 
 
+# what a probability is of (ECSS-E-ST-60-10C)
+INTERPRETATIONS = {
+    "ensemble": "runs that keep the limit at all times",
+    "temporal": "the time, in every run",
+    "mixed": "the time of all runs: a random run at a random time",
+}
+
+
 @dataclass(frozen=True)
 class Verdict:
     """How a requirement fared over some trials."""
@@ -69,14 +77,28 @@ class Verdict:
     quantile: float | None = None  # share of trials that must keep the limit; None: every one
     confidence: float | None = None  # with which that is shown for all trials there could be
     at_least: bool = False  # the limit is the smallest value allowed, and `worst` the smallest there is
+    interpretation: str = "ensemble"
+    # share of the time within the limit: the least of a run, or, mixed, the mean over runs, and what is shown of it
+    share_of_time: float | None = None
+    shown: float | None = None
 
     @property
     def met(self) -> bool:
-        """As many trials within the limit as are asked for."""
+        """As many trials within the limit as are asked for, or as much of the time."""
+        if self.interpretation == "mixed" and self.shown is not None:
+            return self.quantile is not None and self.shown >= self.quantile
+        if self.interpretation == "temporal":
+            return self.failures == 0
         least = least_within(self.trials, self.quantile, self.confidence)
         return least is not None and self.trials - self.failures >= least
 
     def __str__(self) -> str:
+        if self.share_of_time is not None:
+            assert self.quantile is not None
+            return time_text(
+                self.metric, self.limit, self.unit, self.quantile, self.confidence, self.interpretation,
+                self.share_of_time, self.shown, self.failures, self.trials, met=self.met,
+            )  # fmt: skip
         return verdict_text(
             self.metric,
             self.limit,
@@ -88,6 +110,32 @@ class Verdict:
             self.confidence,
             at_least=self.at_least,
         )
+
+
+def time_text(
+    metric: str,
+    limit: float,
+    unit: str,
+    probability: float,
+    confidence: float | None,
+    interpretation: str,
+    share_of_time: float,
+    shown: float | None,
+    failures: int,
+    trials: int,
+    *,
+    met: bool,
+) -> str:
+    """The verdict on a limit that is to be kept for a share of the time, in one line; see `Verdict`."""
+    wanted = f"{metric} at most {limit:g} {unit} in {100 * probability:g} % of {INTERPRETATIONS[interpretation]}"
+    if interpretation == "temporal":
+        seen = f"the least of a run is {100 * share_of_time:.6g} %"
+        beyond = "" if met or trials == 1 else f", {failures} of {trials} runs have less"
+        return f"{wanted}: {seen}: {'met' if met else 'NOT met'}{beyond}"
+    seen = f"{100 * share_of_time:.6g} %"
+    if confidence is not None and shown is not None:
+        seen += f", at least {100 * shown:.6g} % at {100 * confidence:g} % confidence"
+    return f"{wanted}: {seen}: {'met' if met else 'NOT met'}"
 
 
 def verdict_text(
@@ -136,15 +184,31 @@ class Requirement:
     metric: str
     limit: float
     unit: str | None = None  # of the metric; None: as for a spacecraft
-    quantile: float | None = None
+    quantile: float | None = None  # share of the runs, or of the time: see `INTERPRETATIONS`
     confidence: float | None = None
     at_least: bool = False
+    interpretation: str = "ensemble"
 
-    def verdict(self, values: np.ndarray, ok: np.ndarray) -> Verdict:
+    @property
+    def timed(self) -> str | None:
+        """The metric that says for what share of the time a run keeps the limit, where that is asked for."""
+        return None if self.interpretation == "ensemble" else f"{WITHIN}{self.metric}"
+
+    @property
+    def implied_by(self) -> "Requirement":
+        """The ensemble requirement that implies this one: what is searched for, since shares of time have no slopes."""
+        kept = None if self.interpretation == "temporal" else self.quantile
+        return replace(self, interpretation="ensemble", quantile=kept)
+
+    def verdict(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray | None = None) -> Verdict:
         """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
 
-        A single run, numbers (), is judged by the limit alone.
+        A single run, numbers (), is judged by the limit alone, or by its share of the time. within: shares of the time
+        in which each run keeps the limit, needed where these are asked for.
         """
+        if self.timed is not None and within is not None:
+            many, ended, share = (np.atleast_1d(np.asarray(v)) for v in (values, ok, within))
+            return self._of_time(many, ended, share, single=np.ndim(values) == 0)
         single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
         within = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
@@ -159,3 +223,33 @@ class Requirement:
         failures = int(np.sum(~within))
         count = int(values.size)
         return Verdict(self.metric, self.limit, unit, worst, float(margin), failures, count, *share, self.at_least)
+
+    def _of_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
+        """The verdict on a share of the time; a run that failed keeps the limit at no time."""
+        assert self.quantile is not None
+        beyond = np.where(ok & ~np.isnan(within), 1.0 - within, 1.0)
+        unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
+        confidence = None if single else self.confidence
+        if self.interpretation == "temporal":
+            least = shown = 1.0 - float(beyond.max())
+            failures = int(np.sum(1.0 - beyond < self.quantile))
+        else:
+            from ptsmc_jax.numerics.statistics import mean_bound
+
+            least = 1.0 - float(beyond.mean())
+            shown = least if confidence is None else 1.0 - mean_bound(beyond, confidence)
+            failures = int(np.sum(beyond > 0.0))
+        return Verdict(
+            self.metric,
+            self.limit,
+            unit,
+            worst=float(np.max(np.where(ok, values, np.nan))),
+            margin=(1.0 - shown) / (1.0 - self.quantile),
+            failures=failures,
+            trials=int(values.size),
+            quantile=self.quantile,
+            confidence=confidence,
+            interpretation=self.interpretation,
+            share_of_time=least,
+            shown=shown,
+        )

@@ -17,7 +17,7 @@ from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import draws, guards, integrators, matrices
 from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.observers.base import Observer
-from ptsmc_jax.simulation import metrics
+from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule
@@ -106,7 +106,7 @@ def simulate(
     A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.
     """
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
+    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, parts.pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
     clearance = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
@@ -157,7 +157,8 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
         def until(t: Scalar) -> Any:
             return over_period(parts, now.t, start, drive, pushed, t - now.t)
 
-        state = _advance(parts, course, state, now, target, until(now.t_next), torques, until, dt / parts.substeps)
+        sight, flown = None if parts.sensors is None else computer.seen, until(now.t_next)
+        state = _advance(parts, course, state, now, target, flown, torques, until, dt / parts.substeps, sight)
         computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, dt))
         return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
 
@@ -254,7 +255,7 @@ def _begin(parts: Parts, course: _Course, wheels: Array | None = None) -> _State
         x=x0,
         u=none,
         snapshot=snapshot,
-        running=metrics.begin(Start(snapshot, parts.plant.inputs, wheels), criteria),
+        running=metrics.begin(_start(parts, snapshot, wheels), criteria),
         status=jnp.int32(OK),
         bad_time=jnp.full_like(zero, jnp.nan),
     )
@@ -273,10 +274,10 @@ class _Torques(NamedTuple):
     wheel_torque: Array | None = None
 
 
-def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step) -> _State:
+def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step, told=None) -> _State:
     """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
-    step: longest integration step taken in it [s].
+    step: longest integration step taken in it [s]; told: what the law was told of the state at its start.
     """
     law, criteria, target_next = parts.controller, course.criteria, parts.reference(now.t_next)
     snapshot = _snapshot(parts, target_next, x)
@@ -288,7 +289,14 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torq
         reached = until(criteria.t_f)
         return Arrival(law.errors(reached, course.arrival)[0], law.angle(reached, course.arrival))
 
-    interval = Interval(now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, *torques)
+    observed = ()
+    if parts.pointing is not None:
+        frame, length = parts.pointing.frame, now.t_next - now.t
+        observed = (
+            lambda: pointing.course((state.x, target), (x, target_next), frame, length),
+            None if told is None else lambda: pointing.held(told.q, state.x.q, frame, length),
+        )
+    interval = Interval(now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, *torques, *observed)
     after = state._replace(
         x=x,
         u=jnp.where(now.t_next > now.t, torques.delivered[-1], state.u),
@@ -319,7 +327,7 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
         last = _row(parts, criteria.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
     found = metrics.finish(state.running, criteria)
-    start = Start(first, parts.plant.inputs, None if acting is None else acting.h)
+    start = _start(parts, first, None if acting is None else acting.h)
     unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * criteria.settling_angle))
     cut = (state.status == OK) & ~jnp.isnan(course.gap)
@@ -328,6 +336,10 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
     bad_time = jnp.where(cut, course.gap, bad_time)
     return Result(found, status, bad_time, log)
+
+
+def _start(parts: Parts, snapshot: Snapshot, wheels: Array | None) -> Start:
+    return Start(snapshot, parts.plant.inputs, wheels, told=parts.sensors is not None)
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:

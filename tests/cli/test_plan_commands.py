@@ -37,14 +37,14 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     code, said, _ = command(*asked)
     folder = tmp_path / "out" / "montecarlo-s-corners"
     assert code == 0
-    assert "3 trials of the plan corners.csv and seed 0: 3 ok" in said
+    assert "3 trials of the plan corners.csv and seed 1000: 3 ok" in said
     assert "of trials drawn at random: of the plan as far as its rows are" in said
     rows = rows_of(folder)
     assert rows["trial"].to_list() == [0, 1, 2]
     assert rows["initial_w3"].to_list() == [0.0, 0.0, -0.02]
     assert rows["initial_q1"].n_unique() == 3  # attitudes are drawn as ever
     read = checked(folder)
-    assert "ptsmc montecarlo scenario.toml --plan corners.csv --seed 0" in read.text
+    assert "ptsmc montecarlo scenario.toml --plan corners.csv --seed 1000" in read.text
 
     part = next((folder / "trials").iterdir())
     part.unlink()

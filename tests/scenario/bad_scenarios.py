@@ -513,7 +513,7 @@ BAD = [
     (
         "requirements.effort = { limit = 9.0, confidence = 0.9 }",
         "requirements.effort.confidence is 0.9",
-        "goes with a quantile only",
+        "goes with a quantile or a probability only",
     ),
     ("tune = { objective = 'worst', level = 0.9 }", "tune.level is 0.9", 'tune.objective = "cvar" only'),
     (
@@ -559,6 +559,53 @@ BAD = [
         "requirements.effort = 9.0\ntune = { objective = 't_f', free = ['t_f'], torque_weight = 0.5 }",
         "tune.torque_weight is 0.5",
         'absent where tune.objective is "t_f"',
+    ),
+    ("pointing.boresight = [0, 0, 0]", "pointing.boresight is [0.0, 0.0, 0.0]", "a direction, not all zero"),
+    ("pointing.boresight = [0, 1]", "pointing.boresight is [0, 1]", "three numbers"),
+    ("pointing.window = 6.0", "pointing.window is 6.0", "at most half of loop.t_end - controller.t_f, 10"),
+    ("pointing.window = 0.0", "pointing.window is 0.0", "greater than 0"),
+    ("pointing.window = 0.01", "pointing.window is 0.01", "at least the longest step, 0.1"),
+    (
+        SAMPLED + "loop.period = 0.2\npointing.window = 0.1\ncontroller.delta = 1",
+        "pointing.window is 0.1",
+        "loop.period",
+    ),
+    ("pointing.after = 9.0", "pointing.window is 1.0", "half of loop.t_end - controller.t_f - pointing.after, 1"),
+    ("pointing.axis = 3", "pointing.axis is not a known key", "boresight"),
+    (CHAIN + "pointing = {}", "[pointing] goes with", "spacecraft"),
+    ("requirements.ape_x = 1e-3", "requirements.ape_x needs [pointing]", "no [pointing] table"),
+    (CHAIN + "requirements.ape_x = 1e-3", "requirements.ape_x is not a known metric", "known are"),
+    ("pointing = {}\nrequirements.ake_x = 1e-3", "requirements.ake_x needs noise in [hardware]", "true state"),
+    (
+        "pointing = {}\nrequirements.within_ape_x = 0.9",
+        "requirements.within_ape_x is a share of the time",
+        "requirements.ape_x = { limit",
+    ),
+    (
+        "pointing = {}\nrequirements.ape_x = { limit = 1e-3, quantile = 0.9, probability = 0.9 }",
+        "requirements.ape_x has both quantile and probability",
+        "one of them",
+    ),
+    (
+        "pointing = {}\nrequirements.rpe_x = { limit = 1e-3, probability = 0.9, interpretation = 'mixed' }",
+        'requirements.rpe_x.interpretation is "mixed"',
+        "ape_x, ape_y",
+    ),
+    (
+        "pointing = {}\nrequirements.ape_x = { limit = 1e-3, quantile = 0.9, interpretation = 'mixed' }",
+        'requirements.ape_x.interpretation is "mixed"',
+        "no probability beside it",
+    ),
+    (
+        "pointing = {}\n"
+        "requirements.ape_x = { limit = 1e-3, probability = 0.9, confidence = 0.9, interpretation = 'temporal' }",
+        'requirements.ape_x.interpretation is "temporal"',
+        'allowed is none, or "ensemble" or "mixed"',
+    ),
+    (
+        "pointing = {}\nrequirements.ape_x = { limit = 1e-3, probability = 0.9, interpretation = 'spatial' }",
+        'requirements.ape_x.interpretation is "spatial"',
+        '"ensemble" or "temporal" or "mixed"',
     ),
     ("tune.torque_weight = -0.5", "tune.torque_weight is -0.5", "at least 0"),
     ("tune = { free = ['eta'], per_axis = true }", "tune.per_axis is true", "without observer_gain"),

@@ -155,6 +155,14 @@ COMPLETE = [
     {"flexible": {"frequency": [6.0, 9.0], "damping": [0.005, 0.0], "coupling": [[0.8, 0.0, 0.1], [0.0, 0.5, 0.0]]}},
     {"wheels": {"kind": "pyramid", "cant_deg": 30.0, "torque_limit": 0.2, "momentum_limit": 4.0}},
     {"wheels": {"kind": "axes", "momentum": [0.1, 0.2, 0.3]}},
+    {"pointing": {"boresight": [0.0, 0.6, 0.8], "window": 0.5, "after": 2.0}},
+    {
+        "pointing": {},
+        "hardware": {"attitude_noise": 1e-5},
+        "requirements": {
+            "ake_boresight": {"limit": 1e-4, "probability": 0.9973, "confidence": 0.9, "interpretation": "mixed"},
+        },
+    },
     {"filter": {"kind": "none"}},
     {"filter": {"kind": "steady_state", "bandwidth": 0.1}},
     {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-3, "phase": 0.1, "mrp": [0.0, 0.0, 0.1]}},

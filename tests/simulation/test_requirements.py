@@ -155,3 +155,67 @@ def test_a_share_in_words():
     assert str(share.verdict(values, ok)) == f"{said} 0.6: NOT met in 9 of 1000 trials, at most 5 allowed"
     few = str(share.verdict(values[:50], ok[:50]))
     assert few == f"{said} 0.6: NOT shown, which takes at least 230 trials"
+
+
+RUNS = 1000
+INDEX = "ape_boresight"
+
+
+def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None, values=None):
+    within = np.asarray(within, dtype=float)
+    asked = Requirement(INDEX, 1e-3, "rad", probability, confidence, interpretation=interpretation)
+    assert asked.timed == f"within_{INDEX}"
+    values = np.full(within.shape, 2e-3) if values is None else values
+    return asked.verdict(values, np.ones(within.shape, bool) if ok is None else ok, within)
+
+
+def test_temporal_is_a_share_of_the_time_in_every_run():
+    kept = np.full(RUNS, 1.0)
+    kept[7] = 0.998
+    told = of_time("temporal", kept)
+    assert (told.met, told.failures, told.shown) == (True, 0, pytest.approx(0.998))
+    assert told.margin == pytest.approx(0.002 / 0.0027)
+    kept[8] = 0.99
+    told = of_time("temporal", kept)
+    assert (told.met, told.failures) == (False, 1)
+    assert "in 99.73 % of the time, in every run: the least of a run is 99 %: NOT met, 1 of 1000 runs have less" in str(
+        told
+    )
+    assert not of_time("temporal", np.ones(RUNS), ok=np.arange(RUNS) > 0).met  # a run that failed keeps it never
+
+
+def test_mixed_is_a_random_run_at_a_random_time():
+    never = of_time("mixed", np.ones(852), confidence=0.9)
+    assert never.met  # as many runs without a failure as of an ensemble
+    assert never.shown == pytest.approx(0.1 ** (1 / 852))
+    assert not of_time("mixed", np.ones(851), confidence=0.9).met
+    # half of the runs leave it for a two-hundredth of the time: an ensemble never would keep it
+    kept = np.where(np.arange(RUNS) % 2, 1.0, 0.995)
+    told = of_time("mixed", kept)
+    assert (told.met, told.share_of_time) == (True, pytest.approx(0.9975))
+    assert "99.73 % of the time of all runs: a random run at a random time: 99.75 %: met" in str(told)
+    sure = of_time("mixed", kept, confidence=0.9)
+    assert 0.9973 < sure.shown < 0.9975
+    assert sure.met
+    assert not of_time("mixed", kept, confidence=0.999).met
+    # runs are what is independent: the same share, from fewer of them, is shown less sharply
+    assert of_time("mixed", kept[::10], confidence=0.9).shown < sure.shown
+    failed = of_time("mixed", kept, ok=np.arange(RUNS) > 0)
+    assert failed.share_of_time == pytest.approx(0.9975 - 0.995 / RUNS)
+
+
+def test_one_run_is_judged_by_its_own_share():
+    for interpretation in ("temporal", "mixed"):
+        asked = Requirement(INDEX, 1e-3, "rad", 0.9, 0.95 if interpretation == "mixed" else None,
+                            interpretation=interpretation)  # fmt: skip
+        for share, met in ((0.95, True), (0.85, False)):
+            assert asked.verdict(np.asarray(2e-3), np.asarray(True), np.asarray(share)).met is met
+
+
+def test_the_ensemble_is_what_a_quantile_always_was():
+    asked = Requirement(INDEX, 1e-3, "rad", 0.9973, 0.9)
+    assert asked.timed is None
+    assert asked.implied_by == asked
+    assert Requirement(INDEX, 1e-3, "rad", 0.9973, 0.9, interpretation="mixed").implied_by == asked
+    every = Requirement(INDEX, 1e-3, "rad", 0.9973, interpretation="temporal").implied_by
+    assert (every.quantile, every.interpretation) == (None, "ensemble")

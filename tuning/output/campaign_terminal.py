@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tuning.output import sentences, terminal
+from tuning.output import pointing_sentences, sentences, terminal
 from tuning.output.progress_lines import Lines
 
 
@@ -54,6 +54,9 @@ def campaign(found: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
     terminal.say(*sentences.campaign_counts(found))
     terminal.table(sentences.campaign(found))
+    terminal.say(*pointing_sentences.heading(found))
+    for table in pointing_sentences.tables(found):
+        terminal.table(table)
     terminal.say(
         *sentences.campaign_error(found),
         *map(sentences.verdict, found["verdicts"]),

@@ -20,7 +20,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
-from tuning.output import margin_sentences, page_captions, page_charts, search_sentences, sentences
+from tuning.output import margin_sentences, page_captions, page_charts, pointing_sentences, search_sentences, sentences
 
 HERE = Path(__file__).parent
 
@@ -308,6 +308,9 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
         Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),
         Section("Gains", [_table(sentences.flown_gains(result.scenario, result.kind))]),
     ]
+    pointing = [_table(table) for table in pointing_sentences.tables(summary)]
+    if pointing:
+        sections.insert(-1, Section("Pointing", [_text(pointing_sentences.heading(summary)), *pointing]))
     lines = [*sentences.campaign_counts(summary), *sentences.campaign_error(summary)]
     return _verdict(summary, lines, bool(summary["verdicts"])), sections
 

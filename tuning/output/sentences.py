@@ -5,15 +5,21 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
+from tuning.output import pointing_sentences
 from tuning.output.cells import Summary, Table
 
+TIMED = ("metric", "limit", "unit", "quantile", "confidence", "interpretation", "share_of_time", "shown", "failures",
+         "trials")  # of a verdict on a share of the time  # fmt: skip
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
 
 def verdict(told: Summary) -> str:
     """A verdict in one line; over many trials with the share of them that keeps the limit."""
-    from ptsmc_jax.simulation.requirements import verdict_text
+    from ptsmc_jax.simulation.requirements import time_text, verdict_text
 
+    if told.get("share_of_time") is not None:
+        shares = (told[name] for name in TIMED)
+        return time_text(*shares, met=told["met"])
     fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
     values: list[Any] = [told.get(field) for field in fields]
     text = verdict_text(*values, at_least=told.get("at_least", False))
@@ -259,6 +265,8 @@ def campaign(summary: Summary) -> Table:
 
     rows: list[tuple[str, ...]] = []
     for name, told in summary["quantiles"].items():
+        if pointing_sentences.is_index(name):
+            continue
         far = told["0.9973"]
         between = f"{_number(far['low'])}..{_number(far['high'])}"
         cells = (told["0.5"]["value"], far["value"])

@@ -18,13 +18,14 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from ptsmc_jax.simulation.requirements import Requirement, Verdict, least_within
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, floor_of, margins_of
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
+SHOWN = 0.9973  # of the runs, by which a pointing budget is told
 SEARCHED = 100_000  # trials by which it is judged what drives a metric
 DRAWN = 1000  # trials whose histories are drawn
 POINTS = 5000  # trials in a figure of points
@@ -48,23 +49,35 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
 def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
     """Verdicts over the trials (the first so many), and what `summary.json` says of each; not of margins."""
     wanted = scenario.requirements(folder.scenario)
-    names = dict.fromkeys(r.metric for r in wanted)
+    names = dict.fromkeys(name for r in wanted for name in (r.metric, r.timed) if name is not None)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
     verdicts = flying.verdicts(wanted, frame)
-    return verdicts, [_told(v, r) for v, r in zip(verdicts, wanted, strict=True)]
+    ok = flying.finished(frame)
+    return verdicts, [_told(v, r, _beyond(frame, r, ok)) for v, r in zip(verdicts, wanted, strict=True)]
 
 
-def _told(verdict: Verdict, wanted: Requirement) -> dict[str, Any]:
+def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndarray:
+    """Share of the time that each trial is beyond a limit: 0 or 1 where it is asked for at all times, (trials,)."""
+    if wanted.interpretation != "mixed" or wanted.timed is None:
+        return np.zeros(0)
+    return np.where(ok, 1.0 - frame[wanted.timed].fill_null(0.0).to_numpy(), 1.0)
+
+
+def _told(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
     within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
-    told = {
-        **msgspec.to_builtins(verdict),
-        "met": verdict.met,
-        "share": within / verdict.trials,
-        "share_interval": statistics.share_interval(within, verdict.trials, CONFIDENCE),
-        "share_bound": statistics.share_bound(within, verdict.trials, confidence),
-    }
+    told = {**msgspec.to_builtins(verdict), "met": verdict.met}
+    if beyond.size:  # a share of the time, of which runs are what is independent
+        each = (1.0 + CONFIDENCE) / 2.0
+        told["share"] = 1.0 - beyond.mean()
+        told["share_interval"] = 1.0 - statistics.mean_bound(beyond, each), statistics.mean_bound(1.0 - beyond, each)
+        told["share_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
+    else:
+        told["share"] = within / verdict.trials
+        told["share_interval"] = statistics.share_interval(within, verdict.trials, CONFIDENCE)
+        told["share_bound"] = statistics.share_bound(within, verdict.trials, confidence)
     if wanted.quantile is not None and wanted.confidence is not None:
-        told["fewest_trials"] = statistics.fewest_for(verdict.failures, wanted.quantile, wanted.confidence)
+        failures = verdict.failures if wanted.timed is None else 0
+        told["fewest_trials"] = statistics.fewest_for(failures, wanted.quantile, wanted.confidence)
     return told
 
 
@@ -106,10 +119,30 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "interval_confidence": CONFIDENCE,
         "floor": floor_of(folder),
         "verdicts": told,
+        **_pointing(folder, parts, finished),
         "quantiles": found,
         "drivers": drivers,
         "cautions": cautions.of(folder.scenario),
     }
+
+
+def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, Any]:
+    """The pointing budget: of every index what `SHOWN` of the runs keep, with `CONFIDENCE` at most this much [rad]."""
+    table = getattr(folder.scenario, "pointing", None)
+    if table is None:
+        return {}
+    there, budget = scenario.catalogue(folder.scenario), {}
+    for index in catalogues.INDICES:
+        names = {axis: f"{index}_{axis}" for axis in catalogues.AXES if f"{index}_{axis}" in there}
+        frame = rows.read(parts, names.values()).head(folder.trials)
+        for axis, name in names.items():
+            values = frame[name].to_numpy().astype(float)
+            ordered = np.sort(np.where(finished & np.isfinite(values), values, np.inf))
+            least = least_within(ordered.size, SHOWN, CONFIDENCE)
+            bound = None if least is None or not np.isfinite(ordered[least - 1]) else float(ordered[least - 1])
+            budget.setdefault(index, {})[axis] = bound
+    told = {"boresight": table.boresight, "window": table.window, "after": table.after}
+    return {"pointing": {**told, "probability": SHOWN, "confidence": CONFIDENCE, "budget": budget}}
 
 
 def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:

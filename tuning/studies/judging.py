@@ -50,8 +50,12 @@ def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Ver
     requirements = ready.requirements
     alone = trials.status.size == 1  # nothing is drawn: no share of the trials to speak of
     finished = trials.finished[0] if alone else trials.finished
-    values = [getattr(trials.metrics, r.metric) for r in requirements]
-    flown = [r.verdict(v[0] if alone else v, finished) for r, v in zip(requirements, values, strict=True)]
+
+    def of(name: str) -> np.ndarray:
+        values = getattr(trials.metrics, name)
+        return values[0] if alone else values
+
+    flown = [r.verdict(of(r.metric), finished, None if r.timed is None else of(r.timed)) for r in requirements]
     return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
 
 

@@ -106,7 +106,7 @@ def trace(
         return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
 
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
-    loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in ready.requirements]
+    loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
     free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
     _unless_interrupted(free)
     problem = replace(free.problem, limits=problem.limits)

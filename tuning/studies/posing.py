@@ -26,6 +26,11 @@ class Posed:
     own: np.ndarray  # (gains,) of the scenario
     sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
 
+    @property
+    def asked(self) -> list[Requirement]:
+        """What the search keeps."""
+        return [r.implied_by for r in self.ready.requirements]
+
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
     """The tuning problem of a scenario."""
@@ -33,15 +38,16 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     assert table is not None
     ready = study(scenario, reach=_reach(scenario, table))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
-    trained = judging.trials_of(ready, confirm.training_trials(ready.requirements, table.trials))
+    asked = [r.implied_by for r in ready.requirements]
+    trained = judging.trials_of(ready, confirm.training_trials(asked, table.trials))
     problem = objective.problem(
         ready.parts,
         ready.dispersion,
         seed,
         np.arange(trained),
         bounds.names,
-        ready.requirements,
-        least=tuple(_least(r, trained) for r in ready.requirements),
+        asked,
+        least=tuple(_least(r, trained) for r in asked),
         goal=T_F if table.objective == T_F else "window_error",
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,

@@ -10,11 +10,17 @@ from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.scenario import cautions, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
+# of a verdict on a share of the time
+OF_TIME = ("quantile", "confidence", "interpretation", "share_of_time", "shown")
+
 
 def summary(run: Run, scenario: Scenario) -> dict[str, Any]:
     """What `summary.json` says."""
     verdicts = {
-        v.metric: {"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least}
+        v.metric: {
+            **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
+            **({} if v.share_of_time is None else {name: getattr(v, name) for name in OF_TIME}),
+        }
         for v in run.verdicts
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}

@@ -27,9 +27,11 @@ JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # sta
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
     summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
-    for name in catalogues.CATALOGUES[kind]:
+    for name, entry in catalogues.CATALOGUES[kind].items():
         values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
+        if known.size == 0 and entry.table is not None:
+            continue  # what the scenario has no table for
         if known.size == 0:
             summary[name] = None
             continue

@@ -113,7 +113,7 @@ def tune(
     found = search(
         evaluate,
         problem,
-        ready.requirements,
+        posed.asked,
         own,
         table.starts,
         table.steps,

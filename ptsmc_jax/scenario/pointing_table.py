@@ -1,0 +1,50 @@
+"""The table of a scenario file that says what pointing is observed."""
+
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.values import NotNegative, Positive, Table, Three
+
+LONGEST_STEP = 0.1  # of the continuous loop after the hand-over [s], see `clock`
+
+
+class Pointing(Table, frozen=True):
+    """What pointing error indices (ECSS-E-ST-60-10C) are taken of: from `after` t_f to t_end, in windows.
+
+    Attributes:
+        boresight: direction of an instrument in body axes, of any length; its half-cones are told beside the axes
+        window: time over which means are taken (MPE, RPE, PDE), one window after the other [s]
+        after: from t_f to when the observation begins [s]
+    """
+
+    boresight: Three = (0.0, 0.0, 1.0)
+    window: Positive = 1.0
+    after: NotNegative = 0.0
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError where no direction is given, or not two windows fit into the observation."""
+        if not np.linalg.norm(self.boresight) > 0.0:
+            raise wrong("pointing.boresight", self.boresight, "a direction, not all zero")
+        left = scenario.end - scenario.controller.t_f - self.after
+        if not left >= 2.0 * self.window * (1 - 1e-9):
+            times = f"loop.t_end - controller.t_f{' - pointing.after' if self.after else ''}"
+            raise wrong("pointing.window", self.window, f"at most half of {times}, {left:.6g}")
+        sampled = scenario.loop.mode == "sampled"
+        least, what = (scenario.loop.period, "loop.period") if sampled else (LONGEST_STEP, "the longest step")
+        if self.window < least * (1 - 1e-9):
+            raise wrong("pointing.window", self.window, f"at least {what}, {least}")
+
+    def build(self, scenario: Any) -> Any:
+        """`pointing.Pointing`, with the limits of which shares of time are asked for."""
+        from ptsmc_jax.numerics.pytrees import vector
+        from ptsmc_jax.simulation.pointing import Pointing as Physics
+        from ptsmc_jax.simulation.pointing import across
+
+        timed = {
+            name: vector(limit.limit)
+            for name, limit in scenario.requirements.items()
+            if getattr(limit, "interpretation", None) not in (None, "ensemble")
+        }
+        return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed)

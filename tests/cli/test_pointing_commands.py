@@ -1,0 +1,102 @@
+"""Pointing requirements as a user asks for them: rows, verdicts, the review's tables, the page."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax.campaigns import campaign
+from ptsmc_jax.numerics import statistics
+from tests.output.pages import checked
+from tuning.output import pointing_sentences
+
+ASKED = """
+[pointing]
+boresight = [1.0, 0.0, 0.0]
+window = 0.5
+after = 0.5
+[requirements]
+peak_torque = 30.0
+rpe_boresight = { limit = 0.02, probability = 0.9, confidence = 0.9 }
+ape_boresight = { limit = 0.01, probability = 0.5, confidence = 0.9, interpretation = "mixed" }
+ake_x = { limit = 1e-4, probability = 0.9973, interpretation = "temporal" }
+"""
+FOLDER = "out/montecarlo-s"
+
+
+@pytest.fixture
+def flown(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "PART", 100)
+    text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", ASKED)
+    (tmp_path / "s.toml").write_text(text)
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 150, "--seed", 0, "--no-figures")
+    rows = pl.concat([pl.read_parquet(path) for path in sorted((tmp_path / FOLDER / "trials").glob("*.parquet"))])
+    return code, said, rows, json.loads((tmp_path / FOLDER / "summary.json").read_text())
+
+
+def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
+    code, said, rows, found = flown
+    verdicts = {told["metric"]: told for told in found["verdicts"]}
+    assert code == (0 if all(told["met"] for told in verdicts.values()) else 1)
+    assert {"within_ape_boresight", "within_ake_x"} <= set(rows.columns)
+    assert "within_ake_y" not in rows.columns
+
+    mixed, within = verdicts["ape_boresight"], rows["within_ape_boresight"].to_numpy()
+    assert 0.1 < within.mean() < 1.0
+    assert mixed["share"] == pytest.approx(within.mean())
+    assert mixed["share_bound"] == pytest.approx(1.0 - statistics.mean_bound(1.0 - within, 0.9))
+    assert mixed["met"] == (mixed["share_bound"] >= 0.5)
+    assert mixed["fewest_trials"] == 4  # 0.5^4 <= 0.1
+    low, high = mixed["share_interval"]
+    assert low < mixed["share"] < high
+    temporal = verdicts["ake_x"]
+    assert temporal["share_of_time"] == pytest.approx(rows["within_ake_x"].min())
+    assert temporal["met"]
+    ensemble = verdicts["rpe_boresight"]
+    assert ensemble["failures"] == int((rows["rpe_boresight"] > 0.02).sum())
+
+    budget = found["pointing"]["budget"]
+    assert set(budget) == {"ape", "mpe", "rpe", "pde", "ake", "mke", "rke"}
+    assert budget["ape"]["x"] is None  # 150 runs show nothing of 99.73 %
+    for place in (said, checked(tmp_path / FOLDER).text):
+        assert "pointing from 0.5 s after t_f to t_end, boresight 1, 0, 0" in place
+        assert "shown by 1109 runs without a failure; with 90 % confidence 852 would do" in place
+        assert "ape_boresight at most 0.01 rad in 50 % of the time of all runs" in place
+    table = pointing_sentences.compliance(found)
+    assert table is not None
+    assert [row[:7] for row in table.rows] == [
+        ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
+         pointing_sentences.angle(ensemble["margin"] * 0.02)),
+        ("APE", "half-cone", "2.06e+03 arcsec", "50 %", "mixed", "90 %", f"{100 * mixed['shown']:.6g} % of the time"),
+        ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "-", f"{100 * temporal['shown']:.6g} % of the time"),
+    ]  # fmt: skip
+    assert [row[9] for row in table.rows] == ["22", "4", "-"]  # 0.9^22 <= 0.1
+
+
+def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
+    from tuning.studies import campaign_summary
+
+    rows, found = flown[2:]
+    monkeypatch.setattr(campaign_summary, "SHOWN", 0.9)
+    from pathlib import Path
+
+    from tuning.studies import campaign_folder
+
+    again = campaign_summary.summarise(campaign_folder.opened(Path(FOLDER)))["pointing"]["budget"]
+    ordered = np.sort(rows["mpe_y"].to_numpy())
+    least = next(k for k in range(1, 151) if statistics.share_bound(k, 150, 0.95) >= 0.9)
+    assert again["mpe"]["y"] == ordered[least - 1]
+    assert pointing_sentences.angle(again["mpe"]["y"]) in str(
+        pointing_sentences.budget({**found, "pointing": {**found["pointing"], "budget": again}})
+    )
+
+
+def test_a_single_run_knows_the_indices(command, flown, tmp_path):
+    code, said, _ = command("simulate", "s.toml", "--trial", 3, "--no-figures", "--out", "one")
+    made = json.loads((tmp_path / "one" / "summary.json").read_text())
+    row = flown[2].row(3, named=True)
+    for name in ("ape_x", "rpe_boresight", "mke_z", "within_ape_boresight"):
+        assert made[name] == pytest.approx(row[name], rel=1e-9), name
+    assert code == (0 if all(told["met"] for told in made["verdicts"].values()) else 1)
+    assert "ake_x at most 0.0001 rad in 99.73 % of the time, in every run" in said

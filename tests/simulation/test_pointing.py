@@ -1,0 +1,247 @@
+"""Pointing error indices against brute force: over made-up errors, and over the recorded history of a run."""
+
+import dataclasses
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import scenario
+from ptsmc_jax.simulation import catalogues, pointing, rollout
+from tests.helpers import SHORT, drawn, vector
+
+SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # half-cones of deviations are known to this factor, from above
+
+
+def brute_force(t, error, mean_of, begins, window, t_end):
+    """Indices (4,) each from errors (n, 5) at times t (n,) and a function of two times for their mean between them.
+
+    About x, y, z, and the half-cone.
+    """
+    count = int((t_end - begins) / window + 1e-9)
+    interpolated = mean_of("at")
+
+    def sizes(e):
+        return np.concatenate([np.abs(e[..., :3]), np.linalg.norm(e[..., 3:], axis=-1)[..., None]], axis=-1)
+
+    seen = t >= begins - 1e-12
+    largest = sizes(np.concatenate([error[seen], interpolated(np.array([begins]))])).max(axis=0)
+    means, relative = [], []
+    for k in range(count):
+        low, high = begins + k * window, begins + (k + 1) * window
+        inside = (t > low) & (t < high)
+        points = np.concatenate([error[inside], interpolated(np.array([low, high]))])
+        means.append(mean_of(low, high))
+        relative.append(sizes(points - means[-1]).max(axis=0))
+    means = np.stack(means)
+    apart = sizes(means[:, None] - means[None]).max(axis=(0, 1))
+    return {"ape": largest, "mpe": sizes(means).max(axis=0), "rpe": np.max(relative, axis=0), "pde": apart}
+
+
+def of_spline(spline):
+    """The mean between two times of a piecewise cubic, exactly; "at": itself."""
+    integral = spline.antiderivative()
+    return lambda low, high=0.0: spline if isinstance(low, str) else (integral(high) - integral(low)) / (high - low)
+
+
+def close(found, expected, rel):
+    """Half-cones of deviations are said at most 0.5 % too large, and never too small."""
+    for index, values in expected.items():
+        np.testing.assert_allclose(found[index][:3], values[:3], rtol=rel, atol=1e-15, err_msg=index)
+        ratio = found[index][3] / values[3]
+        slack = SLACK if index in ("rpe", "pde", "rke") else 1.0
+        assert 1.0 - rel <= ratio <= slack * (1.0 + rel), index
+
+
+@jax.jit
+def tallied(nodes, error, rate, begins, window, limits):
+    """A tally over errors (n, 5) with their rates at nodes (n,)."""
+
+    def step(tally, row):
+        t, t_next, start, start_rate, end, end_rate = row
+        course = pointing.Course(start, start_rate, end, end_rate, t_next - t)
+        return pointing.update(tally, course, t, t_next, begins, window, limits), None
+
+    rows = nodes[:-1], nodes[1:], error[:-1], rate[:-1], error[1:], rate[1:]
+    return jax.lax.scan(step, pointing.begin(jnp.zeros(())), rows)[0]
+
+
+def indices(tally):
+    """By their names."""
+    return {"ape": tally.largest, "mpe": tally.mean, "rpe": tally.relative, "pde": pointing.drift(tally)}
+
+
+NODES = 0.1 * np.arange(101)
+# windows that end at nodes, between them, and an observation that begins between them and holds no whole number of them
+OBSERVED = [(4.0, 1.0), (4.0, 0.37), (4.03, 0.1), (0.0, 2.5), (3.999, 3.0)]
+
+
+@pytest.mark.parametrize(("begins", "window"), OBSERVED)
+def test_indices_of_an_error_are_those_of_its_history(begins, window):
+    def check(seed):
+        rng = np.random.default_rng(seed)
+        error, rate = rng.normal(size=(NODES.size, 5)), 10.0 * rng.normal(size=(NODES.size, 5))
+        spline = CubicHermiteSpline(NODES, error, rate)
+        expected = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1])
+        limits = np.array([0.5, 1.0, 1.5, 2.0])
+        tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, limits)))
+        close(indices(tally), expected, 1e-10)  # sums of a hundred numbers
+        assert float(tally.windows) == int((NODES[-1] - begins) / window + 1e-9)
+        # the time within a limit, sizes going straight from node to node
+        sizes = np.concatenate([np.abs(error[:, :3]), np.linalg.norm(error[:, 3:], axis=1)[:, None]], axis=1)
+        fine = np.linspace(begins, NODES[-1], 200_001)
+        at_first = spline(begins)
+        opened = np.append(np.abs(at_first[:3]), np.linalg.norm(at_first[3:]))
+        later = begins < NODES
+        for k, limit in enumerate(limits):
+            shown = np.interp(fine, np.append(begins, NODES[later]), np.append(opened[k], sizes[later, k]))
+            share = np.mean(shown <= limit)
+            assert float(tally.within[k]) / (NODES[-1] - begins) == pytest.approx(share, abs=1e-4)
+
+    for seed in range(3):
+        check(seed)
+
+
+def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
+    error = np.tile([1.0, -2.0, 3.0, 0.6, 0.8], (NODES.size, 1))
+    tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full(4, np.inf))))
+    np.testing.assert_allclose(tally.largest, [1.0, 2.0, 3.0, 1.0], rtol=1e-14)
+    np.testing.assert_allclose(tally.mean, [1.0, 2.0, 3.0, 1.0], rtol=1e-13)
+    np.testing.assert_allclose(tally.relative, 0.0, atol=1e-13)
+    ramp, slope = NODES[:, None] * np.ones(5), np.ones((NODES.size, 5))
+    tally = tallied(*map(jnp.asarray, (NODES, ramp, slope, 2.0, 1.0, np.full(4, np.inf))))
+    np.testing.assert_allclose(tally.relative[:3], 0.5, rtol=1e-12)
+    np.testing.assert_allclose(pointing.drift(tally)[:3], 7.0, rtol=1e-12)  # eight windows of 1 s
+    np.testing.assert_allclose(tally.mean[:3], 9.5, rtol=1e-12)
+
+
+def check_the_cone(seed):
+    """Against the angle between the boresight and where it points, and SciPy's rotation vector."""
+    rng = np.random.default_rng(seed)
+    b = rng.normal(size=3)
+    frame = pointing.across(b)
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-14)
+    target = Rotation.from_rotvec(rng.normal(size=3))
+    off = Rotation.from_rotvec(rng.normal(size=3) * 10.0 ** rng.uniform(-9, -0.5))
+    seen = pointing.seen(vector((target * off).as_quat()), vector(target.as_quat()), vector(frame))
+    np.testing.assert_allclose(seen.axes, off.as_rotvec(), rtol=1e-9, atol=1e-15)  # quaternions' rounding
+    unit = b / np.linalg.norm(b)
+    turned = off.apply(unit)
+    angle = np.arctan2(np.linalg.norm(np.cross(unit, turned)), unit @ turned)
+    assert float(jnp.linalg.norm(seen.cross)) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+
+
+test_the_half_cone_is_the_angle_of_the_boresight = drawn(check_the_cone, 20, seed=st.integers(0, 2**32 - 1))
+
+POINTED = (
+    SHORT.replace("[requirements]\npeak_torque = 30.0\n", "")
+    + """
+[pointing]
+boresight = [1.0, 2.0, -0.5]
+window = 0.33
+after = 0.25
+[reference]
+kind = "spin"
+rate = [0.01, -0.02, 0.03]
+[requirements]
+ape_boresight = { limit = 0.016, probability = 0.95, interpretation = "mixed" }
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    tables = {name: table for name, table in tomllib.loads(POINTED).items() if name != "tune"}
+    tables["loop"] |= {"clock": "flight"}
+    ready = scenario.study(scenario.from_tables(tables))
+    return ready, rollout.simulate_jit(ready.parts, jnp.uint32(3), jnp.uint32(5), record=True)
+
+
+def test_indices_of_a_run_are_those_of_its_history(flown):
+    ready, result = flown
+    frame = np.array(ready.parts.pointing.frame)
+    log = jax.tree.map(np.array, result.log)
+    kept = log.lasts
+    t, q, w = log.t[kept], log.x.q[kept], log.x.w[kept]
+    target, rate = log.reference.q[kept], log.reference.w[kept]
+
+    def errors(step):
+        """At step [s] from each row, on the tangent of the motion."""
+        body = Rotation.from_quat(q) * Rotation.from_rotvec(step * w)
+        wanted = Rotation.from_quat(target) * Rotation.from_rotvec(step * rate)
+        off = wanted.inv() * body
+        side = off.apply(frame[0]) @ frame[1:].T
+        size = np.linalg.norm(side, axis=1, keepdims=True)
+        return np.concatenate([off.as_rotvec(), side * np.arcsin(size) / size], axis=1)
+
+    late = t > 4.0  # from where on errors are small, and the cone's arc is its sine's
+    spline = CubicHermiteSpline(t[late], errors(0.0)[late], ((errors(1e-5) - errors(-1e-5)) / 2e-5)[late])
+    begins = 5.25
+    expected = brute_force(t[late], errors(0.0)[late], of_spline(spline), begins, 0.33, 6.5)
+    found = {
+        index: np.array([getattr(result.metrics, f"{index}_{axis}") for axis in pointing.AXES]) for index in expected
+    }
+    close(found, expected, 1e-7)  # rates by differences
+    assert 1e-3 < found["ape"][3] < 0.1
+    fine = np.linspace(begins, 6.5, 100_001)
+    nodes = np.append(begins, t[t > begins])
+    seen = np.concatenate([spline([begins]), errors(0.0)[t > begins]])
+    share = np.mean(np.interp(fine, nodes, np.linalg.norm(seen[:, 3:], axis=1)) <= 0.016)  # straight from node to node
+    assert float(result.metrics.within_ape_boresight) == pytest.approx(share, abs=1e-4)
+    assert 0.0 < share < 1.0
+    assert float(result.metrics.within_ape_x) == 1.0  # no limit of its own
+
+
+def test_what_the_law_is_told_is_off_by_its_noise(flown):
+    ready, result = flown
+    keys = ready.parts.sensors.keys(jnp.uint32(3), jnp.uint32(5))
+    samples = np.arange(50, 65)
+    turns = np.stack([np.asarray(ready.parts.sensors.noise(keys, jnp.int32(k))[0]) for k in samples])
+    began, found = 0.1 * samples, result.metrics
+    in_view = began + 0.1 > 5.25 + 1e-9  # the sample before the observation is held into it
+    for k, axis in enumerate("xyz"):
+        assert float(getattr(found, f"ake_{axis}")) == pytest.approx(np.abs(turns[in_view, k]).max(), rel=1e-6)
+    frame = np.asarray(ready.parts.pointing.frame)
+    cones = np.linalg.norm(np.cross(turns, frame[0]), axis=1)
+    assert float(found.ake_boresight) == pytest.approx(cones[in_view].max(), rel=1e-6)
+    means = []
+    for k in range(3):
+        low, high = 5.25 + 0.33 * k, 5.25 + 0.33 * (k + 1)
+        lasts = np.clip(np.minimum(began + 0.1, high) - np.maximum(began, low), 0.0, None)
+        means.append(lasts @ turns / 0.33)
+    for k, axis in enumerate("xyz"):
+        assert float(getattr(found, f"mke_{axis}")) == pytest.approx(np.abs(means)[:, k].max(), rel=1e-6)
+
+
+def test_indices_have_slopes(flown):
+    """Against central differences, of a gain that moves the hand-over with everything behind it."""
+    ready, _ = flown
+    parts = scenario.study(scenario.replace(ready.scenario, loop__clock="anchored")).parts
+    names = ("ape_boresight", "mpe_x", "rpe_boresight", "pde_y")
+
+    @jax.jit
+    def of(delta):
+        moved = dataclasses.replace(parts, controller=dataclasses.replace(parts.controller, delta=delta))
+        found = rollout.simulate(moved, jnp.uint32(3), jnp.uint32(5)).metrics
+        return jnp.stack([getattr(found, name) for name in names])
+
+    at, step = 0.437, 1e-6
+    slopes = jax.jit(jax.jacfwd(of))(vector(at))
+    differences = (of(vector(at + step)) - of(vector(at - step))) / (2 * step)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-4, atol=1e-9)
+    assert np.all(np.abs(slopes) > 1e-8)
+
+
+def test_every_index_is_a_metric_of_a_scenario_that_observes_it(flown):
+    ready, _ = flown
+    named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in pointing.AXES}
+    assert named | {"within_ape_boresight"} <= set(ready.catalogue)
+    assert not {"within_ape_x", "within_ake_boresight"} & set(ready.catalogue)
+    quiet = scenario.replace(ready.scenario, hardware=None, requirements=None)
+    assert {name for name in named if "ke_" in name} & set(scenario.catalogue(quiet)) == set()
+    assert not named & set(scenario.catalogue(scenario.replace(quiet, pointing=None)))

@@ -1,0 +1,110 @@
+"""Pointing error indices of a campaign as tables: the budget, and what was shown of each requirement."""
+
+import math
+from collections.abc import Iterator
+
+from ptsmc_jax.simulation.catalogues import AXES, INDICES
+from tuning.output.cells import Summary, Table
+
+USUAL = (0.9, 0.95)  # confidences that reviews ask for
+
+
+def angle(value: float | None) -> str:
+    """An angle [rad] in arcsec, from a degree on in degrees.
+
+    >>> angle(1e-4), angle(0.1), angle(None)
+    ('20.6 arcsec', '5.73 deg', '-')
+    """
+    if value is None or not math.isfinite(value):
+        return "-"
+    degrees = math.degrees(value)
+    return f"{degrees:.3g} deg" if abs(degrees) >= 1.0 else f"{3600.0 * degrees:.3g} arcsec"
+
+
+def tables(summary: Summary) -> list[Table]:
+    """Both, as far as they are there."""
+    return [table for table in (budget(summary), compliance(summary)) if table is not None]
+
+
+def is_index(metric: str) -> bool:
+    """Whether a metric is one of the indices, which the budget tells."""
+    index, _, axis = metric.rpartition("_")
+    return index in INDICES and axis in AXES
+
+
+def budget(summary: Summary) -> Table | None:
+    """What the indices keep to, each about the axes and as a half-cone; None: no pointing is observed."""
+    told = summary.get("pointing")
+    if not told:
+        return None
+    rows = []
+    for index, what in INDICES.items():
+        if index in told["budget"]:
+            name, _, meaning = what.partition(", ")
+            over = f"{meaning} ({told['window']:g} s)" if "window" in meaning else meaning
+            rows.append((name, *(angle(told["budget"][index].get(axis)) for axis in AXES), over))
+    return Table(("index", "x", "y", "z", "half-cone", "largest in the observation of"), rows)
+
+
+def heading(summary: Summary) -> Iterator[str]:
+    """What the budget says."""
+    from ptsmc_jax.simulation.requirements import fewest_trials
+
+    told = summary.get("pointing")
+    if told:
+        boresight = ", ".join(f"{v:g}" for v in told["boresight"])
+        begins = f"{told['after']:g} s after t_f" if told["after"] else "t_f"
+        yield (
+            f"pointing from {begins} to t_end, boresight {boresight}: {100 * told['probability']:g} % of the runs keep "
+            f"to these, with {100 * told['confidence']:g} % confidence"
+        )
+        if any(value is None for axes in told["budget"].values() for value in axes.values()):
+            few, more = (fewest_trials(told["probability"], confidence) for confidence in USUAL)
+            yield f"-: shown by {more} runs without a failure; with 90 % confidence {few} would do"
+
+
+def compliance(summary: Summary) -> Table | None:
+    """Requirements on pointing as a review takes them over; None: there are none."""
+    rows = []
+    for told in summary["verdicts"]:
+        if is_index(told["metric"]):
+            index, _, axis = told["metric"].rpartition("_")
+            rows.append(_row(told, INDICES[index].partition(",")[0], axis))
+    if not rows:
+        return None
+    head = ("index", "about", "at most", "probability", "interpretation", "confidence", "shown", "runs", "beyond")
+    return Table((*head, "needed without", "verdict"), rows)
+
+
+def _row(told: Summary, index: str, axis: str) -> tuple[str, ...]:
+    kind = told.get("interpretation") or "ensemble"
+    probability, confidence = told["quantile"], told["confidence"]
+    margin = told["margin"]
+    if kind == "ensemble":
+        shown = angle(None if margin is None else margin * told["limit"])
+    else:
+        shown = f"{100 * told['shown']:.6g} % of the time"
+    return (
+        index,
+        "half-cone" if axis == "boresight" else axis,
+        angle(told["limit"]),
+        "all flown" if probability is None else f"{100 * probability:g} %",
+        kind,
+        "-" if confidence is None else f"{100 * confidence:g} %",
+        shown,
+        str(told["trials"]),
+        str(told["failures"]),
+        _needed(kind, probability, confidence),
+        "met" if told["met"] else "NOT met",
+    )
+
+
+def _needed(kind: str, probability: float | None, confidence: float | None) -> str:
+    """Runs without a failure that would show it."""
+    from ptsmc_jax.simulation.requirements import fewest_trials
+
+    if probability is None or kind == "temporal":
+        return "-"
+    if confidence is not None:
+        return str(fewest_trials(probability, confidence))
+    return ", ".join(f"{fewest_trials(probability, c)} ({100 * c:g} %)" for c in USUAL)
