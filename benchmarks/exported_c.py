@@ -1,0 +1,82 @@
+"""The exported C beside the simulator: commands of many trials, one by one, and what a step takes.
+
+`python benchmarks/exported_c.py [TRIALS] [FLIGHT ..]`; flights are those of tests/onboard/flights.py, by default six.
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+
+def compared(name: str, count: int) -> None:
+    """Print how far apart the commands of these trials are, and how long a step takes."""
+    from ptsmc_jax import scenario
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.onboard import folder, vectors
+    from ptsmc_jax.onboard.library import Library
+    from tests.onboard.flights import FLIGHTS
+
+    begin = time.perf_counter()
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
+    with tempfile.TemporaryDirectory() as place:
+        store.write(Path(place) / "c", lambda making: folder.write_program(making, made))
+        generated = time.perf_counter() - begin
+        library = Library(Path(place) / "c")
+    dispersion = vectors.known_alike(made.ready.dispersion)
+    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    flown = jax.tree.map(np.asarray, flown)
+    worst, worst_of_peak, used = 0.0, 0.0, 0
+    at = library.columns["out"].index("command[0]")
+    for k in range(count):
+        samples = vectors.one(flown, k)
+        if not vectors.usable(samples):
+            continue
+        used += 1
+        given, out, _ = vectors.rows(made.board, samples)
+        state = vectors.first_state(made.board, samples)
+        expected = out[:, at : at + samples.command.shape[1]]
+        found = np.empty_like(expected)
+        for n, row in enumerate(given):
+            state, outputs, _ = library.many(state, row)
+            found[n] = outputs[at : at + expected.shape[1]]
+        off = np.linalg.norm(found - expected, axis=1)
+        size = np.linalg.norm(expected, axis=1)
+        worst = max(worst, float(np.max(off / np.maximum(size, 1e-300))))
+        worst_of_peak = max(worst_of_peak, float(np.max(off) / np.max(size)))
+    many = np.repeat(library.first()[None], 100_000, axis=0), np.repeat(given[:1], 100_000, axis=0)
+    seconds = []
+    for _ in range(7):
+        begin = time.perf_counter()
+        library.many(*many)
+        seconds.append((time.perf_counter() - begin) / 100_000)
+    print(
+        f"| {name} | {used} of {count} | {worst:.1e} | {worst_of_peak:.1e} | {1e6 * np.median(seconds):.2f} us "
+        f"| {generated:.1f} s |",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """A row for each flight."""
+    from ptsmc_jax.configure import configure
+
+    configure(keep_programs=True)
+    from tests.onboard.flights import SIX
+
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    print("| flight | trials | largest difference of a command, of its own size | of the trial's peak | a step, with "
+          "copies of its rows | generation |")  # fmt: skip
+    for name in sys.argv[2:] or SIX:
+        compared(name, count)
+
+
+if __name__ == "__main__":
+    main()
