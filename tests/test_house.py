@@ -87,6 +87,7 @@ HOUSE = {
             cells page_captions page_charts progress_lines
             margin_sentences
             search_sentences sentences
+            law_sentences
             page terminal
             campaign_terminal
         """,
