@@ -29,7 +29,7 @@ HOUSE = {
             fixed_time pd predefined_time scaling super_twisting terminal time_base
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
-        "devices": "attitude_filter reaction_wheels ticks | actuators sensors",
+        "devices": "attitude_filter reaction_wheels ticks | actuators sensors | own_sensors",
         "simulation": "catalogues clock interval | assembly metric_rows requirements | computer metrics | rollout",
         "dispersions": "base | attitudes inertias numbers quantities | variation | planned",
         "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
@@ -38,7 +38,7 @@ HOUSE = {
             attitude_keys dispersion_tables gain_record keys scales
             device_tables gain_bounds own start_checks
             disturbance_bounds
-            disturbance_tables law_record observer_tables reference_tables
+            disturbance_tables law_record observer_tables own_devices reference_tables
             baseline_tables
             own_laws
             law_tables

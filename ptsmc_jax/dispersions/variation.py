@@ -17,8 +17,10 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_ATTITUDE,
     INITIAL_RATE,
     INITIAL_STATE,
+    OWN,
     REFERENCE,
     Coordinates,
+    Draw,
 )
 from ptsmc_jax.dispersions.inertias import RelativeInertia
 from ptsmc_jax.dispersions.numbers import Factor, Normal, Uniform, UniformPhase
@@ -40,6 +42,7 @@ FIELDS = {
     DISTURBANCE_AMPLITUDE: "amplitude",
     DISTURBANCE_BIAS: "bias",
     REFERENCE: "reference",
+    OWN: "own",
 }
 
 
@@ -60,6 +63,7 @@ class Dispersion:
     bias: Uniform | Normal | None = None  # a constant disturbance that is added, about zero [N m]
     reference: Attitudes | None = None
     levels: dict[str, Factor] = field(default_factory=dict)  # see `LEVELS`
+    own: Draw | None = None  # anything of one's own, drawn after all else
 
     @property
     def varies(self) -> bool:
@@ -107,7 +111,8 @@ class Dispersion:
             nominal = getattr(device, key)
             factor = level.at(coordinates[quantities.level(name)], jnp.ones(level.count))
             parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
-        return replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
+        parts = replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
+        return parts if self.own is None else self.own.at(coordinates[OWN], parts)
 
     def _disturbance(self, nominal: Any, coordinates: Coordinates) -> Any:
         found = nominal

@@ -24,7 +24,7 @@ def setup(scenario: Scenario) -> Setup:
         reference=scenario.target(),
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
-        sensors=scenario.devices.sensors(scenario),
+        sensors=scenario.devices.sensors(scenario) if scenario.sensors is None else scenario.sensors.build(model),
         initial=scenario.start(),
         t_end=vector(scenario.end),
         window=vector(scenario.loop.window),
@@ -65,5 +65,6 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         phase=None if table.disturbance_phase is None else numbers.UniformPhase(phases),
         amplitude=drawn("disturbance_amplitude", amplitudes),
         bias=drawn("disturbance_bias", parts.plant.inputs),
+        own=drawn("own"),
         levels={key: level for key, level in levels.items() if level is not None},
     )

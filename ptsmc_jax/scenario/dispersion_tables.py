@@ -241,6 +241,7 @@ class Dispersion(Table, frozen=True):
         attitude_noise: factor on hardware.attitude_noise
         rate_noise: factor on hardware.rate_noise
         torque_limit: factor on hardware.torque_limit
+        own: what code of one's own makes of numbers that are drawn
     """
 
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
@@ -253,6 +254,7 @@ class Dispersion(Table, frozen=True):
     attitude_noise: RelativeNormal | RelativeUniform | None = None
     rate_noise: RelativeNormal | RelativeUniform | None = None
     torque_limit: RelativeNormal | RelativeUniform | None = None
+    own: Any = None  # `own_devices.OwnDraw`
 
 
 class StateDispersion(Table, frozen=True):
@@ -265,6 +267,7 @@ class StateDispersion(Table, frozen=True):
         disturbance_bias: a constant, added
         state_noise: factor on hardware.state_noise
         torque_limit: factor on hardware.torque_limit
+        own: what code of one's own makes of numbers that are drawn
     """
 
     x0: UniformState | NormalState | None = None
@@ -273,3 +276,4 @@ class StateDispersion(Table, frozen=True):
     disturbance_bias: NormalBias | UniformBias | None = None
     state_noise: RelativeNormal | RelativeUniform | None = None
     torque_limit: RelativeNormal | RelativeUniform | None = None
+    own: Any = None  # `own_devices.OwnDraw`

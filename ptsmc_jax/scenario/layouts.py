@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from ptsmc_jax.scenario import dispersion_tables as dt
+from ptsmc_jax.scenario import own_devices
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.state_scenario import ChainScenario, SystemScenario
 from ptsmc_jax.scenario.tables import Scenario
@@ -15,7 +16,7 @@ SCENARIOS: dict[str, type[Scenario]] = {
     "system": SystemScenario,
 }
 TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {kind: made.TABLES for kind, made in SCENARIOS.items()}
-OPTIONAL = ("hardware", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
+OPTIONAL = ("hardware", "sensors", "wheels", "filter", "dispersion", "requirements", "tune")  # off where absent
 _RELATIVE: Kinds = {"relative_normal": dt.RelativeNormal, "relative_uniform": dt.RelativeUniform}
 DISPERSIONS: dict[str, Kinds] = {
     "attitude": {"axis_angle": dt.AxisAngle, "uniform": dt.UniformAttitude, "normal": dt.NormalAttitude},
@@ -26,5 +27,6 @@ DISPERSIONS: dict[str, Kinds] = {
     "disturbance_amplitude": _RELATIVE,
     "disturbance_bias": {"normal": dt.NormalBias, "uniform": dt.UniformBias},
     **dict.fromkeys(("attitude_noise", "rate_noise", "state_noise", "torque_limit"), _RELATIVE),
+    "own": {"own": own_devices.OwnDraw},
     "x0": {"uniform": dt.UniformState, "normal": dt.NormalState},
 }

@@ -12,6 +12,7 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Kind, Kinds, Numbers, Table
 from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
@@ -57,6 +58,7 @@ def _tables(plant: type[Table]) -> dict[str, type[Table] | Kinds]:
         "observer": OBSERVERS[kind],
         "loop": Loop,
         "hardware": device_tables.StateHardware,
+        "sensors": SENSORS,
         "dispersion": dispersion_tables.StateDispersion,
         "tune": Tune,
     }

@@ -112,6 +112,8 @@ def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
+    from tuning.output import law_sentences
+
     alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
     for one in law_sentences.answers(summary):
