@@ -20,6 +20,7 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief, show
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.values import Table
 
+KEYS = ("system", "truth", "code")  # that name code, in any table
 Code = Annotated[Any, Meta(description=systems.WHERE)]
 
 
@@ -49,7 +50,7 @@ class Own:
 def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
     """The tables of a parsed file that name code, and the key that does, in tables within tables too."""
     for table in _tables(raw):
-        for key in ("system", "code"):
+        for key in KEYS:
             if isinstance(table.get(key), str):
                 yield table, key
 
@@ -66,7 +67,7 @@ def programs(scenario: Table) -> dict[str, str]:
     """What flying a scenario runs: where it stands, by the key that names it."""
     found = {}
     for place, table in _places(scenario):
-        for key in ("system", "code"):
+        for key in KEYS:
             if isinstance(getattr(table, key, None), str):
                 found[f"{place}.{key}"] = getattr(table, key)
     return found

@@ -1,7 +1,6 @@
 """Sensors and draws of one's own: beside the built-in ones, a loop by hand, and what is wrong with them."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -118,9 +117,11 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     text = SHORT.replace("attitude_noise = 2e-5\n", "").replace("rate_noise = 1e-6\n", "").replace("[hardware]\n", "")
     text = text[: text.index("[requirements]")] + '[sensors]\nkind = "own"\ncode = "mine.py:Tilted"\n'
     (here / "s.toml").write_text(text)
-    run = explore.simulate(scenario.read("s.toml"))
-    assert abs(run.metrics["terminal_angle"] - 2e-3) < 2e-4
-    assert run.floor is None
+    longer = scenario.replace(scenario.read("s.toml"), loop__t_end=25.0, controller__k1=4.0)
+    run = explore.simulate(longer)
+    turned = np.asarray(run.run.log.x.q)[-1]
+    np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # what the observer lags by is left
+    assert run.run.floor is None
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (status, error) == (0, "")
     made = store.made(here / "out" / "simulate-s")
@@ -153,7 +154,6 @@ def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here)
     assert command("montecarlo", "c.toml", "--trials", 40, "--seed", 2, "--no-figures", "--quiet")[0] in (0, 1)
     kept = pl.read_parquet(here / "out" / "montecarlo-c" / "trials")
     np.testing.assert_allclose(kept["drift"][5], 1.0 + 0.2 * float(c[0]), rtol=1e-12)
-    assert "drift" in json.dumps(json.loads((here / "out" / "montecarlo-c" / "summary.json").read_text()))
 
 
 def test_keys_of_both_are_read_written_and_known_as_programs(command, here):
@@ -180,7 +180,7 @@ SEES = [
     ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
-    ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 19 of mine.py)"),
+    ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
     ("sigma: tuple = (1e-3, 2e-3)", "sigma: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
 ]
 DRAWS = [
@@ -188,7 +188,7 @@ DRAWS = [
     ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns something else"),
     ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
-    ("0.01 * c[1]", "0.01 * c[1] / 0", "at fails: ZeroDivisionError"),
+    ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
 ]
 
@@ -218,5 +218,5 @@ def test_sensors_of_ones_own_are_all_that_there_are(tables, said):
         scenario.from_tables({**CHAIN, "sensors": NOISY, **tables})
     assert said in str(caught.value)
     with pytest.raises(ScenarioError, match=r"filter\.kind"):
-        scenario.from_tables({"loop": {"mode": "sampled"}, "filter": {}, "sensors": NOISY})
+        scenario.from_tables({"loop": {"mode": "sampled"}, "filter": {"bandwidth": 1.0}, "sensors": NOISY})
     assert dataclasses.is_dataclass(ptsmc.SampledSensor)

@@ -213,7 +213,10 @@ COMPLETE = [
             {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},
         )
     ),
-    {"plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]}, "controller": SYSTEM_CONTROLLER},
+    {
+        "plant": {"kind": "system", "system": ARM, "truth": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
+        "controller": SYSTEM_CONTROLLER,
+    },
 ]
 
 

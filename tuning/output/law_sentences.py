@@ -17,7 +17,7 @@ class Value:
 
     name: str
     unit: str
-    of: Callable[[Summary], float | None]
+    of: Callable[[Summary], float | int | None]
     digits: str = ".3g"
     interval: Callable[[Summary], Any] = lambda law: None  # 95 %, two numbers
 
@@ -175,7 +175,7 @@ def _broken(told: Summary) -> str:
     return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
 
 
-def _cell(value: Value, known: float | None) -> str:
+def _cell(value: Value, known: float | int | None) -> str:
     if known is None or known != known:
         return "-"
     return "unlimited" if math.isinf(known) else f"{known:{value.digits}}"
