@@ -1,4 +1,7 @@
-"""Sensors of one's own: what the law sees of the true state at a sample, and what they remember of it."""
+"""Sensors of one's own: what the law sees of the true state at a sample, and what they remember of it.
+
+seen, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
+"""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -54,12 +57,12 @@ class OwnSensors:
         return self.loud * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
 
     def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> tuple:
-        """Memory before the first sample of positive length, which is now."""
+        """Memory before the first sample of positive length [s], which is now."""
         key = draws.stream(seed, trial, OWN_NOISE)
         return key, self.noise(key, now.sample), self.own.begin(x0)
 
     def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, tuple]:
-        """The state as seen, and the memory; a period without a length changes none of what is remembered."""
+        """The state as seen, and the memory; a period without a length [s] changes none of what is remembered."""
         key, noise, kept = memory
         following = self.noise(key, now.sample + 1)
         seen, new = self.own.see(kept, x, guards.lerp(now.noise_weight, noise, following), now.t, dt)

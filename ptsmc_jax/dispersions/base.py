@@ -1,7 +1,7 @@
 """What every kind of draw has: a map from coordinates to a value.
 
-Coordinates are numbers uniform on (0, 1) or standard normal: a trial's are drawn, and a search for the worst trial
-moves them.
+value = at(coordinates), numbers uniform on (0, 1) or standard normal: a trial's are drawn, and a search for the worst
+trial moves them.
 """
 
 from dataclasses import dataclass

@@ -162,6 +162,7 @@ def test_keys_of_both_are_read_written_and_known_as_programs(command, here):
     assert set(own.programs(loaded)) == {"sensors.code", "dispersion.own.code"}
     assert set(own.digests(loaded)) == {"sensors_sha256", "dispersion_own_sha256"}
     whole = reading.complete(loaded)
+    assert whole.dispersion is not None
     assert (whole.sensors.sigma, whole.dispersion.own.std) == ((1.0, 2.0), 0.1)
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
     (here / "c.toml").write_text(

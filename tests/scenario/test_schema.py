@@ -8,6 +8,7 @@ from ptsmc_jax.scenario import errors, from_tables, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
+from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.own import Own
@@ -320,6 +321,9 @@ def test_tables_of_these_tests_name_every_key_there_is():
     for wheels in (PyramidWheels, AxesWheels):
         named[wheels] |= {"momentum", "torque_limit", "momentum_limit"}
     named[GravityGradient] |= set(Attitude.__struct_fields__)  # as in [initial]
+    for drawn in (Dispersion, StateDispersion):
+        named[drawn].add("own")  # see test_own_devices
+    named[Scenario].add("sensors")
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
 
 

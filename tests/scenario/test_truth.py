@@ -38,7 +38,10 @@ def here(tmp_path, monkeypatch):
 
 
 def test_the_truth_flies_under_a_law_that_knows_the_model():
-    """u = -2 x_1 - 1.5 x_2 held, the truth's motion by the matrix exponential; RK4 leaves h^5 / 120 of it a period."""
+    """u = -2 x_1 - 1.5 x_2 held, the truth's motion by the matrix exponential.
+
+    RK4 leaves h^5 / 120 = 8e-8 of its fifth derivative a period, of the order 1, which the loop forgets within ten.
+    """
     parts = scenario.study(scenario.from_tables(TABLES)).parts
     log = rollout.simulate_jit(parts, record=True).log
     kept = np.asarray(log.lasts)
@@ -46,9 +49,9 @@ def test_the_truth_flies_under_a_law_that_knows_the_model():
     block = expm(PERIOD * np.array([[0.0, 1.0, 0.0], [-0.5, -0.3, 1.2], [0.0, 0.0, 0.0]]))
     state = np.array([1.0, -0.2])
     for k in range(60):
-        np.testing.assert_allclose(x[k], state, rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(x[k], state, rtol=0.0, atol=2e-6)
         held = -2.0 * state[0] - 1.5 * state[1]
-        np.testing.assert_allclose(u[k, 0], held, rtol=0.0, atol=1e-6)
+        np.testing.assert_allclose(u[k, 0], held, rtol=0.0, atol=1e-5)
         state = block[:2, :2] @ state + block[:2, 2] * held
 
 
