@@ -1,6 +1,5 @@
 """What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -148,8 +147,6 @@ def paper_refused(summary: Summary) -> Iterator[str]:
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
     return "" if interval is None else f" (95 %: {interval[0]:{digits}} to {interval[1]:{digits}})"
-
-
 
 
 def front(summary: Summary) -> Table:
