@@ -30,7 +30,14 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
 
 def test_a_comparison_says_which_requirement_each_law_breaks_and_in_how_many_trials():
     def law(failures, met):
-        verdict = {"metric": "peak_torque", "failures": failures, "trials": 1000, "met": met, "worst": 0.5}
+        verdict = {
+            "metric": "peak_torque",
+            "limit": 0.5,
+            "failures": failures,
+            "trials": 1000,
+            "met": met,
+            "worst": 0.5,
+        }
         numbers = dict.fromkeys(
             ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "settling_near_far",
              "window_error_interval", "margins")
