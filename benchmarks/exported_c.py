@@ -34,6 +34,7 @@ def compared(name: str, count: int) -> None:
     flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
     flown = jax.tree.map(np.asarray, flown)
     worst, worst_of_peak, used = 0.0, 0.0, 0
+    given = np.empty((0, 0))
     at = library.columns["out"].index("command[0]")
     for k in range(count):
         samples = vectors.one(flown, k)

@@ -19,7 +19,7 @@ def main() -> None:
     configure()
     from ptsmc_jax import scenario
     from tuning.search import gains
-    from tuning.studies import stability, tuner
+    from tuning.studies import judging, stability, tuner
 
     path = sys.argv[1] if len(sys.argv) > 1 else "scenarios/flexible_panels.toml"
     loaded = scenario.read(path)
@@ -36,7 +36,7 @@ def main() -> None:
         print(f"{name} ({time.monotonic() - started:.0f} s): {said}", flush=True)
     for name, chosen in found.items():
         made = gains.in_scenario(loaded, chosen) if chosen else loaded
-        flown = tuner.judge(made, tuner.seed_of_judge(0), ())
+        flown = judging.judge(made, judging.seed_of_judge(0), ())
         done, metrics = flown.finished, flown.metrics
         print(
             f"{name} on the flexible body: {done.sum()} of {done.size} flown, "

@@ -24,6 +24,8 @@ _EXPORTS = {
     "chain": "plants.integrator_chain",
     "AccelerationLaw": "laws.acceleration",
     "SampledObserver": "observers.base",
+    "SampledSensor": "devices.own_sensors",
+    "Draw": "dispersions.base",
     "Disturbance": "signals.disturbances",
     "Reference": "signals.references",
     "gain": "numerics.pytrees",
@@ -65,7 +67,9 @@ _EXPORTS = {
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.montecarlo import one as one
     from ptsmc_jax.campaigns.montecarlo import run as run
+    from ptsmc_jax.devices.own_sensors import SampledSensor as SampledSensor
     from ptsmc_jax.devices.sensors import Sensors as Sensors
+    from ptsmc_jax.dispersions.base import Draw as Draw
     from ptsmc_jax.dispersions.variation import Dispersion as Dispersion
     from ptsmc_jax.explore import floor as floor
     from ptsmc_jax.explore import simulate as simulate

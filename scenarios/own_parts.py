@@ -1,4 +1,6 @@
-"""Parts of one's own for own_parts.toml: a law, an observer, a disturbance and a reference; see docs/own_parts.md."""
+"""Parts of one's own for own_parts.toml, one of each kind; see docs/own_parts.md."""
+
+import dataclasses
 
 import jax.numpy as jnp
 
@@ -59,3 +61,38 @@ class Nodding(ptsmc.Reference):
     def fastest(self):
         """How fast it changes [rad/s]."""
         return float(self.frequency)
+
+
+class StarTracker(ptsmc.SampledSensor):
+    """A star tracker that sees worse the faster the body turns, and a gyro."""
+
+    draws = 6
+    attitude_noise: float = 2e-5  # rad, 1 sigma of each axis of a body that does not turn
+    smear: float = 20.0  # s: how much more of it by the body rate
+    rate_noise: float = 1e-6  # rad/s
+
+    def see(self, memory, x, noise, t, dt):
+        """The state as seen, and the memory, of which there is none."""
+        spread = self.attitude_noise * (1.0 + self.smear * jnp.sqrt(x.w @ x.w + 1e-20))
+        half = 0.5 * spread * noise[:3]
+        v, s = x.q[:3], x.q[3]
+        turned = jnp.concatenate([v + s * half + jnp.cross(v, half), jnp.stack([s - v @ half])])  # to first order
+        return x._replace(q=turned / jnp.sqrt(turned @ turned), w=x.w + self.rate_noise * noise[3:]), memory
+
+
+class SunDirection(ptsmc.Draw):
+    """The sun about which `SolarPressure` knows stands elsewhere in each trial."""
+
+    count = 3
+
+    def at(self, c, parts):
+        """The parts with another sun, from three standard normal numbers."""
+        *others, solar = parts.disturbance.terms
+        solar = dataclasses.replace(solar, sun=c / jnp.sqrt(c @ c))
+        return dataclasses.replace(parts, disturbance=dataclasses.replace(parts.disturbance, terms=(*others, solar)))
+
+
+def slowest_turn(result, parts):
+    """Metrics of one's own, for `montecarlo --metrics`: what is asked of the run's history."""
+    turning = jnp.linalg.norm(result.log.x.w, axis=1)
+    return {"mean_rate": jnp.mean(turning), "last_rate": turning[-1]}

@@ -29,7 +29,7 @@ HOUSE = {
             fixed_time pd predefined_time scaling super_twisting terminal time_base
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
-        "devices": "attitude_filter command_filter reaction_wheels ticks | actuators sensors",
+        "devices": "attitude_filter command_filter reaction_wheels ticks | actuators sensors | own_sensors",
         "simulation": """
             catalogues clock pointing
             interval
@@ -45,7 +45,7 @@ HOUSE = {
             command_filter_tables
             device_tables gain_bounds own start_checks
             disturbance_bounds
-            disturbance_tables law_record observer_tables reference_tables
+            disturbance_tables law_record observer_tables own_devices reference_tables
             baseline_tables
             own_laws
             law_tables
@@ -95,6 +95,7 @@ HOUSE = {
             cells page_captions page_charts progress_lines
             margin_sentences pointing_sentences
             search_sentences sentences
+            law_sentences
             page terminal
             campaign_terminal
         """,

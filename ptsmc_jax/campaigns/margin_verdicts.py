@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import INERTIA
+from ptsmc_jax.dispersions.base import INERTIA, OWN
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -56,7 +56,7 @@ def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Ve
 
 def differ(dispersion: Dispersion) -> bool:
     """Whether loops differ from trial to trial."""
-    return INERTIA in dispersion.kinds or bool(dispersion.misfits)
+    return not {INERTIA, OWN}.isdisjoint(dispersion.kinds) or bool(dispersion.misfits)
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:

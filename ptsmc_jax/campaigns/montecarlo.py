@@ -13,7 +13,7 @@ from ptsmc_jax import programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices.sensors import RATE_BIAS, Sensors
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import Coordinates
+from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation import rollout
@@ -93,18 +93,23 @@ def one(
     drawn = about.dispersion.at(about.parts, coordinates)
     result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None)
     more = {} if own is None else own(result, drawn)
-    return Flown(result.metrics, result.status, result.bad_time, _values(dispersion, drawn, about), more)
+    return Flown(result.metrics, result.status, result.bad_time, _values(dispersion, drawn, about, coordinates), more)
 
 
 def values(parts: Parts, dispersion: Dispersion, seed, trial) -> dict[str, jax.Array]:
     """What a trial flies with, by name, without flying it; trial: see `one`."""
     about = planned.about(parts, dispersion, seed, trial)
-    return _values(dispersion, about.drawn, about)
+    coordinates = about.dispersion.coordinates(about.seed, about.trial)
+    return _values(dispersion, about.dispersion.at(about.parts, coordinates), about, coordinates)
 
 
-def _values(dispersion: Dispersion, drawn: Parts, about: planned.About) -> dict[str, jax.Array]:
-    """Read from the parts of a trial, and the gyro's bias from its sensors."""
+def _values(
+    dispersion: Dispersion, drawn: Parts, about: planned.About, coordinates: Coordinates
+) -> dict[str, jax.Array]:
+    """Read from the parts of a trial, the gyro's bias from its sensors, and what draws of one's own say of theirs."""
     found = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
+    if dispersion.own is not None:
+        found |= dispersion.own.values(coordinates[OWN])
     if isinstance(drawn.sensors, Sensors) and (drawn.sensors.rate_bias is not None or RATE_BIAS in about.given):
         bias = drawn.sensors.first_bias(about.seed, about.trial)
         found |= {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}

@@ -51,9 +51,13 @@ class Run:
 
     @cached_property
     def floor(self) -> Floor | None:
-        """What no controller can beat along this run, see `error_floor`; None: it was not flown to the end."""
+        """What no controller can beat along this run, see `error_floor`.
+
+        None: it was not flown to the end, or with sensors of one's own, of which it is not known what they say.
+        """
         finished = self.status in [rollout.STATUS[code][0] for code in rollout.FINISHED]
-        return error_floor.along(self.parts, self.log) if finished else None
+        known = self.parts.sensors is None or hasattr(self.parts.sensors, "reading")
+        return error_floor.along(self.parts, self.log) if finished and known else None
 
     def columns(self) -> dict[str, np.ndarray]:
         """The history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, flexible modes."""

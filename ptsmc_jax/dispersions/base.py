@@ -5,7 +5,8 @@ moves them: value = at(coordinates).
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,6 +31,9 @@ FARTHEST = 3.0  # standard deviations of what is truncated, at most
 
 
 Drawn = Literal["uniform", "normal"]
+
+
+OWN = "own"
 
 
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
@@ -75,3 +79,22 @@ def positive(given: np.ndarray) -> np.ndarray:
     """The same of positive numbers (rows, n), in any unit [-]."""
     UnfitError.check((given > 0.0).all(axis=1), lambda k: "a number greater than 0")
     return given
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What draws of one's own are derived from: the parts of a trial from `count` numbers that are drawn for it.
+
+    drawn: "normal", standard normal numbers, or "uniform", on (0, 1).
+    """
+
+    count: ClassVar[int] = 1
+    drawn: ClassVar[Drawn] = "normal"
+
+    def at(self, c: Float[Array, " count"], parts: Any) -> Any:
+        """The parts with what these numbers (count,) [-] make of them, by `dataclasses.replace`; shapes stay."""
+        raise NotImplementedError
+
+    def values(self, c: Float[Array, " count"]) -> dict[str, Array]:
+        """What a trial's row says of it, numbers by name; by default those drawn [-], own_1 and so on."""
+        return {f"{OWN}_{k + 1}": c[k] for k in range(self.count)}

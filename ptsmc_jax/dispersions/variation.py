@@ -17,8 +17,10 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_ATTITUDE,
     INITIAL_RATE,
     INITIAL_STATE,
+    OWN,
     REFERENCE,
     Coordinates,
+    Draw,
 )
 from ptsmc_jax.dispersions.inertias import RelativeInertia
 from ptsmc_jax.dispersions.misfits import Misfit
@@ -40,6 +42,7 @@ FIELDS = {
     DISTURBANCE_AMPLITUDE: "amplitude",
     DISTURBANCE_BIAS: "bias",
     REFERENCE: "reference",
+    OWN: "own",
 }
 
 
@@ -61,6 +64,7 @@ class Dispersion:
     reference: Attitudes | None = None
     levels: dict[str, Factor] = field(default_factory=dict)  # see `LEVELS`
     misfits: dict[str, Misfit] = field(default_factory=dict)  # see `misfits.MISFITS`
+    own: Draw | None = None  # anything of one's own, drawn after all else
 
     @property
     def varies(self) -> bool:
@@ -112,7 +116,8 @@ class Dispersion:
             parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
         for name, misfit in self.misfits.items():
             parts = QUANTITIES[name].write(parts, misfit.at(coordinates[name], parts))
-        return replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
+        parts = replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
+        return parts if self.own is None else self.own.at(coordinates[OWN], parts)
 
     def _disturbance(self, nominal: Any, coordinates: Coordinates) -> Any:
         found = nominal

@@ -17,6 +17,12 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES
 MARKERS = ("o", "^", "s", "D", "v")
 
 
+def _looks(count: int) -> list[tuple[str, str]]:
+    """A colour and a marker for each of many sets, no two alike up to 25."""
+    size = len(STYLES)
+    return [(STYLES[k % size][0], MARKERS[(k + k // size) % len(MARKERS)]) for k in range(count)]
+
+
 def tuning_history(
     gains: Mapping[str, tuple[str, np.ndarray]],
     values: np.ndarray,
@@ -102,30 +108,37 @@ def tradeoff(
     error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
-    for (label, (errors, torques)), (colour, _), marker in zip(arrays.items(), STYLES, MARKERS, strict=False):
+    for (label, (errors, torques)), (colour, marker) in zip(arrays.items(), _looks(len(arrays)), strict=True):
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
         axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
-        text = f"{label}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
+        text = f"{label.replace('_', ' ')}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
     if limit is not None:
         axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
     axes.set_xlabel(f"window error [{error_unit}]")
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19))
+    _legend_below(figure, len(arrays) + 1, columns=1)
     return figure
+
+
+def _legend_below(figure: Figure, entries: int, columns: int) -> None:
+    """A legend outside of the axes, and room for it."""
+    rows = -(-entries // columns)
+    figure.set_size_inches(8.0, 4.5 + 0.26 * rows)
+    figure.legend(loc="outside lower left", ncols=columns, fontsize=9, markerscale=1.0)
 
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float, unit: str = "s") -> Figure:
     """When each trial settles against where it starts; label -> (initial angles [deg], settling times, NaN: never)."""
     figure, axes = figure_of("When it settles, by where it starts", f"settling time [{unit}]")
-    for (label, (angle, time)), (colour, _), marker in zip(sets.items(), STYLES, MARKERS, strict=False):
-        known = np.isfinite(time)
-        said = f"{label}: {int((~known).sum())} never" if np.any(~known) else label
+    for (label, (angle, time)), (colour, marker) in zip(sets.items(), _looks(len(sets)), strict=True):
+        known, name = np.isfinite(time), label.replace("_", " ")
+        said = f"{name}: {int((~known).sum())} never" if np.any(~known) else name
         axes.plot(angle[known], time[known], marker, ms=3.5, alpha=0.5, color=colour, mew=0, label=said)
     axes.axhline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate("$t_f$", (1.0, t_f), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
                   va="center")  # fmt: skip
     axes.set_xlabel("initial angle [deg]")
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.19), ncols=2, fontsize=9, markerscale=2.0)
+    _legend_below(figure, len(sets), columns=2)
     return figure
 
 

@@ -31,7 +31,7 @@ def setup(scenario: Scenario) -> Setup:
         reference=scenario.target(),
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
-        sensors=scenario.devices.sensors(scenario),
+        sensors=scenario.devices.sensors(scenario) if scenario.sensors is None else scenario.sensors.build(model),
         initial=plant.at_rest(scenario.start()),
         t_end=vector(scenario.end),
         window=vector(scenario.loop.window),
@@ -74,6 +74,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         phase=None if table.disturbance_phase is None else numbers.UniformPhase(phases),
         amplitude=drawn("disturbance_amplitude", amplitudes),
         bias=drawn("disturbance_bias", parts.plant.inputs),
+        own=drawn("own"),
         levels={key: level for key, level in levels.items() if level is not None},
         misfits={
             key: made(getattr(table, key), parts)

@@ -33,6 +33,7 @@ def check(scenario: Scenario) -> None:
     scenario.check_plant()
     _check_requirements(scenario)
     scenario.observer.check(scenario)
+    _check_sensors(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
 
@@ -85,6 +86,22 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
             f"{said}, which every run that is flown must keep, but confidence is {limit.confidence}; "
             'allowed is none, or "ensemble" or "mixed"'
         )
+
+
+def _check_sensors(scenario: Scenario) -> None:
+    """Sensors of one's own are all that there are, and sample."""
+    if scenario.sensors is None:
+        return
+    if scenario.loop.mode != "sampled":
+        raise ScenarioError(f'[sensors] needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    said = ("attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk", "star_tracker_every",
+            "state_noise")  # fmt: skip
+    for key in said:
+        value = getattr(scenario.hardware, key, None)
+        if value is not None:
+            raise wrong(f"hardware.{key}", value, "absent where [sensors] says what is seen")
+    if scenario.estimator.kind != "none":
+        raise ScenarioError('filter.kind is "steady_state", but must be absent where [sensors] says what is seen')
 
 
 def _check_loop(scenario: Scenario) -> None:

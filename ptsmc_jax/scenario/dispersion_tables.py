@@ -312,6 +312,7 @@ class Dispersion(Table, frozen=True):
         wheel_failure: a wheel that gives no torque any more
         mode_frequency: factor on each of flexible.frequency
         mode_coupling: factor on each row of flexible.coupling
+        own: what code of one's own makes of numbers that are drawn
     """
 
     attitude: UniformAttitude | AxisAngle | NormalAttitude | None = None
@@ -332,6 +333,7 @@ class Dispersion(Table, frozen=True):
     wheel_failure: Failure | None = None
     mode_frequency: RelativeNormal | RelativeUniform | None = None
     mode_coupling: RelativeNormal | RelativeUniform | None = None
+    own: Any = None  # `own_devices.OwnDraw`
 
 
 class StateDispersion(Table, frozen=True):
@@ -344,6 +346,7 @@ class StateDispersion(Table, frozen=True):
         disturbance_bias: a constant, added
         state_noise: factor on hardware.state_noise
         torque_limit: factor on hardware.torque_limit
+        own: what code of one's own makes of numbers that are drawn
     """
 
     x0: UniformState | NormalState | None = None
@@ -352,3 +355,4 @@ class StateDispersion(Table, frozen=True):
     disturbance_bias: NormalBias | UniformBias | None = None
     state_noise: RelativeNormal | RelativeUniform | None = None
     torque_limit: RelativeNormal | RelativeUniform | None = None
+    own: Any = None  # `own_devices.OwnDraw`

@@ -264,6 +264,7 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
 
     kind: Literal["own"] = "own"
     code: Code
+    tuned: ClassVar[bool] = False
 
     @classmethod
     def base(cls) -> type:

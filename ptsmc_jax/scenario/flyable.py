@@ -89,7 +89,7 @@ def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = N
     scenario = reading.complete(scenario)
     setup = build.setup(scenario)
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
-    own_checks.check(parts, scenario)
     dispersion = build.dispersion(scenario, parts)
+    own_checks.check(parts, dispersion, scenario)
     scenario.check_start(parts, dispersion, drawn=drawn)
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))

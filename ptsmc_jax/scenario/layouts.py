@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from ptsmc_jax.scenario import dispersion_tables as dt
+from ptsmc_jax.scenario import own_devices
 from ptsmc_jax.scenario.command_filter_tables import COMMAND_FILTERS
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.state_scenario import ChainScenario, SystemScenario
@@ -19,6 +20,7 @@ TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {kind: made.TABLES for ki
 OPTIONAL = (
     "flexible",
     "hardware",
+    "sensors",
     "wheels",
     "filter",
     "pointing",
@@ -42,5 +44,6 @@ DISPERSIONS: dict[str, Kinds] = {
     **dict.fromkeys(("actuator_misalignment", "star_tracker_misalignment"), _TURN),
     "star_tracker_outage": {"uniform": dt.Outage},
     "wheel_failure": {"uniform": dt.Failure},
+    "own": {"own": own_devices.OwnDraw},
     "x0": {"uniform": dt.UniformState, "normal": dt.NormalState},
 }

@@ -20,6 +20,7 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief, show
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.values import Table
 
+KEYS = ("system", "truth", "code")  # that name code, in any table
 Code = Annotated[Any, Meta(description=systems.WHERE)]
 
 
@@ -30,6 +31,7 @@ class Own:
     waits: ClassVar[bool] = False  # until its code is run: it holds the keys that are not known yet in `rest`
     gains: ClassVar[Mapping[str, GainBounds]] = {}
     free_by_default: ClassVar[tuple[str, ...]] = ()
+    tuned: ClassVar[bool] = True  # whether it may have gains
     made: ClassVar[Any] = None  # the class that the code names
 
     prefix: ClassVar[str] = ""  # of the names of its gains
@@ -48,7 +50,7 @@ class Own:
 def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
     """The tables of a parsed file that name code, and the key that does, in tables within tables too."""
     for table in _tables(raw):
-        for key in ("system", "code"):
+        for key in KEYS:
             if isinstance(table.get(key), str):
                 yield table, key
 
@@ -64,15 +66,24 @@ def _tables(value: Any) -> Iterator[dict]:
 def programs(scenario: Table) -> dict[str, str]:
     """What flying a scenario runs: where it stands, by the key that names it."""
     found = {}
+    for place, table in _places(scenario):
+        for key in KEYS:
+            if isinstance(getattr(table, key, None), str):
+                found[f"{place}.{key}"] = getattr(table, key)
+    return found
+
+
+def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
+    """The tables that may name code, by where they stand: also those of a sum, and of what is drawn."""
     for name in scenario.__struct_fields__:
         table = getattr(scenario, name)
         terms = getattr(table, "terms", None)
-        places = {name: table} if terms is None else {f"{name}.terms[{k}]": term for k, term in enumerate(terms)}
-        for place, one in places.items():
-            for key in ("system", "code"):
-                if isinstance(getattr(one, key, None), str):
-                    found[f"{place}.{key}"] = getattr(one, key)
-    return found
+        if name == "dispersion" and table is not None:
+            yield "dispersion.own", table.own
+        elif terms is None:
+            yield name, table
+        else:
+            yield from ((f"{name}.terms[{k}]", term) for k, term in enumerate(terms))
 
 
 def digest_name(key: str) -> str:
@@ -93,8 +104,7 @@ def digests(scenario: Table) -> dict[str, str]:
 
 def waits(scenario: Table) -> bool:
     """Whether a scenario has a table of one's own whose code was not run yet."""
-    found = (getattr(scenario, name) for name in scenario.__struct_fields__)
-    return any(getattr(one, "waits", False) for table in found for one in getattr(table, "terms", (table,)))
+    return any(getattr(table, "waits", False) for _, table in _places(scenario))
 
 
 @functools.cache
@@ -145,6 +155,8 @@ def _with_keys(table: Any, found: Any) -> Any:
         meaning = "" if about is None else " ".join(about.meaning.split())
         unit = f" [{about.unit}]" if about is not None and about.unit else ""
         meanings.append(f"    {field.name}: {meaning or 'of one of its own'}{unit}")
+        if about is not None and not table.tuned:
+            raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
         if about is not None:
             if table.prefix + field.name == "observer_gain":
                 raise ValueError("the name of its gain must be another than gain, which has a number for each axis")

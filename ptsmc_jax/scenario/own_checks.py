@@ -8,18 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 
 
-def check(parts: Parts, scenario: Scenario) -> None:
+def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
     """Raise ScenarioError where a part of one's own fails at t = 0, or returns what a run cannot go on with."""
-    tables = {name: getattr(scenario, name, None) for name in ("reference", "observer", "controller")}
+    tables = {name: getattr(scenario, name, None) for name in ("reference", "sensors", "observer", "controller")}
     terms = scenario.terms
     signals = (parts.disturbance,) if len(terms) == 1 else getattr(parts.disturbance, "terms", ())
     acting = iter(signals)
@@ -29,7 +31,10 @@ def check(parts: Parts, scenario: Scenario) -> None:
             _disturbance(parts, next(one for one in acting if isinstance(one, term.made)), _Asked(name, term))
     for name, table in tables.items():
         if isinstance(table, Own):
-            {"reference": _reference, "observer": _observer, "controller": _law}[name](parts, _Asked(name, table))
+            _OF[name](parts, _Asked(name, table))
+
+    if dispersion.own is not None:
+        _draw(parts, dispersion, _Asked("dispersion.own", getattr(scenario.dispersion, "own", None)))
 
 
 class _Asked:
@@ -85,6 +90,41 @@ def _reference(parts: Parts, ask: _Asked) -> None:
     ask.check("attitude", "an attitude whose second derivative is", target.w_dot, (3,))
 
 
+def _sensors(parts: Parts, ask: _Asked) -> None:
+    own, zero = parts.sensors.own, jnp.zeros(())
+    x = parts.controller.align(parts.initial, parts.reference(zero))
+    memory = ask("begin", own.begin, x)
+    period = jnp.asarray(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise ask.refused("see", "something else", "the state as seen and its memory")
+    was, now = (jax.tree.map(_kind, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
+    if was != now:
+        raise ask.refused("see", f"a state {now}", f"one as the plant's, {was}")
+    if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(returned[0])):
+        raise ask.refused("see", f"a state {jax.tree.map(np.asarray, returned[0])}", "finite numbers")
+    ask.same_memory("see", memory, returned[1])
+
+
+def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
+    own: Any = dispersion.own
+    taken = {"trial", "status", "reason", "bad_time", *Metrics._fields, *dispersion.values(parts)}
+    c = jnp.full(own.count, 0.5)
+    drawn = ask("at", own.at, c, parts)
+    was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))
+    if jax.tree.structure(was) != jax.tree.structure(now):
+        raise ask.refused("at", "something else", "the parts with other numbers, by dataclasses.replace")
+    for one, other, value in zip(*map(jax.tree.leaves, (was, now, drawn)), strict=True):
+        if one != other:
+            raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
+        if not np.all(np.isfinite(value)):
+            raise ask.refused("at", "parts with numbers that are not finite", "finite ones")
+    for name, value in ask("values", own.values, c).items():
+        ask.check("values", f"a number {name}", value, ())
+        if name in taken:
+            raise ask.refused("values", f"a number {name}", "names that no column of the rows has")
+
+
 def _observer(parts: Parts, ask: _Asked) -> None:
     observer, m = parts.observer, parts.plant.inputs
     memory = ask("begin", observer.begin)
@@ -119,3 +159,6 @@ def _law(parts: Parts, ask: _Asked) -> None:
     ask.check(method, wanted[1], returned[1], (m,))
     if method != "acceleration":
         ask.same_memory(method, memory, returned[2])
+
+
+_OF = {"reference": _reference, "sensors": _sensors, "observer": _observer, "controller": _law}  # by table

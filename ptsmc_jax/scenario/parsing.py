@@ -100,7 +100,7 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
             continue
         given = raw.get(name, {})
         if name == "dispersion":
-            found[name] = _dispersion(given, kind)
+            found[name] = _dispersion(given, kind, run)
         else:
             found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
     for name in ("initial", "reference"):
@@ -261,7 +261,7 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
     return disturbance_tables.SumDisturbance(terms=found)
 
 
-def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
+def _dispersion(raw: Mapping[str, Any], kind: str, run: bool) -> Table:
     struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
     found = {}
     for key, table in raw.items():
@@ -270,7 +270,7 @@ def _dispersion(raw: Mapping[str, Any], kind: str) -> Table:
             raise ScenarioError(f"dispersion.{key} is not a known key; {known}")
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key])
+        found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], run)
     return struct(**found)
 
 

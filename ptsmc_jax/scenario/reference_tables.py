@@ -3,7 +3,7 @@
 A reference is its physics in `signals.references`, a table here, and a row in `REFERENCES`.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -157,6 +157,7 @@ class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
 
     kind: Literal["own"] = "own"
     code: Code
+    tuned: ClassVar[bool] = False
 
     @classmethod
     def base(cls) -> type:

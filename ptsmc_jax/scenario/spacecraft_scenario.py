@@ -15,6 +15,7 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
@@ -105,6 +106,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "observer": OBSERVERS["spacecraft"],
         "loop": Loop,
         "hardware": Hardware,
+        "sensors": SENSORS,
         "wheels": WHEELS,
         "filter": FILTERS,
         "pointing": Pointing,

@@ -23,7 +23,7 @@ SINGULAR_CONDITION = 1e14  # of a matrix in double precision
 
 def system(scenario: Any, parts: Parts) -> None:
     """Refuse a system that the law, or the observer, cannot invert where it starts."""
-    start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.plant)
+    start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
     matrices = {"dF/dx2 G": plant.slope(*start) @ plant.input_gain(*start)}
     if not isinstance(parts.observer, NoObserver):
         matrices["D"] = plant.disturbance_gain(*start)

@@ -12,6 +12,7 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Kind, Kinds, Numbers, Table
 from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
@@ -40,11 +41,13 @@ class SystemPlant(Table, frozen=True):
 
     Attributes:
         system: where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed
+        truth: the system that flies, where it is another one than law and observer know; it stands likewise
         x0: initial state, x_1 and then x_2
     """
 
     kind: Literal["system"] = "system"
     system: Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')] = None
+    truth: Annotated[Any, Meta(description='"FILE.py:NAME", a system with as many inputs')] | None = None
     x0: Numbers = (1.0, 0.0)
 
 
@@ -57,6 +60,7 @@ def _tables(plant: type[Table]) -> dict[str, type[Table] | Kinds]:
         "observer": OBSERVERS[kind],
         "loop": Loop,
         "hardware": device_tables.StateHardware,
+        "sensors": SENSORS,
         "dispersion": dispersion_tables.StateDispersion,
         "tune": Tune,
     }
@@ -176,24 +180,34 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
             raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
         if len(plant.x0) % 2:
             raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
-        if isinstance(plant.system, str):
-            try:
-                systems.named(plant.system, systems.ALLOWED)
-            except ValueError as error:
-                raise ScenarioError(f"plant.system is {errors.brief(plant.system)}: {error}") from None
-        else:
-            self.model()
+        for key, value in (("system", plant.system), ("truth", plant.truth)):
+            if isinstance(value, str):
+                try:
+                    systems.named(value, systems.ALLOWED)
+                except ValueError as error:
+                    raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
+            elif value is not None:
+                self._loaded(key)
         super().check_plant()
 
     def model(self) -> Any:
-        """The system that the scenario holds, or names: that file is run. Raises ScenarioError where there is none."""
+        """The system that law and observer know. Raises ScenarioError where there is none."""
+        return self._loaded("system")
+
+    def truth(self, model: Any) -> Any:
+        """The one that flies. Raises ScenarioError where there is none."""
+        return model if self.plant.truth is None else self._loaded("truth")
+
+    def _loaded(self, key: str) -> Any:
+        """The system that a key holds, or names: that file is run."""
+        value = getattr(self.plant, key)
         try:
-            found = systems.load(self.plant.system)
+            found = systems.load(value)
         except ValueError as error:
-            raise ScenarioError(f"plant.system is {errors.brief(self.plant.system)}: {error}") from None
+            raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
         n = found.inputs
         if n * 2 != len(self.plant.x0):
-            raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.system has n = {n}")
+            raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.{key} has n = {n}")
         return found
 
     def target(self) -> Any:

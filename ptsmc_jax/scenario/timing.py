@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
+from ptsmc_jax.laws.base import SecondOrder
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -64,7 +66,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
     if setup.plant.unknown_pace:
-        hurried = setup.with_t_f(vector(reach.smallest_t_f))
+        hurried = _on_the_papers_way(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if loop.mode == "continuous":
@@ -147,6 +149,15 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
 def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
     """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
     return controller.boundary_layer(observer.error_bound().largest, visited)
+
+
+def _on_the_papers_way(setup: Setup) -> Setup:
+    """The parts under the paper's law, whose way is known: for any other one it says which states a run comes by."""
+    law = setup.controller
+    if isinstance(law, SecondOrder):
+        return setup
+    gains = (vector(v) for v in (3.0, law.delta, 1.0, 1e-3, 1.0))  # eta, delta, K1, width of the sign, surface rate
+    return dataclasses.replace(setup, controller=PrescribedTimeSystem(law.model, law.t_f, *gains))
 
 
 @programs.jit

@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState
+from ptsmc_jax.devices.own_sensors import OwnSensors
 from ptsmc_jax.devices.sensors import Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import clock, rollout
@@ -79,7 +80,7 @@ class Nominal(NamedTuple):
 
 
 def quiet(parts: Parts) -> Parts:
-    """The parts without noise and disturbance; a sensor of one's own keeps its noise, of trial 0."""
+    """The parts without noise and disturbance."""
     sensors: Any = parts.sensors
     if isinstance(sensors, Sensors):
         known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)
@@ -88,6 +89,8 @@ def quiet(parts: Parts) -> Parts:
         sensors = replace(sensors, rate_bias=None, bias_rate=None, given_bias=None)
     elif isinstance(sensors, StateSensor):
         sensors = replace(sensors, sigma=0.0 * sensors.sigma)
+    elif isinstance(sensors, OwnSensors):
+        sensors = replace(sensors, loud=0.0 * sensors.loud)
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
     return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
 

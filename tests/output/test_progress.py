@@ -3,7 +3,7 @@
 import numpy as np
 
 from ptsmc_jax.numerics import statistics
-from tuning.output import sentences
+from tuning.output import law_sentences, sentences
 from tuning.output.progress_lines import Lines
 
 
@@ -30,14 +30,25 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
 
 def test_a_comparison_says_which_requirement_each_law_breaks_and_in_how_many_trials():
     def law(failures, met):
-        verdict = {"metric": "peak_torque", "failures": failures, "trials": 1000, "met": met, "worst": 0.5}
+        verdict = {
+            "metric": "peak_torque",
+            "limit": 0.5,
+            "failures": failures,
+            "trials": 1000,
+            "met": met,
+            "worst": 0.5,
+        }
         numbers = dict.fromkeys(
-            ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "settling_near_far")
-        )
-        return {**numbers, "settling_time": None, "unsettled": 0, "verdicts": [verdict], "met": met}
+            ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "settling_near_far",
+             "window_error_interval", "margins")
+        )  # fmt: skip
+        told = {"settling_time": None, "unsettled": 0, "untold": {}, "verdicts": [verdict], "met": met}
+        return {**numbers, **told, "window_error": 1e-5}
 
-    rows = sentences.comparison({"laws": {"pd": law(12, False), "prescribed_time": law(0, True)}}).rows
-    assert ("trials beyond peak_torque", "12 of 1000: NOT met", "0 of 1000", "") in rows
+    laws = {"pd": law(12, False), "prescribed_time": law(0, True)}
+    table = law_sentences.answers({"laws": laws})[0].table
+    assert table.head[-2:] == ("trials beyond peak_torque", "all limits met")
+    assert [row[-2:] for row in table.rows] == [("12 of 1000: NOT met", "no"), ("0 of 1000", "yes")]
 
 
 def test_of_inputs_that_rank_the_trials_alike_only_the_first_is_a_driver():

@@ -9,6 +9,7 @@ from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
+from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion
 from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.own import Own
@@ -249,7 +250,10 @@ COMPLETE = [
             {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},
         )
     ),
-    {"plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]}, "controller": SYSTEM_CONTROLLER},
+    {
+        "plant": {"kind": "system", "system": ARM, "truth": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
+        "controller": SYSTEM_CONTROLLER,
+    },
 ]
 
 
@@ -354,6 +358,10 @@ def test_tables_of_these_tests_name_every_key_there_is():
     for wheels in (PyramidWheels, AxesWheels):
         named[wheels] |= {"momentum", "torque_limit", "momentum_limit"}
     named[GravityGradient] |= set(Attitude.__struct_fields__)  # as in [initial]
+    for drawn in (Dispersion, StateDispersion):
+        named[drawn].add("own")  # see test_own_devices
+    for struct in [struct for struct in named if issubclass(struct, Scenario)]:
+        named[struct].add("sensors")
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
 
 

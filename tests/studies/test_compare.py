@@ -11,13 +11,14 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.figures import study_plots
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
 from tests.output.pages import checked
 from tuning.errors import UsageError
-from tuning.output import page, sentences
+from tuning.output import law_sentences, page
 from tuning.search import gains
 from tuning.studies import compare, judging, tuner
 
@@ -119,6 +120,63 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     assert command("compare", "s.toml", "--seed", "x")[0] == 2
 
 
+def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
+    """The plant that flies is a tenth heavier and lighter, or a period later; law and observer know what they knew."""
+    base = scenario.from_tables(TABLES)
+    parts = scenario.study(base).parts
+    others = compare.untold(base)
+    assert tuple(others) == compare.UNTOLD
+    for name, factor in (("heavier", 1.1), ("lighter", 0.9), ("later", 1.0)):
+        other = scenario.study(others[name]).parts
+        np.testing.assert_allclose(other.plant.inertia, factor * np.asarray(parts.plant.inertia), rtol=1e-15)
+        np.testing.assert_array_equal(other.controller.model.inertia, parts.controller.model.inertia)
+        assert getattr(other.actuators, "delay", 0) == (1 if name == "later" else 0)
+    twice = scenario.replace(others["heavier"], hardware__delay=1)
+    again = compare.untold(twice)
+    np.testing.assert_allclose(
+        scenario.study(again["lighter"]).parts.plant.inertia, 0.9 * 1.1 * np.asarray(parts.plant.inertia), rtol=1e-15
+    )
+    assert getattr(scenario.study(again["later"]).parts.actuators, "delay", 0) == 2
+    ok = rollout.OK
+    lost = changed(eight, [ok] * 7 + [rollout.MISSED], window_error=[2.0] * 7 + [2.0], peak_torque=[0.3] * 8)
+    said = compare.figures_of(replace(contender(eight), changed={"later": lost}))["untold"]
+    assert said == {"later": {"window_error": 2.0, "window_error_interval": None,
+                              "largest_peak_torque": 0.3, "lost": 1}}  # fmt: skip
+
+
+def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path):
+    """More laws than there are colours: none is left out of a table, a chart or a figure."""
+    base = scenario.from_tables(TABLES)
+    margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
+                        "modulus_margin": 3.0}}  # fmt: skip
+    one = replace(contender(eight), margins=margins, changed={"heavier": eight})
+    names = ["paper", *compare.laws()]
+    found = compare.Comparison(dict.fromkeys(names, one), 0, False)
+    (tmp_path / "out").mkdir()
+    compare.write(tmp_path / "out", base, found, True, compare.told(base, 0))
+    rows = list(csv.DictReader((tmp_path / "out" / "compare.csv").read_text().splitlines()))
+    said = json.loads((tmp_path / "out" / "summary.json").read_text())
+    low, high = said["laws"]["pd"]["window_error_interval"]
+    assert low < said["laws"]["pd"]["window_error"] < high
+    for row in rows:
+        assert (float(row["window_error_low"]), float(row["window_error_high"])) == (low, high)
+        assert (row["gain_margin"], row["delay_margin"], row["window_error_later"]) == ("7.5", "", "")
+        assert row["window_error_heavier"] == row["window_error"]
+    answers = law_sentences.answers(said)
+    assert len(answers) == len(law_sentences.QUESTIONS)
+    read = checked(tmp_path / "out")
+    for k, answer in enumerate(answers):
+        assert [row[0] for row in answer.table.rows] == [name.replace("_", " ") for name in names]
+        assert answer.title in read.text
+        for series in read.charts[f"question_{k}"]["data"]:
+            assert series["y"] == [name.replace("_", " ") for name in names]
+    assert answers[0].table.rows[3][2] == f"{low:.2e} to {high:.2e}"
+    figures = dict(compare._figures(found))
+    drawn = [line for line in figures["settling"].axes[0].lines if line.get_marker() in study_plots.MARKERS]
+    looks = {(line.get_color(), line.get_marker()) for line in drawn}
+    assert len(drawn) == len(looks) == len(names)
+
+
 def test_settling_is_summed_up_by_where_trials_start():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
     assert compare._near_far(angle, settling) == (30.0, 33.0)
@@ -217,6 +275,7 @@ def rivals(monkeypatch, eight, interrupt=None):
         asked.append(("judge", "paper", seed))
         return eight
 
+    monkeypatch.setattr(compare, "_with_more", lambda one, seed: one)
     monkeypatch.setattr(tuner, "tune", tune)
     monkeypatch.setattr(judging, "judge", judge)
     return asked
@@ -266,11 +325,10 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
     assert [row["gain_margin"] for row in rows] == ["5.04", "nan"]
     assert [row["delay_margin"] for row in rows] == ["inf", "0.2"]
     for said in (compare.summary(found), json.loads((tmp_path / "out" / "summary.json").read_text())):
-        table = {row[0]: row[1:] for row in sentences.comparison(said).rows}
-        assert table["gain margin"] == ("5.04", "-", "dB")
-        assert table["delay margin"] == ("unlimited", "0.2", "s")
-        assert "phase margin" not in table
-        lines = list(sentences.comparison_lines(said))
+        (table,) = [one.table for one in law_sentences.answers(said) if "margins" in one.title]
+        assert table.head == ("", "gain [dB]", "delay [s]")
+        assert table.rows == [("paper", "5.04", "unlimited"), ("prescribed time", "-", "0.2")]
+        lines = list(law_sentences.lines(said))
         assert "  gain_margin at least 6 dB: worst 5.04: NOT met in 1 of 2 trials" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 trials" in lines
         assert not [line for line in lines if "delay_margin" in line]

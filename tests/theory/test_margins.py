@@ -250,6 +250,23 @@ def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherev
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
 
 
+def test_the_sensitivity_of_all_inputs_at_once_is_the_largest_singular_value():
+    """Of (I + L)^-1, here on an even grid of its own; no axis alone has a larger one."""
+    law = {"t_f": 10.0, "delta": 0.5, "k1": 3.0, "sign_width": 0.05}
+    parts = scenario.study(scenario.from_tables({**COUPLED, "controller": law})).parts
+    loop = opened(parts)
+    opening = linear.at_input(loop)
+    a, b, c = (np.asarray(v) for v in (opening.a, opening.b, opening.c))
+    z = np.exp(1j * np.pi * np.linspace(1e-3, 1.0, 4000))
+    back = np.eye(2) - c @ np.linalg.solve(
+        z[:, None, None] * np.eye(len(a)) - a, np.broadcast_to(b, (z.size, *b.shape))
+    )
+    peak = 20 * np.log10(np.linalg.svd(np.linalg.inv(back), compute_uv=False)[:, 0].max())
+    found = margins.together(loop)["modulus"]
+    np.testing.assert_allclose(found, peak, atol=5e-3)  # both on grids
+    assert found > of(loop).modulus.max() - 5e-3
+
+
 def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
     """The loop between its samples is another one than at them."""
     every, hardware = 4, {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_every": 4}

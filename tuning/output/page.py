@@ -20,7 +20,15 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
-from tuning.output import margin_sentences, page_captions, page_charts, pointing_sentences, search_sentences, sentences
+from tuning.output import (
+    law_sentences,
+    margin_sentences,
+    page_captions,
+    page_charts,
+    pointing_sentences,
+    search_sentences,
+    sentences,
+)
 
 HERE = Path(__file__).parent
 
@@ -283,8 +291,8 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
     lines = [f"each law tuned alike, all of its gains free, judged on {judged}"]
-    best = min(summary["laws"], key=lambda law: _error(summary["laws"][law]))
-    if np.isfinite(_error(summary["laws"][best])):
+    best = law_sentences.best(summary)
+    if best is not None:
         lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
     else:
         lines.append("no law meets every requirement")
@@ -292,12 +300,11 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
     mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
     headline = meets.get(summary["status"], "Interrupted: the best so far")
     lines += sentences.cautions(summary)
-    blocks = [_table(sentences.comparison(summary)), _text(sentences.comparison_lines(summary))]
-    return Heading(mood, headline, lines), [Section("Laws side by side", blocks)]
-
-
-def _error(law: dict[str, Any]) -> float:
-    return law["window_error"] if law["met"] and law["window_error"] is not None else np.inf
+    sections = [
+        Section(one.title, [result.chart(f"question_{number}", one.chart, one.note), _table(one.table)])
+        for number, one in enumerate(law_sentences.answers(summary))
+    ]
+    return Heading(mood, headline, lines), [*sections, Section("Gains", [_text(law_sentences.lines(summary))])]
 
 
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:

@@ -13,6 +13,7 @@ Chart = dict[str, Any]
 
 COLOURS = [colour for colour, _ in STYLES]
 DASHES = ("solid", "dash", "dashdot", "dot", "longdashdot")
+SYMBOLS = ("circle", "diamond", "triangle-up", "square")
 POINTS = 3000  # of a history, at most
 FRAMES = 60  # of a turning body
 _DECADES = {"type": "log", "dtick": "D2", "tickformat": ".0e"}
@@ -155,6 +156,38 @@ def _bars(points: Sequence[dict[str, Any]]) -> Chart:
         "array": [high - p["rms"] for p, (_, high) in zip(points, intervals, strict=True)],
         "arrayminus": [p["rms"] - low for p, (low, _) in zip(points, intervals, strict=True)],
     }  # fmt: skip
+
+
+def laws(
+    names: Sequence[str],
+    series: Mapping[str, tuple[Sequence[float | None], Sequence[Any]]],
+    axis: str,
+    marks: Mapping[str, float],
+    logarithmic: bool,
+) -> Chart:
+    """Numbers of several laws, one below the other.
+
+    series: label -> (a number for each law, its interval); axis: what they are; marks: lines to draw, by what they are.
+    """
+    labels, data = [name.replace("_", " ") for name in names], []
+    for k, (label, (values, intervals)) in enumerate(series.items()):
+        known = [None if v is None or not np.isfinite(v) else v for v in values]
+        away = [(0.0, 0.0) if v is None or not both else (both[1] - v, v - both[0])
+                for v, both in zip(known, intervals, strict=True)]  # fmt: skip
+        data.append({
+            "type": "scatter", "mode": "markers", "name": label, "x": known, "y": labels,
+            "hovertemplate": "%{y}: %{x:.4g}<extra>" + label + "</extra>", "showlegend": len(series) > 1,
+            "marker": {"size": 10, "color": COLOURS[k % len(COLOURS)], "symbol": SYMBOLS[k % len(SYMBOLS)]},
+            "error_x": {"type": "data", "symmetric": False, "thickness": 1.5, "visible": any(intervals),
+                        "array": [one for one, _ in away], "arrayminus": [one for _, one in away]},
+        })  # fmt: skip
+    across = {"title": {"text": axis}, **({**_DECADES, "dtick": 1} if logarithmic else {})}
+    up = {"autorange": "reversed", "automargin": True, "type": "category"}
+    lines = [{"type": "line", "x0": at, "x1": at, "yref": "paper", "y0": 0, "y1": 1, "line": {"dash": "dot"}}
+             for at in marks.values()]  # fmt: skip
+    said = [{"text": what, "x": np.log10(at) if logarithmic else at, "yref": "paper", "y": 0, "yanchor": "bottom",
+             "xanchor": "left", "showarrow": False} for what, at in marks.items()]  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=across, yaxis=up, shapes=lines, annotations=said)}
 
 
 def search(rows: Sequence[Mapping[str, str]], goal: str) -> Chart:

@@ -1,7 +1,6 @@
 """What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
@@ -64,7 +63,7 @@ def run_lines(summary: Summary) -> list[str]:
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
 
     units = {**CATALOGUES[kind], **MARGINS}
     return [
@@ -155,63 +154,6 @@ def paper_refused(summary: Summary) -> Iterator[str]:
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
     return "" if interval is None else f" (95 %: {interval[0]:{digits}} to {interval[1]:{digits}})"
-
-
-def comparison(summary: Summary) -> Table:
-    """Laws side by side."""
-    laws = summary["laws"]
-    rows: list[tuple[str, ...]] = []
-
-    def row(label: str, unit: str, value: Callable[[Summary], float | None], digits: str = ".3g") -> None:
-        cells = (value(found) for found in laws.values())
-        rows.append((label, *("-" if cell is None else f"{cell:{digits}}" for cell in cells), unit))
-
-    row("RMS window error", "-", lambda found: found["window_error"], ".2e")
-    if any(found.get("floor") for found in laws.values()):
-        row("times the floor", "", lambda found: over_floor(found["window_error"], found.get("floor")))
-    row("mean peak torque", "N m", lambda found: found["peak_torque"])
-    row("largest", "N m", lambda found: found["largest_peak_torque"])
-    row("mean effort", "N m s", lambda found: found["effort"])
-    row("mean chattering", "N m/s", lambda found: found["chattering"])
-    row("settles, median", "s", lambda found: (found["settling_time"] or {}).get("0.5"), ".1f")
-    row("  nearest fifth", "s", lambda found: (found["settling_near_far"] or [None])[0], ".1f")
-    row("  farthest fifth", "s", lambda found: (found["settling_near_far"] or [None])[-1], ".1f")
-    row("  never", "", lambda found: found["unsettled"], "d")
-    for name, (unit, _, _) in MARGINS.items():
-        found = [{v["metric"]: v for v in law["verdicts"]}.get(name) for law in laws.values()]
-        if any(found):
-            rows.append((name.replace("_", " "), *("-" if one is None else _margin(one) for one in found), unit))
-    for metric in dict.fromkeys(v["metric"] for law in laws.values() for v in law["verdicts"]):
-        told = [{v["metric"]: v for v in law["verdicts"]}.get(metric) for law in laws.values()]
-        rows.append((f"trials beyond {metric}", *("-" if one is None else _broken(one) for one in told), ""))
-    rows.append(("all limits met", *("yes" if found["met"] else "no" for found in laws.values()), ""))
-    return Table(("", *(law.replace("_", " ") for law in laws), "unit"), rows)
-
-
-def _broken(told: Summary) -> str:
-    """In how many trials a requirement is broken, and whether that is too many."""
-    return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
-
-
-def _margin(told: Summary) -> str:
-    """Of a verdict on a margin its worst value."""
-    if told["failures"] == 0 and told["worst"] in (None, math.inf):  # JSON has no number for it
-        return "unlimited"
-    return _digits(told["worst"], ".3g")
-
-
-def comparison_lines(summary: Summary) -> Iterator[str]:
-    """The gains of each law, trials that went wrong, and limits that it breaks."""
-    yield from paper_refused(summary)
-    for law, found in summary["laws"].items():
-        gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
-        bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
-        yield f"{law}: {gains}{bound}"
-        missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
-        if missed:
-            yield f"  of {summary['trials']} trials {', '.join(missed)}"
-        yield from (f"  {verdict(told)}" for told in found["verdicts"] if not told["met"])
-    yield f"settles: from when the angle stays below {summary['settling_angle']:g} rad"
 
 
 def front(summary: Summary) -> Table:

@@ -6,6 +6,8 @@ from typing import Any
 from tuning.output import margin_sentences, search_sentences, sentences
 from tuning.output.progress_lines import Lines
 
+WIDE = 1000  # columns of what is no terminal
+
 
 class Progress:
     """A progress bar on the error stream with the best so far and the time left; silent where told to be."""
@@ -110,10 +112,13 @@ def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
+    from tuning.output import law_sentences
+
     alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
-    table(sentences.comparison(summary))
-    say(*sentences.comparison_lines(summary), *sentences.cautions(summary), f"results in {folder}")
+    for one in law_sentences.answers(summary):
+        table(one.table, title=one.title, title_justify="left")
+    say(*law_sentences.lines(summary), *sentences.cautions(summary), f"results in {folder}")
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
@@ -141,4 +146,6 @@ def table(cells: sentences.Table, **style: Any) -> None:
     made = Table(*map(escape, cells.head), pad_edge=False, **{"box": None, **style})
     for row in cells.rows:
         made.add_row(*map(Text, row))
-    Console(highlight=False).print(made)
+    # a file or a pipe has no width: what does not fit into 80 columns would be cut
+    width = None if Console().is_terminal else WIDE
+    Console(highlight=False, width=width).print(made)

@@ -1,8 +1,10 @@
 """The paper's law beside others, tuned to the same requirements by the same search, judged on the same trials."""
 
+import contextlib
+import dataclasses
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from ptsmc_jax.scenario import cautions, errors, own, parsing, replace, study, s
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -26,9 +29,11 @@ from tuning.search import gains, trust
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.progress import Report
-from tuning.studies import judging, tuner
+from tuning.studies import judging, stability, tuner
 
 OURS = "prescribed_time"
+OFF = 0.1  # share by which the inertia differs from what laws are told
+UNTOLD = ("heavier", "lighter", "later")
 KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
 
 
@@ -42,6 +47,8 @@ class Contender:
     trials: Trials
     verdicts: list[Verdict]
     floor: float | None  # RMS window error that no controller can beat
+    margins: dict[str, dict[str, Any]] | None = None  # of the nominal loop, see `stability.worst`
+    changed: Mapping[str, Trials] = field(default_factory=dict)  # with what it is not told, see `untold`
 
     @property
     def met(self) -> bool:
@@ -150,6 +157,31 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
     return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
+def untold(flown: Scenario) -> dict[str, Scenario]:
+    """The scenario with what its law is not told of: another inertia, a control period of delay; those that can fly."""
+    assert isinstance(flown, SpacecraftScenario)
+    body, device = flown.spacecraft, flown.hardware
+    inertia = np.asarray(body.inertia if body.true_inertia is None else body.true_inertia)
+    late = (getattr(device, "delay", None) or 0) + 1
+    changes: list[dict[str, Any]] = [
+        {"spacecraft__true_inertia": ((1.0 + OFF) * inertia).tolist()},
+        {"spacecraft__true_inertia": ((1.0 - OFF) * inertia).tolist()},
+        {"hardware__delay": late},
+    ]
+    found = {}
+    for name, change in zip(UNTOLD, changes, strict=True):
+        with contextlib.suppress(ScenarioError):
+            found[name] = replace(flown, **change)
+    return found
+
+
+def _with_more(one: Contender, fresh_seed: int) -> Contender:
+    """With its margins, and flown once more with what its law is not told of."""
+    requirements = study(one.flown).requirements
+    changed = {name: judging.judge(other, fresh_seed, requirements) for name, other in untold(one.flown).items()}
+    return dataclasses.replace(one, margins=stability.worst(study(one.flown)), changed=changed)
+
+
 def compare(
     scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None, against: Rivals = Rivals()
 ) -> Comparison:
@@ -162,7 +194,9 @@ def compare(
         except ScenarioError as error:  # before hours of search, not after
             raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
     others, refused = judging.beside(scenario)
-    made = {"paper": _papers(judging.as_flown(others["paper"]), fresh_seed)} if "paper" in others else {}
+    made = {}
+    if "paper" in others:
+        made["paper"] = _with_more(_papers(judging.as_flown(others["paper"]), fresh_seed), fresh_seed)
     stopped = False
     for law, posed in rivals.items():
 
@@ -175,6 +209,8 @@ def compare(
         stopped = tuned.search.interrupted
         if stopped:
             break
+        told("flying with what it is not told", 0, 0, np.nan, 0.0)
+        made[law] = _with_more(made[law], fresh_seed)
     return Comparison(made, fresh_seed, stopped, refused)
 
 
@@ -211,7 +247,21 @@ def figures_of(one: Contender) -> dict[str, Any]:
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
         "settling_by_angle": float(rank(angle[settled], known)[0]) if spread else None,
         "settling_near_far": _near_far(angle, late) if spread else None,
+        "margins": one.margins,
+        "untold": {name: _told_nothing(other) for name, other in one.changed.items()},
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
+    }
+
+
+def _told_nothing(trials: Trials) -> dict[str, Any]:
+    """What is said of trials with something that the law is not told of."""
+    done = trials.finished
+    errors, peaks = (np.asarray(v)[done] for v in (trials.metrics.window_error, trials.metrics.peak_torque))
+    return {
+        "window_error": float(trust.rms(errors)) if done.any() else None,
+        "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
+        "largest_peak_torque": float(np.max(peaks)) if done.any() else None,
+        "lost": int(np.count_nonzero(~trials.ok)),
     }
 
 
@@ -252,20 +302,34 @@ def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, kno
     (folder / "scenarios").mkdir()
     for law, one in made.contenders.items():
         store.write_toml(folder / "scenarios" / f"{law}.toml", parsing.dump(one.flown))
-    columns = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
-               "settling_by_angle")  # fmt: skip
-    asked = [name for name in catalogues.MARGINS if name in scenario.requirements]
-    rows = [[law, *(found[name] for name in columns), *((found["settling_time"] or {}).get(q) for q in _SHARES),
-             *({v["metric"]: v["worst"] for v in found["verdicts"]}.get(name) for name in asked),
-             "; ".join(f"{name} = {value:.6g}" for name, value in found["gains"].items())]
-            for law, found in said["laws"].items()]  # fmt: skip
-    settling = [f"settling_time_{100 * float(q):g}" for q in _SHARES]
-    store.write_csv(folder / "compare.csv", ["law", *columns, *settling, *asked, "gains"], rows)
+    store.write_csv(folder / "compare.csv", *_rows(scenario, said))
     if figures:
         style.save(dict(_figures(made)), folder / "figures")
 
 
 _SHARES = ("0.01", "0.5", "0.99")
+_COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
+            "settling_by_angle")  # fmt: skip
+
+
+def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+    """Head and rows of `compare.csv`, a law each."""
+    asked = [name for name in catalogues.MARGINS if name in scenario.requirements]
+    others = [name for name in catalogues.MARGINS if name not in asked]  # of the nominal loop in hold
+    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *asked, *others,
+            "window_error_low", "window_error_high", *(f"window_error_{name}" for name in UNTOLD), "gains"]  # fmt: skip
+
+    def row(law: str, found: Mapping[str, Any]) -> list[Any]:
+        worst = {v["metric"]: v["worst"] for v in found["verdicts"]}
+        hold = (found["margins"] or {}).get("hold", {})
+        return [
+            law, *(found[name] for name in _COLUMNS), *((found["settling_time"] or {}).get(q) for q in _SHARES),
+            *map(worst.get, asked), *map(hold.get, others), *(found["window_error_interval"] or (None, None)),
+            *(found["untold"].get(name, {}).get("window_error") for name in UNTOLD),
+            "; ".join(f"{name} = {value:.6g}" for name, value in found["gains"].items()),
+        ]  # fmt: skip
+
+    return head, [row(law, found) for law, found in said["laws"].items()]
 
 
 def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:

@@ -1,0 +1,71 @@
+"""Sensors of one's own: what the law sees of the true state at a sample, and what they remember of it.
+
+seen, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import draws, guards
+from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
+
+Scalar = Float[Array, ""]
+
+OWN_NOISE = "own_noise"
+
+
+@dataclass(frozen=True)
+class SampledSensor:
+    """What sensors of one's own are derived from; they fly in the sampled loop.
+
+    `draws` standard normal numbers are drawn for each sample, [-]. Their memory is any pytree of arrays; `begin`'s
+    default is none.
+    """
+
+    draws: ClassVar[int] = 0
+    model: Any  # the plant as law and observer know it
+
+    def begin(self, x: Any) -> Any:
+        """The memory before the first sample, at which the true state is x."""
+        return None
+
+    def see(self, memory: Any, x: Any, noise: Float[Array, " draws"], t: Scalar, dt: Scalar) -> tuple[Any, Any]:
+        """The state as the law sees it, and the memory, from the true state x at t [s]; noise: (draws,) [-].
+
+        dt: time since the sample before [s], 0 at the first. What is seen has the form of x: (q, w) of a spacecraft,
+        (n,) of another plant; the memory keeps its shapes and types.
+        """
+        raise NotImplementedError
+
+
+@pytree
+@dataclass(frozen=True)
+class OwnSensors:
+    """Sensors of one's own as the rollout asks for them: with noise that belongs to (seed, trial, sample)."""
+
+    own: Any  # `SampledSensor`
+    loud: Leaf  # 1, or 0 [-]: without noise
+
+    def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " draws"]:
+        """Noise of one sample, (draws,) [-]."""
+        return self.loud * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
+
+    def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> tuple:
+        """Memory before the first sample of positive length [s], which is now."""
+        key = draws.stream(seed, trial, OWN_NOISE)
+        return key, self.noise(key, now.sample), self.own.begin(x0)
+
+    def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, tuple]:
+        """The state as seen, and the memory; a period without a length [s] changes none of what is remembered."""
+        key, noise, kept = memory
+        following = self.noise(key, now.sample + 1)
+        seen, new = self.own.see(kept, x, guards.lerp(now.noise_weight, noise, following), now.t, dt)
+        there = now.t_next > now.t
+        kept = jax.tree.map(lambda one, other: jnp.where(there, one, other), new, kept)
+        return seen, (key, following, kept)

@@ -1,0 +1,223 @@
+"""Sensors and draws of one's own: beside the built-in ones, a loop by hand, and what is wrong with them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import explore, scenario
+from ptsmc_jax.campaigns import margin_verdicts, store
+from ptsmc_jax.devices.own_sensors import OWN_NOISE
+from ptsmc_jax.numerics import draws
+from ptsmc_jax.scenario import own, parsing, reading, systems
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import linear
+from tests.helpers import SHORT
+
+FILE = """
+import dataclasses
+
+import jax.numpy as jnp
+import ptsmc_jax as ptsmc
+
+
+class Noisy(ptsmc.SampledSensor):
+    '''Both states with white noise, the first one through a lag of one sample.'''
+
+    draws = 2
+    sigma: tuple = (1e-3, 2e-3)
+
+    def begin(self, x):
+        return x[:1]
+
+    def see(self, memory, x, noise, t, dt):
+        seen = x + self.sigma * noise
+        return jnp.concatenate([memory, seen[1:]]), seen[:1]
+
+
+class Drift(ptsmc.Draw):
+    '''A disturbance that is larger or smaller, and a start that goes with it.'''
+
+    count = 2
+    std: float = 0.1
+
+    def at(self, c, parts):
+        wave = dataclasses.replace(parts.disturbance, amplitude=parts.disturbance.amplitude * (1.0 + self.std * c[0]))
+        return dataclasses.replace(parts, disturbance=wave, initial=parts.initial + 0.01 * c[1])
+
+    def values(self, c):
+        return {"drift": 1.0 + self.std * c[0]}
+"""
+CHAIN = {
+    "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+    "controller": {"kind": "pd", "k_p": 2.0, "k_d": 2.0, "t_f": 5.0},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 6.5},
+}
+NOISY = {"kind": "own", "code": "mine.py:Noisy"}
+DRIFT = {"own": {"kind": "own", "code": "mine.py:Drift"}}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """An empty folder with the parts in mine.py, and a process that has run nothing yet."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(systems, "_ran", {})
+    (tmp_path / "mine.py").write_text(FILE)
+    return tmp_path
+
+
+def parts_of(**tables):
+    return scenario.study(scenario.from_tables({**CHAIN, **tables})).parts
+
+
+def test_sensors_do_what_they_say_with_noise_of_the_trial():
+    """u = -2 x_1 - 2 x_2 of what is seen: x_1 of the sample before, and the noise of (seed, trial, sample)."""
+    parts = parts_of(sensors={**NOISY, "sigma": [0.02, 0.03]}, disturbance={"kind": "none"})
+    log = rollout.simulate_jit(parts, 3, 7, record=True).log
+    kept = np.asarray(log.lasts)
+    t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
+    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    sample = np.asarray(ticks.sample)[np.asarray(ticks.t_next > ticks.t)]
+    key = draws.stream(np.uint32(3), np.uint32(7), OWN_NOISE)
+    noise = np.array([draws.normals(key, 2, k) for k in sample[1:]])
+    seen = x[1:-1] + np.array([0.02, 0.03]) * noise
+    wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # its first one lies a sample back
+    np.testing.assert_allclose(u[2:-1, 0], wanted, rtol=0.0, atol=1e-13)
+    other = rollout.simulate_jit(parts, 3, 8)
+    assert float(other.metrics.window_error) != float(rollout.simulate_jit(parts, 3, 7).metrics.window_error)
+    assert linear.quiet(parts).sensors.loud == 0.0
+    assert t.size > 60
+
+
+def test_a_sensor_that_sees_the_state_flies_as_none_does():
+    class Clear(ptsmc.SampledSensor):
+        def see(self, memory, x, noise, t, dt):
+            return x, memory
+
+    with_it = rollout.simulate_jit(parts_of(sensors={"kind": "own", "code": Clear}))
+    without = rollout.simulate_jit(parts_of())
+    for one, other in zip(*map(jax.tree.leaves, (with_it.metrics, without.metrics)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)  # two programs
+
+
+def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
+    """One that turns what is seen by a bias brings the body to rest that far from the reference; every row is known."""
+    (here / "mine.py").write_text(
+        "import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\nfrom ptsmc_jax.numerics import attitude\n\n"
+        "class Tilted(ptsmc.SampledSensor):\n    turn: float = 2e-3\n\n"
+        "    def see(self, memory, x, noise, t, dt):\n"
+        "        by = self.turn * jnp.array([0.0, 0.0, 1.0])\n"
+        "        return x._replace(q=attitude.multiply(x.q, attitude.from_rotation_vector(by))), memory\n"
+    )
+    text = SHORT.replace("attitude_noise = 2e-5\n", "").replace("rate_noise = 1e-6\n", "").replace("[hardware]\n", "")
+    text = text[: text.index("[requirements]")] + '[sensors]\nkind = "own"\ncode = "mine.py:Tilted"\n'
+    (here / "s.toml").write_text(text)
+    longer = scenario.replace(scenario.read("s.toml"), loop__t_end=25.0, controller__k1=4.0)
+    run = explore.simulate(longer)
+    turned = np.asarray(run.run.log.x.q)[-1]
+    np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # what the observer lags by is left
+    assert run.run.floor is None
+    status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
+    assert (status, error) == (0, "")
+    made = store.made(here / "out" / "simulate-s")
+    assert made["sensors_sha256"] == systems.digest("mine.py:Tilted")
+    again = command("simulate", "out/simulate-s/scenario.toml", "--quiet", "--out", "new")
+    assert again[0] == 2
+    assert "(sensors.code), which this command would run" in again[2]
+
+
+def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here):
+    tables = {**CHAIN, "disturbance": {"kind": "sinusoid", "amplitude": [0.05]}, "dispersion": DRIFT}
+    ready = scenario.study(scenario.from_tables(tables))
+    assert ready.dispersion.varies
+    assert margin_verdicts.differ(ready.dispersion)
+    c = ready.dispersion.coordinates(jnp.uint32(2), jnp.uint32(5))["own"]
+    drawn = ready.dispersion.apply(ready.parts, jnp.uint32(2), jnp.uint32(5))
+    np.testing.assert_allclose(drawn.disturbance.amplitude, 0.05 * (1.0 + 0.1 * c[0]), rtol=1e-15)
+    np.testing.assert_allclose(drawn.initial, np.array([1.0, 0.0]) + 0.01 * np.asarray(c[1]), rtol=1e-15)
+    rows = ptsmc.trials(scenario.from_tables(tables), 40, seed=2)
+    assert rows["drift"].n_unique() == 40
+    np.testing.assert_allclose(rows["drift"][5], 1.0 + 0.1 * float(c[0]), rtol=1e-12)
+    text = "\n".join([
+        'plant = { kind = "chain", order = 2, x0 = [1.0, 0.0] }',
+        'controller = { kind = "pd", k_p = 2.0, k_d = 2.0, t_f = 5.0 }',
+        'disturbance = { kind = "sinusoid", amplitude = [0.05] }',
+        'loop = { mode = "sampled", period = 0.1, t_end = 6.5 }',
+        'dispersion = { own = { kind = "own", code = "mine.py:Drift", std = 0.2 } }',
+    ])  # fmt: skip
+    (here / "c.toml").write_text(text)
+    assert command("montecarlo", "c.toml", "--trials", 40, "--seed", 2, "--no-figures", "--quiet")[0] in (0, 1)
+    kept = pl.read_parquet(here / "out" / "montecarlo-c" / "trials")
+    np.testing.assert_allclose(kept["drift"][5], 1.0 + 0.2 * float(c[0]), rtol=1e-12)
+
+
+def test_keys_of_both_are_read_written_and_known_as_programs(command, here):
+    loaded = scenario.from_tables({**CHAIN, "sensors": {**NOISY, "sigma": [1.0, 2.0]}, "dispersion": DRIFT})
+    assert own.waits(loaded)
+    assert set(own.programs(loaded)) == {"sensors.code", "dispersion.own.code"}
+    assert set(own.digests(loaded)) == {"sensors_sha256", "dispersion_own_sha256"}
+    whole = reading.complete(loaded)
+    assert whole.dispersion is not None
+    assert (whole.sensors.sigma, whole.dispersion.own.std) == ((1.0, 2.0), 0.1)
+    assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
+    (here / "c.toml").write_text(
+        'plant = { kind = "chain", x0 = [1.0, 0.0] }\nloop = { mode = "sampled" }\n'
+        'sensors = { kind = "own", code = "mine.py:Noisy" }\n'
+        'dispersion = { own = { kind = "own", code = "mine.py:Drift" } }\n'
+    )
+    assert command("new", "commented.toml", "--like", "c.toml", "--quiet")[0] == 0
+    first, second = (reading.complete(scenario.read(path)) for path in ("c.toml", "commented.toml"))
+    assert first == second
+
+
+SEES = [
+    ("def see", "def seen", "the class Noisy has no method see"),
+    ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen", "see returns something else at t = 0"),
+    ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
+    ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
+    ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
+    ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
+    ("sigma: tuple = (1e-3, 2e-3)", "sigma: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
+]
+DRAWS = [
+    ("def at", "def be", "the class Drift has no method at"),
+    ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns something else"),
+    ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
+    ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
+    ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
+    ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "said"), SEES + DRAWS, ids=[row[2][:30] for row in SEES + DRAWS])
+def test_what_is_wrong_with_them_is_one_sentence(here, old, new, said):
+    assert old in FILE
+    (here / "mine.py").write_text(FILE.replace(old, new))
+    which = {"sensors": NOISY} if (old, new, said) in SEES else {"dispersion": DRIFT}
+    with pytest.raises(ScenarioError) as caught:
+        parts_of(**which, disturbance={"kind": "sinusoid", "amplitude": [0.05]})
+    text = str(caught.value).replace("f64", "float64") if "float64" in said else str(caught.value)
+    assert said in text
+    assert "\n" not in text
+    assert ("sensors.code" if "sensors" in which else "dispersion.own") in text
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        ({"hardware": {"state_noise": [1.0, 1.0]}}, "hardware.state_noise is [1.0, 1.0], but must be absent where"),
+        ({"loop": {"mode": "continuous"}, "controller": {"t_f": 5.0}}, "[sensors] needs the sampled loop"),
+    ],
+)
+def test_sensors_of_ones_own_are_all_that_there_are(tables, said):
+    with pytest.raises(ScenarioError) as caught:
+        scenario.from_tables({**CHAIN, "sensors": NOISY, **tables})
+    assert said in str(caught.value)
+    with pytest.raises(ScenarioError, match=r"filter\.kind"):
+        scenario.from_tables({"loop": {"mode": "sampled"}, "filter": {"bandwidth": 1.0}, "sensors": NOISY})
+    assert dataclasses.is_dataclass(ptsmc.SampledSensor)

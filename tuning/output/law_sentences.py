@@ -1,0 +1,212 @@
+"""Laws side by side in tables and words, a table for each question; and what a page draws of each."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from ptsmc_jax.simulation.catalogues import MARGINS
+from tuning.output import page_charts, sentences
+from tuning.output.cells import Summary, Table
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of each law: a column of a table, a series of a chart."""
+
+    name: str
+    unit: str
+    of: Callable[[Summary], float | int | None]
+    digits: str = ".3g"
+    interval: Callable[[Summary], Any] = lambda law: None  # 95 %, two numbers
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of all laws, and the numbers that answer it.
+
+    drawn: how many of them, the first ones, a chart shows, in one unit; judged: with whether all limits are met.
+    """
+
+    title: str
+    values: tuple[Value, ...]
+    drawn: int
+    logarithmic: bool = True
+    note: str = ""
+    judged: bool = False
+    what: str = ""  # on the axis of the chart, where it shows several
+    limit: str = ""  # metric whose limit is drawn
+
+
+def _untold(name: str, which: str) -> Value:
+    def of(law: Summary) -> float | None:
+        return law["untold"].get(which, {}).get("window_error")
+
+    return Value(name, "-", of, ".2e", lambda law: law["untold"].get(which, {}).get("window_error_interval"))
+
+
+def _hold(name: str) -> Value:
+    """A margin in hold, of the worst axis; where it is asked for, the worst that was judged."""
+    unit = MARGINS[name][0]
+
+    def of(law: Summary) -> float | None:
+        asked = {v["metric"]: v for v in law["verdicts"]}.get(name)
+        if asked is not None:
+            unlimited = asked["failures"] == 0 and asked["worst"] in (None, math.inf)  # JSON has no number for it
+            return math.inf if unlimited else asked["worst"]
+        hold = (law["margins"] or {}).get("hold", {})
+        return math.inf if name in hold and hold[name] is None else hold.get(name)  # null where it is unlimited
+
+    return Value(name.removesuffix("_margin"), unit, of)
+
+
+ERROR = Value("RMS window error", "-", lambda law: law["window_error"], ".2e", lambda law: law["window_error_interval"])
+FLOOR = Value("times the floor", "", lambda law: sentences.over_floor(law["window_error"], law.get("floor")))
+QUESTIONS = (
+    Question("How accurate?", (ERROR, FLOOR), 1, judged=True, note="Bars: 95 %; dotted: what no controller can beat."),
+    Question(
+        "How much torque?",
+        (
+            Value("mean peak", "N m", lambda law: law["peak_torque"]),
+            Value("largest", "N m", lambda law: law["largest_peak_torque"]),
+        ),
+        2,
+        what="peak torque",
+        limit="peak_torque",
+    ),
+    Question("How much is spent?", (Value("mean effort", "N m s", lambda law: law["effort"]),), 1),
+    Question("How much does it chatter?", (Value("mean chattering", "N m/s", lambda law: law["chattering"]),), 1),
+    Question(
+        "When is it there?",
+        (
+            Value("median", "s", lambda law: (law["settling_time"] or {}).get("0.5"), ".1f"),
+            Value("nearest fifth", "s", lambda law: (law["settling_near_far"] or [None])[0], ".1f"),
+            Value("farthest fifth", "s", lambda law: (law["settling_near_far"] or [None])[-1], ".1f"),
+            Value("never", "trials", lambda law: law["unsettled"], "d"),
+        ),
+        3,
+        logarithmic=False,
+        what="settling time",
+        note="Medians over all starts, and over the fifths of them that begin nearest and farthest.",
+    ),
+    Question(
+        "What margins are left?",
+        tuple(_hold(name) for name in MARGINS),
+        1,
+        logarithmic=False,
+        limit="gain_margin",
+        note="Drawn: gain, of the worst axis in hold; one that is asked for: the worst that was judged.",
+    ),
+    Question(
+        "What if the model is wrong?",
+        (
+            dataclasses.replace(ERROR, name="as told"),
+            _untold("inertia + 10 %", "heavier"),
+            _untold("inertia - 10 %", "lighter"),
+            _untold("a period later", "later"),
+        ),
+        4,
+        what="RMS window error",
+        note="The same gains and trials, with what the law is not told of; bars: 95 %.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What laws say to a question: a law each row of the table."""
+
+    title: str
+    table: Table
+    chart: page_charts.Chart
+    note: str
+
+
+def answers(summary: Summary) -> list[Answer]:
+    """To each question that any law has a number for."""
+    laws = summary["laws"]
+    known = [q for q in QUESTIONS if any(value.of(law) is not None for value in q.values for law in laws.values())]
+    return [Answer(one.title, _table(one, laws), _chart(one, laws), one.note) for one in known]
+
+
+def _chart(question: Question, laws: Summary) -> page_charts.Chart:
+    drawn, each = question.values[: question.drawn], list(laws.values())
+    series = {value.name: (list(map(value.of, each)), list(map(value.interval, each))) for value in drawn}
+    what = question.what or drawn[0].name
+    axis = f"{what} [{drawn[0].unit}]"
+    return page_charts.laws(list(laws), series, axis, _marks(question, each), question.logarithmic)
+
+
+def _marks(question: Question, laws: list[Summary]) -> dict[str, float]:
+    """What numbers of laws are drawn beside: the floor, a limit that is asked for."""
+    if question.judged:
+        floors = [law["floor"] for law in laws if law.get("floor")]
+        return {"floor": min(floors)} if floors else {}
+    limits = {verdict["metric"]: verdict["limit"] for law in laws for verdict in law["verdicts"]}
+    return {"limit": limits[question.limit]} if question.limit in limits else {}
+
+
+def _table(question: Question, laws: Summary) -> Table:
+    kept = [value for value in question.values if any(value.of(law) is not None for law in laws.values())]
+    head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in kept]
+    within = question.judged and any(kept[0].interval(law) for law in laws.values())
+    asked = list(dict.fromkeys(verdict["metric"] for law in laws.values() for verdict in law["verdicts"]))
+    rows = []
+    for name, law in laws.items():
+        cells = [_cell(value, value.of(law)) for value in kept]
+        if within:
+            low, high = kept[0].interval(law) or (None, None)
+            cells.insert(1, "-" if low is None else f"{low:{kept[0].digits}} to {high:{kept[0].digits}}")
+        if question.judged:
+            told = {verdict["metric"]: verdict for verdict in law["verdicts"]}
+            cells += ["-" if metric not in told else _broken(told[metric]) for metric in asked]
+            cells.append("yes" if law["met"] else "no")
+        rows.append((name.replace("_", " "), *cells))
+    if within:
+        head.insert(1, "95 %")
+    if question.judged:
+        head += [*(f"trials beyond {metric}" for metric in asked), "all limits met"]
+    return Table(("", *head), rows)
+
+
+def _broken(told: Summary) -> str:
+    """In how many trials a requirement is broken, and whether that is too many."""
+    return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
+
+
+def _cell(value: Value, known: float | int | None) -> str:
+    if known is None or known != known:
+        return "-"
+    return "unlimited" if math.isinf(known) else f"{known:{value.digits}}"
+
+
+def lines(summary: Summary) -> Iterator[str]:
+    """The gains of each law, trials that went wrong, and limits that it breaks."""
+    yield from sentences.paper_refused(summary)
+    for law, found in summary["laws"].items():
+        gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
+        bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
+        yield f"{law}: {gains}{bound}"
+        missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
+        if missed:
+            yield f"  of {summary['trials']} trials {', '.join(missed)}"
+        yield from (f"  {sentences.verdict(told)}" for told in found["verdicts"] if not told["met"])
+        for which, other in found["untold"].items():
+            if other["lost"]:
+                yield f"  {WORDS[which]} {other['lost']} of {summary['trials']} trials fail or miss t_f"
+    yield f"settles: from when the angle stays below {summary['settling_angle']:g} rad"
+
+
+WORDS = {
+    "heavier": "with an inertia 10 % larger than it is told",
+    "lighter": "with an inertia 10 % smaller than it is told",
+    "later": "with a control period of delay more than it is told",
+}
+
+
+def best(summary: Summary) -> str | None:
+    """The law with the smallest error of those that meet every requirement."""
+    met = {law: found["window_error"] for law, found in summary["laws"].items() if found["met"]}
+    known = {law: error for law, error in met.items() if error is not None}
+    return min(known, key=lambda law: known[law]) if known else None
