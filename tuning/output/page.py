@@ -292,10 +292,8 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
     judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
     lines = [f"each law tuned alike, all of its gains free, judged on {judged}"]
     best = law_sentences.best(summary)
-    if best is not None:
-        lines.append(f"smallest error of those that meet every requirement: {best.replace('_', ' ')}")
-    else:
-        lines.append("no law meets every requirement")
+    said = f"smallest error of those that meet every requirement: {best.replace('_', ' ')}" if best else ""
+    lines.append(said or "no law meets every requirement")
     meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}
     mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
     headline = meets.get(summary["status"], "Interrupted: the best so far")
