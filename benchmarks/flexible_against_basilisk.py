@@ -130,7 +130,7 @@ def main() -> None:
         theirs, angles = flown_again(run)
         off = (Rotation.from_quat(run.log.x.q).inv() * Rotation.from_quat(theirs)).magnitude().max()
         print(
-            f"slew of {100 * share:g} deg: largest angle apart {off:.1e} rad, "
+            f"slew of {100 * share:g} %: largest angle apart {off:.1e} rad, "
             f"panels up to {np.abs(angles).max():.1e} rad, {run.status}, {run.parts.substeps} steps a period"
         )
 

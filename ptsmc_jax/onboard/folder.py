@@ -122,7 +122,8 @@ def write_program(folder: Path, made: Controller) -> None:
     }
     for name, text in texts.items():
         store.write_text(folder / name, text)
-    layout = {"name": about.name, "digest": about.digest, "columns": templates.columns(code)}
+    period = float(made.ready.parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    layout = {"name": about.name, "digest": about.digest, "period": period, "columns": templates.columns(code)}
     store.write_json(folder / "controller.json", layout)
 
 

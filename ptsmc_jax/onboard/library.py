@@ -75,6 +75,7 @@ class Library:
         try:
             layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
+            self.period = float(layout["period"])  # [s]
         except (OSError, ValueError, KeyError, TypeError):
             raise ScenarioError(
                 f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
@@ -136,6 +137,12 @@ class InTheLoop:
                     f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
+        period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        if library.period != period:
+            raise ScenarioError(
+                f"loop.period is {period:g} s, but must be {library.period:g} s, that of the controller in "
+                f"{library.folder}"
+            )
 
     @property
     def software(self) -> Software:

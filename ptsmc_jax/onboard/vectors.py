@@ -15,7 +15,7 @@ from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import boot, brought_about, decide, schedule
-from ptsmc_jax.simulation.rollout import DISTURBANCE_WALK, SINGULAR_CLEARANCE, over_period
+from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, over_period, walk_stream
 
 
 class Samples(NamedTuple):
@@ -54,7 +54,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     x0 = law.align(parts.initial, target)
     k2 = parts.observer.error_bound()
     listed, about, started = schedule(parts, ticks)
-    walk = draws.stream(seed, trial, DISTURBANCE_WALK)
+    walk = walk_stream(seed, trial)
     sensors, wheels = parts.sensors, actuators.wheels
 
     def period(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:

@@ -124,6 +124,11 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
+def walk_stream(seed: Whole, trial: Whole) -> draws.Key:
+    """The stream that a trial's random walk of the disturbance is drawn from."""
+    return draws.stream(seed, trial, DISTURBANCE_WALK)
+
+
 # One compiled program for all parts of the same structure.
 simulate_jit = programs.jit(simulate, static_argnames=("record", "software"))
 
@@ -133,7 +138,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = parts.observer.error_bound()
     listed, about, started = schedule(parts, ticks)
-    walk = draws.stream(seed, trial, DISTURBANCE_WALK)
+    walk = walk_stream(seed, trial)
 
     def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
         (now, *_), (state, world) = tick, carry

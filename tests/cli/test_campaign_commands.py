@@ -335,7 +335,7 @@ def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
     }[plant])  # fmt: skip
     code, said, _ = command("montecarlo", "o.toml", "--trials", 70)
     assert code in (0, 1)
-    assert "70 trials of seed 0" in said
+    assert "70 trials of seed 1000" in said
     frame = rows_of(tmp_path / "out/montecarlo-o")
     assert frame.height == 70
     assert ("initial_x3" if plant == "chain" else "disturbance_phase_3") in frame.columns

@@ -537,12 +537,12 @@ def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_le
 
 
 def test_map_leaves_what_the_contract_says(command, tmp_path):
-    pairs = ("--x", "controller.eta=2.7:3.0:2", "--y", "controller.delta=0.2:0.8:2")
+    pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.delta=0.2:0.8:2")
     status, out, _ = command("map", "s.toml", *pairs, "--trials", 2)
     assert status == 0
     assert "4 of 4 pairs flown" in out
     assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
-    again = "ptsmc map scenario.toml --x controller.eta=2.7:3.0:2 --y controller.delta=0.2:0.8:2 --trials 2 --seed 0"
+    again = "ptsmc map scenario.toml --x controller.eta=2.7:2.9:2 --y controller.delta=0.2:0.8:2 --trials 2 --seed 0"
     assert again in checked(tmp_path / "out" / "map-s").text
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.delta=0.2:0.8:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip

@@ -173,6 +173,9 @@ def test_what_is_no_controller_is_refused(tmp_path):
     other = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
     with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
         InTheLoop(library, other.parts)
+    slower = scenario.from_tables({**FLIGHTS["raw"], "loop": {**FLIGHTS["raw"]["loop"], "period": 0.2}})
+    with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be .* s, that of the controller in "):
+        InTheLoop(library, scenario.study(folder.flown(scenario.reading.complete(slower))).parts)
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
     with pytest.raises(ScenarioError, match="does not compile: "):
         Library(tmp_path / "controller")

@@ -54,12 +54,7 @@ def simulate(
         str | None,
         Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
     ] = None,
-    controller: Annotated[
-        Path | None,
-        Parameter(
-            name="--controller", help="Folder of `ptsmc export`, whose C is compiled and flies, on the flight clock."
-        ),
-    ] = None,
+    controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,

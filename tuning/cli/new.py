@@ -21,6 +21,8 @@ EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",
     "controller.code": "my_parts.py:MyLaw",
     "controller.delta": 0.5,
+    "controller.disturbance_bound": 0.01,
+    "controller.disturbance_rate_bound": 1e-3,
     "observer.code": "my_parts.py:MyObserver",
     "disturbance.code": "my_parts.py:MyDisturbance",
     "reference.code": "my_parts.py:MyReference",
