@@ -9,7 +9,7 @@ from common import SCENARIO, say  # noqa: E402
 
 from ptsmc_jax import scenario  # noqa: E402
 from tuning.search import gains  # noqa: E402
-from tuning.studies import tuner  # noqa: E402
+from tuning.studies import judging  # noqa: E402
 
 TUNED = {"eta": 2.861, "delta": 0.65, "observer_gain": 902.0, "k1": 6.63}  # for explicit sampling, as in the README
 
@@ -20,7 +20,7 @@ def main() -> None:
     for name, one in (("paper's gains", gains.papers(flight)), ("tuned", gains.in_scenario(flight, TUNED))):
         for sampling in ("explicit", "implicit"):
             flown = scenario.replace(one, controller__sampling=sampling)
-            trials = tuner.judge(flown, tuner.seed_of_judge(0), scenario.study(flown).requirements)
+            trials = judging.judge(flown, judging.seed_of_judge(0), scenario.study(flown).requirements)
             errors, peaks, chattering = (
                 np.asarray(getattr(trials.metrics, key)) for key in ("window_error", "peak_torque", "chattering")
             )
