@@ -41,8 +41,13 @@ class Controller:
         self.about = About(
             name, source, digest(self.scenario), type(law).__name__, self.board.parameters["filter"] is not None,
             self.board.spacecraft, device is not None and device.wheels is not None,
-            0 if device is None else device.delay,
+            0 if device is None else device.delay, float((law.t_f / (law.delta + self.period)) ** 2),
         )  # fmt: skip
+
+    @property
+    def period(self) -> float:
+        """Of control [s]."""
+        return float(self.ready.parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def flown(scenario: Scenario) -> Scenario:
@@ -122,8 +127,7 @@ def write_program(folder: Path, made: Controller) -> None:
     }
     for name, text in texts.items():
         store.write_text(folder / name, text)
-    period = float(made.ready.parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
-    layout = {"name": about.name, "digest": about.digest, "period": period, "columns": templates.columns(code)}
+    layout = {"name": about.name, "digest": about.digest, "period": made.period, "columns": templates.columns(code)}
     store.write_json(folder / "controller.json", layout)
 
 

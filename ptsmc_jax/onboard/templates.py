@@ -35,6 +35,7 @@ class About(NamedTuple):
     spacecraft: bool
     wheels: bool
     delay: int
+    steepness: float  # (t_f / time to go of the last sample before the hand-over)^2, by which gains grow until then
 
 
 def filled(file: str, **values: str) -> str:
@@ -304,7 +305,7 @@ def check(code: Code, about: About) -> str:
     names = [f"{kind}.{column}" for kind in ("out", "state") for column in lists[kind]]
     groups = {group: k for k, group in enumerate(dict.fromkeys(map(_compared, names)))}
     listed = ",\n".join(f'    {{"{name}", {groups[_compared(name)]}}}' for name in names)
-    return filled("check.c", name=about.name, listed=listed)
+    return filled("check.c", name=about.name, listed=listed, steepness=repr(about.steepness))
 
 
 def fuzz(code: Code, about: About) -> str:
