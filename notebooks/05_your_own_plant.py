@@ -100,7 +100,8 @@ except ptsmc.ScenarioError as error:
     print(error)
 
 # %% [markdown]
-# What flies may be another system than law and observer know: here the true pendulum is a tenth heavier.
+# What flies may be another system than law and observer know. Here the true pendulum is a tenth heavier; the observer
+# takes what that changes for a disturbance.
 
 # %%
 heavier = system(
@@ -139,7 +140,8 @@ class Scaling(ptsmc.AccelerationLaw):
 
 
 # %% [markdown]
-# It flies as the built-in one of that name does, on a spacecraft with a star tracker and a gyro, and on the pendulum.
+# On a spacecraft with a star tracker and a gyro it flies as the built-in one of that name does: the two lines are one.
+# The same class flies the pendulum.
 
 # %%
 flight = ptsmc.read("../scenarios/first_flight.toml")
