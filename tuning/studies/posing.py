@@ -25,11 +25,7 @@ class Posed:
     evaluate: Evaluator
     own: np.ndarray  # (gains,) of the scenario
     sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
-
-    @property
-    def asked(self) -> list[Requirement]:
-        """What the search keeps."""
-        return [r.implied_by for r in self.ready.requirements]
+    asked: list[Requirement]  # what the search keeps
 
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
@@ -55,7 +51,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
-    return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact)
+    return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact, asked=asked)
 
 
 def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
