@@ -301,7 +301,7 @@ def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> flo
     except ValueError:
         size = math.nan
     if name not in units or not math.isfinite(size):
-        example = f', or in words such as "0.05 {list(units)[1]}", in {", ".join(units)}' if units else ""
+        example = f', or in words such as "0.05 {[*units][:2][-1]}", in {", ".join(units)}' if units else ""
         raise wrong(key, value, keys.allowed(allowed) + (f" [{unit}]" if unit != "-" else "") + example)
     return _value(key, size * units[name], allowed)
 

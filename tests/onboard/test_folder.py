@@ -26,7 +26,13 @@ def short(tmp_path_factory):
 
 
 def make(place, *args):
-    return subprocess.run(["make", "-B", f"CC={CC}", *args], cwd=place, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        ["make", "--no-print-directory", "-B", f"CC={CC}", *args],
+        cwd=place,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 @needs_compiler
