@@ -20,11 +20,11 @@ types:
 	$(BIN)/pyright
 
 suite:
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder
 
 # what `test` leaves out: more cases of each kind, and what takes minutes
 test-long: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m long
+	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder -m long
 
 table: $(VENV)/.installed
 	$(BIN)/python -m tuning.studies.table

@@ -5,8 +5,8 @@ import os
 import sys
 from pathlib import Path
 
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 from ptsmc_jax.configure import configure
 from tests.tree import QUICKLY, ROOT, modules
@@ -21,12 +21,18 @@ jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# not what walks through programs, equation by equation: it took longer to check every call than to compile. Nor
-# folders, whose names would stand for all modules in them
+# modules that name shapes. Not what walks through programs, equation by equation: it took longer to check every call
+# than to compile. Nor folders, whose names would stand for all modules in them
 UNCHECKED = {f"ptsmc_jax.batching.{name}" for name in ("lanes", "components", "kernel")}
 UNCHECKED |= {f"ptsmc_jax.onboard.{name}" for name in ("control", "expressions", "printing", "rules", "translate")}
-checked = [name for name, path in modules().items() if name not in UNCHECKED and path.name != "__init__.py"]
-hook = install_import_hook(checked, "beartype.beartype")
+checked = [
+    name
+    for name, path in modules().items()
+    if name not in UNCHECKED and path.name != "__init__.py" and "from jaxtyping import" in path.read_text()
+]
+hook = jaxtyping.install_import_hook(checked, "beartype.beartype")
+# rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
+CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
 
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)
@@ -36,19 +42,41 @@ MANY = 25_000  # mappings of memory; Linux allows a process 65 530, and a compil
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
 LONGEST = """
-    cli/test_cli studies/test_compare studies/test_pareto search/test_tuning test_notebooks
-    campaigns/test_campaign_processes test_conformity cli/test_campaign_commands
+    cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements test_conformity
+    campaigns/test_plans search/test_tuning laws/test_chain cli/test_campaign_commands search/test_worst
+    batching/test_lanes simulation/test_rollout theory/test_margins dispersions/test_misfits plants/test_systems
+    devices/test_hardware paper/test_paper studies/test_mapping campaigns/test_montecarlo test_docs
+    campaigns/test_campaign_processes theory/test_covariance batching/test_kernel theory/test_theory
 """.split()
 TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # tune by the same programs, in one worker
 assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
 
 
-def pytest_collection_modifyitems(config, items):
-    """Files in the order of `LONGEST`, then the others; a worker for each file, or for those of `TOGETHER`."""
+def pytest_collection_modifyitems(items):
+    """Files in the order of `LONGEST`, then the others."""
     names = {item: item.path.relative_to(ROOT / "tests").with_suffix("").as_posix() for item in items}
     items.sort(key=lambda item: LONGEST.index(names[item]) if names[item] in LONGEST else len(LONGEST))
-    for item in items if config.pluginmanager.hasplugin("xdist") else ():
-        item.add_marker(pytest.mark.xdist_group("commands" if names[item] in TOGETHER else names[item]))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A worker for each file, or for those of `TOGETHER`: what it has compiled, and its fixtures, serve all its tests.
+
+    Not by marks of groups: of these xdist 3.8 writes into what pytest 9.2 does not read any more.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Files(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            name = nodeid.split("::")[0].removeprefix("tests/").removesuffix(".py")
+            return "commands" if name in TOGETHER else name
+
+    return Files(config, log)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _shapes_are_checked_where_a_thing_is_tested_by_itself(request):
+    jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in CALLERS)
 
 
 @pytest.fixture(autouse=True, scope="module")
