@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+import operator
 import re
 import runpy
 import shlex
@@ -19,6 +20,7 @@ from jaxtyping import Array
 import ptsmc_jax
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
+from tests.helpers import short
 from tests.scenario.test_schema import COMPLETE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
@@ -27,6 +29,7 @@ DOCS = ROOT / "docs"
 GENERATE = runpy.run_path(str(DOCS / "generate.py"))
 MADE, TITLES = GENERATE["PAGES"], GENERATE["PLANTS"]
 WRITTEN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+page_name = operator.attrgetter("name")
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.M | re.S)
 
 
@@ -86,7 +89,7 @@ def test_the_guide_names_every_command():
     assert not [command for command in COMMANDS if not re.search(rf"`(ptsmc )?{command}\b|ptsmc {command}\b", guide)]
 
 
-@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", WRITTEN, ids=page_name)
 def test_commands_in_the_text_exist(path):
     """Each line of a shell block that calls ptsmc is one that the command line takes; so is each `ptsmc ...`."""
     lines = [line.split("#")[0].strip() for block in blocks(path, "", "bash", "console") for line in block.splitlines()]
@@ -104,7 +107,7 @@ def test_commands_in_the_text_exist(path):
     assert set(re.findall(r"`(--[a-z][\w-]*)", text)) <= known
 
 
-@pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "toml")], ids=lambda path: path.name)
+@pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "toml")], ids=page_name)
 def test_scenarios_in_the_text_are_allowed(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks(path, "python"):
@@ -117,7 +120,7 @@ def test_scenarios_in_the_text_are_allowed(path, tmp_path, monkeypatch):
         from_tables(table)
 
 
-@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", WRITTEN, ids=page_name)
 def test_names_in_the_text_exist(path):
     """`module.name` of ours, and files."""
     text = FENCE.sub("", path.read_text())
@@ -131,7 +134,10 @@ def test_names_in_the_text_exist(path):
         assert (path.parent / link).exists(), link
 
 
-@pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "python")], ids=lambda path: path.name)
+CODED = [page for page in WRITTEN if blocks(page, "python")]
+
+
+@pytest.mark.parametrize("path", short(CODED, [page for page in CODED if page.name != "python.md"]), ids=page_name)
 def test_code_in_the_text_runs(path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
@@ -140,6 +146,7 @@ def test_code_in_the_text_runs(path, monkeypatch, capsys):
         exec(compile(block, str(path), "exec"), space)
 
 
+@pytest.mark.long
 def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_path):
     building = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
     done = subprocess.run(building, capture_output=True, text=True, cwd=ROOT, check=False)

@@ -57,6 +57,7 @@ FIELDS = Margins._fields[:5]  # that are margins
 
 
 @programs.jit(static_argnames=("sensors", "late"))
+@programs.jit(static_argnames=("sensors", "late"))
 def of_each(loops: Loop, sensors: bool = False, late: bool = True) -> Margins:
     """Margins of several loops, arrays over them first; see `of`."""
     return jax.lax.map(partial(of, sensors=sensors, late=late), loops)

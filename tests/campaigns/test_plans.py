@@ -20,7 +20,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
 from tests.helpers import vector
 
-SEED = 3
+SEED, FLOWN = 3, 50  # trials, so few that the program of two of them flies them
 EVERYTHING = """
 [controller]
 t_f = 3.0
@@ -67,7 +67,7 @@ def ready(text):
 def everything():
     """A campaign in which all is drawn that a spacecraft has, its rows and its plan."""
     made = campaign.Campaign(ready(EVERYTHING), SEED)
-    return made, made.fly(range(70)), made.draw(range(70))
+    return made, made.fly(range(FLOWN)), made.draw(range(FLOWN))
 
 
 def of_plan(made, table):
@@ -84,7 +84,7 @@ def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(everything, tmp_
         digests.add(plans.checked(plans.read(tmp_path / name), made.ready.parts).digest)
         assert again.plan is not None
         assert not again.plan.given  # the campaign's own program flies it
-        assert_frame_equal(again.fly(range(70)), frame, check_exact=True)
+        assert_frame_equal(again.fly(range(FLOWN)), frame, check_exact=True)
     assert len(digests) == 1
     # rows of a campaign are a plan, from which results are left out; those of some trials have these trials' noise
     some = of_plan(made, frame[[40, 7]])

@@ -77,8 +77,12 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     shares = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
     near = np.max(np.nan_to_num(shares, nan=WITHOUT, neginf=-1e9), axis=0)
     trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
-    coordinates = jax.vmap(lambda trial: asked.dispersion.coordinates(asked.seed, trial))(trials)
-    return replace(asked, coordinates=coordinates), max(float(near.max()), 0.0)
+    return replace(asked, coordinates=_drawn(asked.dispersion, asked.seed, trials)), max(float(near.max()), 0.0)
+
+
+@programs.jit
+def _drawn(dispersion: Dispersion, seed: Array, trials: Array) -> Coordinates:
+    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:
