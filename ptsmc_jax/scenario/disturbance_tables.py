@@ -256,15 +256,11 @@ class EachSinusoid(SinusoidDisturbance, frozen=True):
 
 
 class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
-    """A disturbance of one's own, a class derived from ptsmc_jax.Disturbance; its fields are further keys.
-
-    Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
-    """
+    """A disturbance of one's own, a class derived from ptsmc_jax.Disturbance; its fields are further keys."""
 
     kind: Literal["own"] = "own"
     code: Code
-    tuned: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ("__call__",)
 
     @classmethod
     def base(cls) -> type:
@@ -272,11 +268,6 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
         from ptsmc_jax.signals.disturbances import Disturbance
 
         return Disturbance
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """What it is at a time, in a state."""
-        return ("__call__",)
 
     def quickest(self) -> float:
         """As it says itself; nothing is known before its code is run."""

@@ -208,14 +208,12 @@ class EachFiniteTimeObserver(FiniteTimeObserver, frozen=True):
 
 
 class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
-    """An observer of one's own, a class derived from ptsmc_jax.SampledObserver; its fields are further keys.
-
-    Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
-    """
+    """An observer of one's own, a class derived from ptsmc_jax.SampledObserver; its fields are further keys."""
 
     kind: Literal["own"] = "own"
     code: Code
+    needs: ClassVar[tuple[str, ...]] = ("step",)
+    tuned: ClassVar[bool] = True
     prefix: ClassVar[str] = "observer_"
 
     @classmethod
@@ -224,11 +222,6 @@ class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
         from ptsmc_jax.observers.base import SampledObserver
 
         return SampledObserver
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """What it does in a period."""
-        return ("step",)
 
     def check(self, scenario: Any) -> None:
         """It is written for samples."""

@@ -25,25 +25,24 @@ Code = Annotated[Any, Meta(description=systems.WHERE)]
 
 
 class Own:
-    """What the tables of parts of one's own share, besides their key `code`."""
+    """What the tables of parts of one's own share; each declares the keys `kind` and `code`, as structs have to.
+
+    Attributes:
+        code: the class, "FILE.py:NAME" or "package.module:NAME"
+    """
 
     __slots__ = ()
-    waits: ClassVar[bool] = False  # until its code is run: it holds the keys that are not known yet in `rest`
+    needs: ClassVar[tuple[str, ...]] = ()  # methods of which the class must have one
+    tuned: ClassVar[bool] = False  # whether it may have gains
+    prefix: ClassVar[str] = ""  # of the names of its gains
     gains: ClassVar[Mapping[str, GainBounds]] = {}
     free_by_default: ClassVar[tuple[str, ...]] = ()
-    tuned: ClassVar[bool] = True  # whether it may have gains
+    waits: ClassVar[bool] = False  # until its code is run: it holds the keys that are not known yet in `rest`
     made: ClassVar[Any] = None  # the class that the code names
-
-    prefix: ClassVar[str] = ""  # of the names of its gains
 
     @classmethod
     def base(cls) -> type:
         """What such a class is derived from; loads JAX."""
-        raise NotImplementedError
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """Methods of which it must have one."""
         raise NotImplementedError
 
 
@@ -135,8 +134,8 @@ def read(table: Any, name: str, code: object) -> Any:
 @functools.lru_cache(maxsize=256)
 def _with_keys(table: Any, found: Any) -> Any:
     base = table.base()
-    if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs()):
-        raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs())}")
+    if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
+        raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
     for cls in reversed(found.__mro__):  # classes of one's own that it is derived from have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:

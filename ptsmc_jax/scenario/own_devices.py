@@ -10,14 +10,11 @@ class OwnSensors(Own, Table, kw_only=True, frozen=True):
     """Sensors of one's own, a class derived from ptsmc_jax.SampledSensor; its fields are further keys.
 
     They take the place of what [hardware] says of noise, and of [filter].
-
-    Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
     """
 
     kind: Literal["own"] = "own"
     code: Code
-    tuned: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ("see",)
 
     @classmethod
     def base(cls) -> type:
@@ -25,11 +22,6 @@ class OwnSensors(Own, Table, kw_only=True, frozen=True):
         from ptsmc_jax.devices.own_sensors import SampledSensor
 
         return SampledSensor
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """What they make of a state."""
-        return ("see",)
 
     def build(self, model: Any) -> Any:
         """What the code names, as the rollout asks for it."""
@@ -43,15 +35,11 @@ SENSORS: Kinds = {"own": OwnSensors}  # those that are built in are keys of [har
 
 
 class OwnDraw(Own, Table, kw_only=True, frozen=True):
-    """Anything of one's own, a class derived from ptsmc_jax.Draw; its fields are further keys.
-
-    Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
-    """
+    """Anything of one's own, a class derived from ptsmc_jax.Draw; its fields are further keys."""
 
     kind: Literal["own"] = "own"
     code: Code
-    tuned: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ("at",)
 
     @classmethod
     def base(cls) -> type:
@@ -59,11 +47,6 @@ class OwnDraw(Own, Table, kw_only=True, frozen=True):
         from ptsmc_jax.dispersions.base import Draw
 
         return Draw
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """What the numbers make of the parts."""
-        return ("at",)
 
     def build(self) -> Any:
         """What the code names."""

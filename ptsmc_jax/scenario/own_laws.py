@@ -15,12 +15,13 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
     """A law of one's own, a class derived from ptsmc_jax.AccelerationLaw; its further fields are further keys.
 
     Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
         delta: hand-over so long before t_f, if it has one; default: one control period [s]
     """
 
     kind: Literal["own"] = "own"
     code: Code
+    needs: ClassVar[tuple[str, ...]] = ("acceleration", "step", "command")
+    tuned: ClassVar[bool] = True
     delta: Positive | None = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"delta": gain_bounds.DELTA, "t_f": gain_bounds.T_F}
 
@@ -30,11 +31,6 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
         from ptsmc_jax.laws.acceleration import AccelerationLaw
 
         return AccelerationLaw
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """One of these."""
-        return "acceleration", "step", "command"
 
     def law(self) -> Any:
         """The class that the code names, with what tuning may move."""

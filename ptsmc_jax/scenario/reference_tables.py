@@ -149,15 +149,11 @@ class SlewReference(ReferenceTable, frozen=True):
 
 
 class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
-    """An attitude of one's own, a class derived from ptsmc_jax.Reference; its fields are further keys.
-
-    Attributes:
-        code: the class, "FILE.py:NAME" or "package.module:NAME"
-    """
+    """An attitude of one's own, a class derived from ptsmc_jax.Reference; its fields are further keys."""
 
     kind: Literal["own"] = "own"
     code: Code
-    tuned: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ("attitude",)
 
     @classmethod
     def base(cls) -> type:
@@ -165,11 +161,6 @@ class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
         from ptsmc_jax.signals.references import Reference
 
         return Reference
-
-    @classmethod
-    def needs(cls) -> tuple[str, ...]:
-        """What it is at a time."""
-        return ("attitude",)
 
     def frequencies(self) -> dict[str, float]:
         """As it says itself."""
