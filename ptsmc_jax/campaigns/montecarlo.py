@@ -11,7 +11,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.devices.sensors import RATE_BIAS, Sensors
+from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
@@ -110,10 +110,7 @@ def _values(
     found = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
     if dispersion.own is not None:
         found |= dispersion.own.values(coordinates[OWN])
-    if isinstance(drawn.sensors, Sensors) and (drawn.sensors.rate_bias is not None or RATE_BIAS in about.given):
-        bias = drawn.sensors.first_bias(about.seed, about.trial)
-        found |= {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
-    return found
+    return found if drawn.sensors is None else found | drawn.sensors.drawn(about.seed, about.trial)
 
 
 def run(

@@ -3,13 +3,14 @@
 seen, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ptsmc_jax.devices.sensors import Sensor
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws, guards
 from ptsmc_jax.numerics.draws import Whole
@@ -46,7 +47,7 @@ class SampledSensor:
 
 @pytree
 @dataclass(frozen=True)
-class OwnSensors:
+class OwnSensors(Sensor):
     """Sensors of one's own as the rollout asks for them: with noise that belongs to (seed, trial, sample)."""
 
     own: Any  # `SampledSensor`
@@ -69,3 +70,7 @@ class OwnSensors:
         there = now.t_next > now.t
         kept = jax.tree.map(lambda one, other: jnp.where(there, one, other), new, kept)
         return seen, (key, following, kept)
+
+    def quiet(self) -> "OwnSensors":
+        """Its standard normal numbers all zero."""
+        return replace(self, loud=0.0 * self.loud)

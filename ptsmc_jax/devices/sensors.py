@@ -6,8 +6,9 @@ its noise belongs to (seed, trial, sample). In the partial first period of the a
 is weighted by the period's share, so that nothing jumps where that period vanishes.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,16 +30,28 @@ ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
 
 
-class Sensor(Protocol):
-    """What the rollout asks of a sensor."""
+class Sensor(ABC):
+    """What the rollout, linear theory and campaigns ask of a sensor."""
 
+    @abstractmethod
     def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> Any:
         """Memory before the first sample of positive length, which is now."""
-        ...
 
+    @abstractmethod
     def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
         """The state as the law sees it, and the memory; dt: length of the period just ended [s]."""
-        ...
+
+    def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
+        """The state as it is read before any filter, and the memory; dt as in `measure` [s]."""
+        return self.measure(memory, x, now, dt)
+
+    @abstractmethod
+    def quiet(self) -> Any:
+        """The same without noise."""
+
+    def drawn(self, seed: Whole, trial: Whole) -> dict[str, Array]:
+        """What the sensor draws once a trial, by the names of a row's columns."""
+        return {}
 
 
 class Reading(NamedTuple):
@@ -67,7 +80,7 @@ class Memory(NamedTuple):
 
 @pytree
 @dataclass(frozen=True)
-class Sensors:
+class Sensors(Sensor):
     """Star tracker [rad] and gyro [rad/s] sampled once a period, white noise, independent per axis and sample.
 
     Without a filter the law sees the samples themselves; with one, its attitude and the gyro's rate less its bias.
@@ -165,6 +178,20 @@ class Sensors:
         estimate = self.filter.correct(ahead, read.q, self.star_weight(now))
         return AttitudeState(estimate.q, read.w - estimate.bias), kept._replace(estimate=estimate, rate=read.w)
 
+    def quiet(self) -> "Sensors":
+        """Without noise and bias; the filter's gains stay."""
+        known = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
+        none = jnp.zeros_like(jnp.asarray(self.attitude_noise))
+        quiet = replace(self, attitude_noise=none, rate_noise=none, filter=known)
+        return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
+
+    def drawn(self, seed: Whole, trial: Whole) -> dict[str, Array]:
+        """Bias of the gyro at the first sample [rad/s]."""
+        if self.rate_bias is None and self.given_bias is None:
+            return {}
+        bias = self.first_bias(seed, trial)
+        return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
+
     def moved(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
         """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""
         if memory.estimate is None:
@@ -196,7 +223,7 @@ class Sensors:
 
 @pytree
 @dataclass(frozen=True)
-class StateSensor:
+class StateSensor(Sensor):
     """All states sampled once a period, white noise in the states' own units, independent per state and sample."""
 
     sigma: Leaf  # (n,) 1 sigma of each state
@@ -219,6 +246,10 @@ class StateSensor:
         key, noise = memory
         noise_next = self.noise(key, now.sample + 1)
         return x + guards.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
+
+    def quiet(self) -> "StateSensor":
+        """Without noise."""
+        return replace(self, sigma=0.0 * self.sigma)
 
     def reading(self, period: float) -> Reading:
         """Every state, every period [s]."""

@@ -13,12 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.actuators import Actuators
-from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.dispersions.base import Drawn, Numbers, Quantity, UnfitError, numbered, positive
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.clock import Graded
 
 
 def _actuators(parts: Parts) -> Actuators:
@@ -32,7 +30,7 @@ def channels(parts: Parts) -> Float[Array, "m channels"]:
 
 
 def _size(parts: Parts) -> int:
-    return 0 if isinstance(parts.clock, Graded) else channels(parts).shape[1]
+    return channels(parts).shape[1] if parts.clock.sampled else 0
 
 
 def _paired(name: str, count: int) -> list[str]:
@@ -93,7 +91,7 @@ def _of_sensors(key: str, columns: list[str], nominal: list[float], checked: Any
         return jnp.asarray(nominal) if found is None else found
 
     return Quantity(
-        lambda parts: columns if isinstance(parts.sensors, Sensors) else [],
+        lambda parts: columns if hasattr(parts.sensors, key) else [],
         read,
         lambda parts, given: replace(parts, sensors=replace(parts.sensors, **{key: given})),
         checked,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas
-from ptsmc_jax.devices.sensors import RATE_BIAS, Sensors
+from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions.base import (
     DISTURBANCE_AMPLITUDE,
     DISTURBANCE_BIAS,
@@ -127,7 +127,7 @@ def _why_no_body(tensor: np.ndarray) -> str:
 
 def _inertia() -> Quantity:
     return Quantity(
-        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if isinstance(parts.plant, Spacecraft) else [],
+        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
         lambda parts: jnp.stack([parts.plant.inertia[i, j] for i, j in PAIRS]),
         _with_inertia,
         _inertia_checked,
@@ -181,7 +181,7 @@ def _rate_bias() -> Quantity:
         return jnp.zeros(3) if parts.sensors.given_bias is None else parts.sensors.given_bias
 
     return Quantity(
-        lambda parts: numbered(f"{RATE_BIAS}_", 3) if isinstance(parts.sensors, Sensors) else [],
+        lambda parts: numbered(f"{RATE_BIAS}_", 3) if hasattr(parts.sensors, "given_bias") else [],
         read,
         lambda parts, given: replace(parts, sensors=replace(parts.sensors, given_bias=given)),
     )

@@ -13,8 +13,6 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax.figures.style import RC, STYLES, TIME, figure_of
-from ptsmc_jax.laws.base import Prescribed
-from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.paper.remark_2 import Measured
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -24,7 +22,7 @@ from ptsmc_jax.theory.error_floor import Floor
 def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
     figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
-    if isinstance(parts.controller, Prescribed):
+    if parts.controller.prescribed:
         figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
@@ -62,7 +60,7 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
     figure, axes = figure_of("Error", symbol)
     size = np.linalg.norm(log.error, axis=1)
     axes.semilogy(log.t, np.maximum(size, 1e-16), color=STYLES[0][0], label="flown")
-    if isinstance(parts.controller, Prescribed):
+    if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, envelopes.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
     if floor is not None and floor.window_error > 0.0:
@@ -88,9 +86,8 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     """Delivered torque or input over time, its largest value marked, the limit drawn where one is given."""
     _, label, unit = _names(parts)
     figure, axes = figure_of(title or ("Control torque" if unit else "Control"), label)
-    held = not hasattr(parts.clock, "max_step")
-    _components(axes, log.t, log.u, "u", drawstyle="steps-post" if held else "default")
-    if isinstance(parts.controller, Prescribed):
+    _components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
+    if parts.controller.prescribed:
         t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
         axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
         axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
@@ -137,7 +134,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
     """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
     figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
     _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
-    if isinstance(parts.controller, Prescribed):
+    if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(
             before, envelopes.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise"
@@ -229,8 +226,7 @@ def _names(parts: Parts) -> tuple[str, str, str]:
     """Labels of the error and the input, and the input's unit behind a number."""
     if not parts.plant.attitude:
         return "$|x_1|$", "input u", ""
-    additive = isinstance(parts.controller, PrescribedTime)
-    return "|$\\varepsilon_1$| [-]" if additive else "|v| [-]", "torque [N m]", " N m"
+    return "|$\\varepsilon_1$| [-]" if parts.controller.additive else "|v| [-]", "torque [N m]", " N m"
 
 
 def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:

@@ -47,6 +47,7 @@ class Law(ErrorMotion):
     t_f: Leaf  # prescribed time, or when the error is judged [s]
     delta: Leaf  # hand-over this long before t_f [s]
     tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
+    prescribed: ClassVar[bool] = False  # one of the paper's: its exact solution and its bounds are known
 
     @property
     def hand_over(self) -> Scalar:
@@ -97,6 +98,7 @@ class Prescribed(Law):
     # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
+    prescribed: ClassVar[bool] = True
 
     def landing(self, now: Sample, s: Vector, power: Scalar, pull: Scalar, reach: Scalar) -> Vector:
         """Where s is to be at the end of the period that begins, implicit (backward Euler) sampling; (m,).

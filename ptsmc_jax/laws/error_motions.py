@@ -3,7 +3,7 @@
 A law knows one of these; what it wants of eps'' is turned into the plant's input.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -27,6 +27,7 @@ class ErrorMotion:
     """
 
     model: Any  # the nominal plant
+    additive: ClassVar[bool] = False  # the paper's q_1 - q_1f, singular where the body is, wherever the reference is
 
     def align(self, x: Any, target: Any) -> Any:
         """The initial state in the form that the law can bring to the target."""
@@ -69,6 +70,7 @@ class ErrorVector(ErrorMotion):
     """The paper's eps_1 = q_1 - q_1f (4); singular at q4 = 0, see `prescribed_time.PrescribedTime`."""
 
     model: Spacecraft
+    additive: ClassVar[bool] = True
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """The same attitude with the sign of q for which q4 q_f4 >= 0: the law cannot cross q4 = 0."""

@@ -60,6 +60,8 @@ class Observer(ABC):
 
     model: Plant  # the nominal plant
     tunable: ClassVar[tuple[str, ...]] = ()  # fields that tuning may move, besides `gain`
+    estimates: ClassVar[bool] = True  # the disturbance
+    linear: ClassVar[bool] = False  # the estimate is linear in what is measured, and its bound inverse to the gain
 
     def begin(self) -> Memory:
         """Memory at t = 0: d_hat = 0 [N m]."""
@@ -144,6 +146,7 @@ class Linear(Observer):
     gain: Leaf  # (m,) diagonal of l [N m s, so that l J^-1 is in 1/s]
     disturbance_rate_bound: Leaf  # c of Assumption 1, bound on each component of d' [N m/s]
     initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
+    linear: ClassVar[bool] = True
 
     def _slope(self) -> Matrix:
         """The matrix l J^-1 [1/s]."""

@@ -1,6 +1,7 @@
 """No observer: the estimate is zero, and K switches against the whole disturbance."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -23,6 +24,8 @@ class NoObserver(Observer):
     """
 
     disturbance_bound: Leaf  # K of Assumption 1 [N m]
+    estimates: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
 
     def error_bound(self) -> ErrorBound:
         """sqrt(m) K at all times."""

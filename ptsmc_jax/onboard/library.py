@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.devices.actuators import ActuatorState
-from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.onboard.board import board
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.templates import STATUS
@@ -165,14 +164,13 @@ class InTheLoop:
         (now, dt_before, _), (sensing, state) = period, computer.sensing
         read = x
         if parts.sensors is not None:
-            sample = parts.sensors.sample if isinstance(parts.sensors, Sensors) else parts.sensors.measure
-            read, sensing = sample(sensing, x, now, dt_before)
+            read, sensing = parts.sensors.sample(sensing, x, now, dt_before)
         known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             known["applied"] = computer.applied[0]
         if self.board.spacecraft:
             known |= {"attitude": read.q, "rate": read.w}
-        if isinstance(parts.sensors, Sensors):
+        if hasattr(parts.sensors, "star_weight"):
             known["attitude_valid"] = (parts.sensors.star_weight(now) > 0.0).astype(float)
         given = jnp.concatenate([now.t[None], *(jnp.ravel(known[name]) for name in self.board.inputs)])
         after, out = self._stepped(state, given)

@@ -9,7 +9,6 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators
-from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.board import Board
@@ -63,8 +62,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         there, sensing = parts.plant.seen(x), computer.sensing
         measured = there
         if sensors is not None:
-            read = sensors.sample if isinstance(sensors, Sensors) else sensors.measure
-            measured, _ = read(sensing, there, now, dt_before)
+            measured, _ = sensors.sample(sensing, there, now, dt_before)
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
         (target, d_hat, u, s, w, _), computer = decide(parts, k2, about(tick), computer, there)

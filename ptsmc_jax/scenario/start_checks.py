@@ -9,9 +9,6 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
-from ptsmc_jax.laws.base import Prescribed
-from ptsmc_jax.laws.error_motions import ErrorVector
-from ptsmc_jax.observers.none import NoObserver
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import attitude_keys, errors
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -25,7 +22,7 @@ def system(scenario: Any, parts: Parts) -> None:
     """Refuse a system that the law, or the observer, cannot invert where it starts."""
     start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
     matrices = {"dF/dx2 G": plant.slope(*start) @ plant.input_gain(*start)}
-    if not isinstance(parts.observer, NoObserver):
+    if parts.observer.estimates:
         matrices["D"] = plant.disturbance_gain(*start)
     for name, matrix in matrices.items():
         if not np.linalg.cond(np.asarray(matrix)) < SINGULAR_CONDITION:
@@ -42,7 +39,7 @@ _OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is sing
 
 def reference(scenario: Any, parts: Parts) -> None:
     """Refuse a reference on which the additive law meets its singularity."""
-    if not isinstance(parts.controller, ErrorVector):
+    if not parts.controller.additive:
         return
     grid = np.linspace(0.0, float(parts.t_end), 4001)
     held = np.asarray(_scalar_part(parts, grid))
@@ -65,11 +62,11 @@ def _scalar_part(parts: Parts, times: Array) -> Array:
 
 def attitude(scenario: Any, parts: Parts) -> None:
     """Refuse an initial attitude from which the law meets its singularity on the way."""
-    additive, law = isinstance(parts.controller, ErrorVector), parts.controller
-    singular, name = (_SINGULAR, "|q4|") if additive else (_OPPOSITE, "|q_e4|")
+    law = parts.controller
+    singular, name = (_SINGULAR, "|q4|") if law.additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {errors.brief(value)}"
-    if isinstance(law, Prescribed):
+    if law.prescribed:
         times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # of the others only the start is known
         target = parts.reference(jnp.zeros_like(parts.t_end))

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
-from ptsmc_jax.laws.base import SecondOrder
 from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
@@ -84,9 +83,8 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
 
 def steps(parts: Parts) -> int:
     """Integration steps of a run."""
-    ticks = parts.clock
-    count = ticks.count if isinstance(ticks, clock.Flight) else ticks.before + ticks.after
-    return count * parts.substeps
+    ticks: Any = parts.clock
+    return ticks.count * parts.substeps
 
 
 def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
@@ -154,7 +152,7 @@ def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
 def _on_the_papers_way(setup: Setup) -> Setup:
     """The parts under the paper's law, whose way is known: for any other one it says which states a run comes by."""
     law = setup.controller
-    if isinstance(law, SecondOrder):
+    if law.prescribed:
         return setup
     gains = (vector(v) for v in (3.0, law.delta, 1.0, 1e-3, 1.0))  # eta, delta, K1, width of the sign, surface rate
     return dataclasses.replace(setup, controller=PrescribedTimeSystem(law.model, law.t_f, *gains))

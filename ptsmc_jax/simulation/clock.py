@@ -5,7 +5,9 @@ intervals that lie before t = 0 or after t_end have length zero and count for no
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +43,17 @@ class Anchored:
     t_end: Leaf  # [s]
     before: int = field(metadata={"static": True})  # samples before the hand-over, at least t_s / period
     after: int = field(metadata={"static": True})  # samples from the hand-over on
+    sampled: ClassVar[bool] = True
+    anchored: ClassVar[bool] = True
+
+    @property
+    def count(self) -> int:
+        """How many samples there are."""
+        return self.before + self.after
+
+    def long_enough_for(self, others: Sequence["Anchored"]) -> "Anchored":
+        """The same with as many samples on either side of the hand-over as the longest of these."""
+        return replace(self, before=max(one.before for one in others), after=max(one.after for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
@@ -61,6 +74,12 @@ class Flight:
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
     count: int = field(metadata={"static": True})  # samples, at least t_end / period
+    sampled: ClassVar[bool] = True
+    anchored: ClassVar[bool] = False
+
+    def long_enough_for(self, others: Sequence["Flight"]) -> "Flight":
+        """The same with as many samples as the longest of these."""
+        return replace(self, count=max(one.count for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
@@ -84,6 +103,12 @@ class Graded:
     saves: Leaf  # (m,) further nodes [s]
     before: int = field(metadata={"static": True})  # steps before the hand-over, more than t_s / max_step
     after: int = field(metadata={"static": True})  # steps after it
+    sampled: ClassVar[bool] = False
+    anchored: ClassVar[bool] = False
+
+    def long_enough_for(self, others: Sequence["Graded"]) -> "Graded":
+        """The same: its number of steps follows from its own accuracy."""
+        return self
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Integration steps for this prescribed time and delta [s]."""

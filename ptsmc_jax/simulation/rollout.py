@@ -19,7 +19,6 @@ from ptsmc_jax.numerics.draws import Whole
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
@@ -112,9 +111,9 @@ def simulate(
     clearance = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
     arrival = parts.reference(criteria.t_f)
     course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(clearance), _gap(ticks, parts.t_end))
-    if isinstance(parts.clock, Graded):
-        return _continuous(parts, ticks, course, record)
-    return _sampled(parts, ticks, course, seed, trial, record, software)
+    if parts.clock.sampled:
+        return _sampled(parts, ticks, course, seed, trial, record, software)
+    return _continuous(parts, ticks, course, record)
 
 
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:

@@ -29,7 +29,6 @@ from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
@@ -63,7 +62,7 @@ class Model(NamedTuple):
 def along(parts: Parts, log: Log) -> Floor:
     """The floor along a run with this history (`rollout.simulate`, record=True)."""
     ticks, log = _lasting(parts, log)
-    if isinstance(parts.clock, Graded) or (parts.sensors is None and parts.walk_rate is None):
+    if not parts.clock.sampled or (parts.sensors is None and parts.walk_rate is None):
         return Floor(0.0, ticks.t_next, np.zeros_like(ticks.t_next))
     delay = 0 if parts.actuators is None else parts.actuators.delay
     seen = deviations(_model(parts, log, ticks), delay)

@@ -25,8 +25,6 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState
-from ptsmc_jax.devices.own_sensors import OwnSensors
-from ptsmc_jax.devices.sensors import Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.assembly import Parts
@@ -81,16 +79,7 @@ class Nominal(NamedTuple):
 
 def quiet(parts: Parts) -> Parts:
     """The parts without noise and disturbance."""
-    sensors: Any = parts.sensors
-    if isinstance(sensors, Sensors):
-        known = sensors.filter and replace(sensors.filter, spread=0.0 * sensors.filter.spread)
-        none = jnp.zeros_like(jnp.asarray(sensors.attitude_noise))
-        sensors = replace(sensors, attitude_noise=none, rate_noise=none, filter=known)
-        sensors = replace(sensors, rate_bias=None, bias_rate=None, given_bias=None)
-    elif isinstance(sensors, StateSensor):
-        sensors = replace(sensors, sigma=0.0 * sensors.sigma)
-    elif isinstance(sensors, OwnSensors):
-        sensors = replace(sensors, loud=0.0 * sensors.loud)
+    sensors = None if parts.sensors is None else parts.sensors.quiet()
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
     return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
 
@@ -101,7 +90,7 @@ def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
 
 def nominal(parts: Parts) -> Nominal:
     """The nominal run of sampled parts."""
-    assert not isinstance(parts.clock, clock.Graded)
+    assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     listed, about, started = schedule(parts, ticks)

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.simulation.clock import Anchored
 from tuning.search.abreast import Ask, in_step
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
@@ -303,7 +302,7 @@ class Descents:
         A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
         """
         clock, bounds = problem.parts.clock, self._evaluate.bounds
-        if "delta" not in problem.names or not isinstance(clock, Anchored):
+        if "delta" not in problem.names or not clock.anchored:
             return []
         named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
         t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)

@@ -13,17 +13,14 @@ from jax import core
 from jaxtyping import Array
 
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax.devices.sensors import Sensors
 from ptsmc_jax.scenario import disturbance_bounds, keys, reading
 from ptsmc_jax.scenario.baseline_tables import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.layouts import SCENARIOS
-from ptsmc_jax.scenario.observer_tables import NonlinearObserver
 from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.clock import Anchored
 from ptsmc_jax.simulation.rollout import Parts
 
 _AXIS = "observer_gain_"
@@ -101,8 +98,8 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     if each is not None:
         parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
     if "filter_bandwidth" in gains:
-        assert isinstance(parts.sensors, Sensors)
-        sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        known: Any = parts
+        sensors = known.sensors.with_bandwidth(gains["filter_bandwidth"], known.clock.period)
         parts = replace(parts, sensors=sensors)
     if "command_corner" in gains:
         assert parts.command_filter is not None
@@ -112,8 +109,9 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
 
 def _check_clock(parts: Parts) -> None:
-    clock, law = parts.clock, parts.controller
-    if not isinstance(clock, Anchored):
+    clock: Any = parts.clock
+    law = parts.controller
+    if not clock.anchored:
         return
     times = [law.t_f, law.delta, parts.t_end, clock.period]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
@@ -139,7 +137,7 @@ def gains_of(parts: Parts) -> dict[str, float]:
         gains["observer_gain"] = sum(each) / len(each)
     gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
-    if isinstance(parts.sensors, Sensors) and parts.sensors.filter is not None:
+    if getattr(parts.sensors, "filter", None) is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
     if parts.command_filter is not None:
         gains["command_corner"] = float(parts.command_filter.corner)
@@ -182,7 +180,7 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     if scenario.motion == "chain":
         gains["eta"] = scenario.order + 1.0
     gain = {"observer_gain": disturbance_bounds.observer_gain(scenario)}
-    return {**gains, **gain} if isinstance(scenario.observer, NonlinearObserver) else gains
+    return {**gains, **gain} if scenario.observer.kind == "nonlinear" else gains
 
 
 def papers(scenario: Scenario) -> Scenario:

@@ -6,8 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.base import Prescribed
-from ptsmc_jax.observers.base import Linear
 from ptsmc_jax.scenario import free_gains
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
@@ -91,7 +89,7 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
     hop = 0.0
     if "sign_width" in names and _hops(scenario, parts):
         hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
-        if isinstance(parts.observer, Linear) and any(gain_names.base(name) == "observer_gain" for name in names):
+        if parts.observer.linear and any(gain_names.base(name) == "observer_gain" for name in names):
             hop *= float(parts.observer.gain.min())
         else:  # it does not move with a gain
             low, high = intervals["sign_width"]
@@ -102,7 +100,7 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
 
 def _hops(scenario: Scenario, parts: Parts) -> bool:
     """Whether the sign may be so narrow that it hops, by a bound that is nobody's but the usual one."""
-    if scenario.loop.mode != "sampled" or not isinstance(parts.controller, Prescribed):
+    if scenario.loop.mode != "sampled" or not parts.controller.prescribed:
         return False
     assert scenario.tune is not None
     return scenario.tune.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]

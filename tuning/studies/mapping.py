@@ -10,14 +10,10 @@ from contourpy import contour_generator
 
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.laws.base import Prescribed
-from ptsmc_jax.observers.base import Linear
-from ptsmc_jax.observers.none import NoObserver
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.simulation.clock import Anchored, Flight
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins
 
@@ -148,18 +144,8 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
 
 def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
     """What gives all parts clocks of one size and one number of substeps, so that one program flies them all."""
-    substeps = max(p.substeps for p in parts)
-
-    def fit(one: Parts) -> Parts:
-        timing = one.clock
-        if isinstance(timing, Flight):
-            timing = replace(timing, count=max(p.clock.count for p in parts if isinstance(p.clock, Flight)))
-        elif isinstance(timing, Anchored):
-            sizes = [(p.clock.before, p.clock.after) for p in parts if isinstance(p.clock, Anchored)]
-            timing = replace(timing, before=max(b for b, _ in sizes), after=max(a for _, a in sizes))
-        return replace(one, clock=timing, substeps=substeps)
-
-    return fit
+    substeps, clocks = max(p.substeps for p in parts), [p.clock for p in parts]
+    return lambda one: replace(one, clock=one.clock.long_enough_for(clocks), substeps=substeps)
 
 
 def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
@@ -175,14 +161,14 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     parts = common(ready.parts)
-    if ready.scenario.loop.mode == "sampled" and isinstance(parts.controller, Prescribed):
+    if ready.scenario.loop.mode == "sampled" and parts.controller.prescribed:
         ends = margins.at_ends(parts)
         (at, radius), (hold, after) = ends["hand_over"], ends["hold"]
         known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
         known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
         known["hold_radius"] = after
         read = parts.sensors is not None and hasattr(parts.sensors, "reading")
-        if read and isinstance(parts.observer, NoObserver | Linear) and radius < 1.0:
+        if read and parts.observer.linear and radius < 1.0:
             expected = covariance.noise(parts)
             known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **known)

@@ -9,7 +9,6 @@ import numpy as np
 
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.laws.base import Prescribed
 from ptsmc_jax.scenario import free_gains, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -141,7 +140,7 @@ def tune(
     verdicts = judging.verdicts_of(tuned, fresh["tuned"], fresh_seed)
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
-    if limit is not None and T_F not in problem.names and isinstance(ready.parts.controller, Prescribed):
+    if limit is not None and T_F not in problem.names and ready.parts.controller.prescribed:
         shortest = shortest_time(tuned, limit, fresh_seed, fresh["tuned"].trial)
     believed, beyond = None, {}
     at_bound = evaluate.bounds.at_bound(found.gains)
