@@ -23,7 +23,7 @@ HOUSE = {
         "plants": "base | integrator_chain rigid_body second_order | flexible_body",
         "signals": "disturbances references",
         "laws": """
-            error_motions
+            closed_forms error_motions
             base
             acceleration prescribed_time
             fixed_time pd predefined_time scaling super_twisting terminal time_base

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax import formulas
+from ptsmc_jax.laws.closed_forms import exact_error
 from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf
@@ -119,6 +120,17 @@ class Prescribed(Law):
         """What is left to t_f at the end of the period that begins [s]; 1 after the hand-over. Never quite nothing."""
         return jnp.where(now.hold, 1.0, jnp.maximum(self.t_f - now.t - now.dt, 1e-9 * now.dt))
 
+    def exact(self, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
+        """The error and s, (m,) each, of the exact motion at t [s] before the hand-over.
+
+        start: each component of the error and its derivatives at t = 0, `derivatives`.
+        """
+        raise NotImplementedError
+
+    def exact_motion(self, t: Scalar, target: Any, start: Any, errors: Float[Array, "m n"]) -> Motion:
+        """What the plant does then; target: at t, start: the initial state, errors: its `derivatives`."""
+        raise NotImplementedError
+
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
 
@@ -170,6 +182,16 @@ class SecondOrder(Prescribed):
     def surface(self) -> Float[Array, "1"]:
         """(c,) [1/s]."""
         return jnp.reshape(self.surface_rate, 1)
+
+    def exact(self, t: Scalar, start: Float[Array, "m 2"]) -> tuple[Vector, Vector]:
+        """The error [-] and s, (m,) each."""
+        found = exact_error(t, self.t_f, self.eta, start[:, 0], start[:, 1])
+        return found.error, found.s
+
+    def exact_motion(self, t: Scalar, target: Any, start: Any, errors: Float[Array, "m 2"]) -> Motion:
+        """By `motion`."""
+        wanted = exact_error(t, self.t_f, self.eta, errors[:, 0], errors[:, 1])
+        return self.motion(target, start, wanted.error, wanted.error_rate, wanted.acceleration)
 
     def motion(self, target: Any, start: Any, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
         """State and w' for which the error and its derivatives are these; start: the initial state, for branches."""

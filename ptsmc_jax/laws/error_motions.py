@@ -45,6 +45,10 @@ class ErrorMotion:
         """What is driven to zero, (m,), and its derivative."""
         raise NotImplementedError
 
+    def derivatives(self, x: Any, target: Any) -> Float[Array, "m n"]:
+        """Each component of the error and its derivatives, n the order of its motion."""
+        return jnp.stack(self.errors(x, target), axis=1)
+
     def angle(self, x: Any, target: Any) -> Scalar:
         """What settles: the angle to the reference [rad], for other plants |x_1|."""
         raise NotImplementedError
@@ -199,6 +203,10 @@ class ErrorOfChain(ErrorMotion):
     def errors(self, x: State, target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """x_1 and x_2, (1,) each: the origin is the target."""
         return x[:1], x[1:2]
+
+    def derivatives(self, x: State, target: Any) -> Float[Array, "1 n"]:
+        """The state: x_1 and its derivatives."""
+        return x[None]
 
     def angle(self, x: State, target: Any) -> Scalar:
         """|x_1|."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ptsmc_jax.laws.base import Motion, Prescribed, Sample, SecondOrder
+from ptsmc_jax.laws.closed_forms import exact_chain, expansion
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
 from ptsmc_jax.numerics import attitude, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
@@ -126,17 +127,6 @@ class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
         return 0.5 * jnp.max(jax.vmap(self.influence)(states, times)) * k2
 
 
-def expansion(eta: Scalar, order: int) -> list[Scalar]:
-    """c_0 .. c_(n-1) of (37) for order n, c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i) [-].
-
-    The paper only calls them expansion parameters (and says "expand (35)" for (36)). Order 2: (eta, 1), which is (7).
-    """
-    rising = [jnp.ones_like(eta)]
-    for k in range(order - 1):
-        rising.append(rising[-1] * (eta + k))
-    return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
-
-
 @pytree
 @dataclass(frozen=True)
 class PrescribedTimeChain(ErrorOfChain, Prescribed):
@@ -197,6 +187,16 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         landed = self.landing(now, s, self.eta + n - 2, self.k1, g * k2)
         u = ((landed - s_0) / g - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, s, memory
+
+    def exact(self, t: Scalar, start: Float[Array, "1 n"]) -> tuple[Vector, Vector]:
+        """x_1 and s, (1,) each."""
+        motion = exact_chain(t, self.t_f, self.eta, start[0])
+        return motion.x[:1], jnp.reshape(motion.s, 1)
+
+    def exact_motion(self, t: Scalar, target: Any, start: Float[Array, " n"], errors: Float[Array, "1 n"]) -> Motion:
+        """State and x_n'; a chain is nowhere singular."""
+        motion = exact_chain(t, self.t_f, self.eta, errors[0])
+        return Motion(motion.x, jnp.reshape(motion.acceleration, 1), jnp.ones_like(t))
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
         """K2."""

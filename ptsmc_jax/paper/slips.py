@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws import closed_forms, prescribed_time
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.observers import nonlinear
@@ -61,7 +61,7 @@ def _expansion() -> Slip:
         for _ in range(n - 1):
             derivative, states = jax.grad(derivative), jax.grad(states)
             whole.append(states(t))
-        c = prescribed_time.expansion(jnp.asarray(eta), n)
+        c = closed_forms.expansion(jnp.asarray(eta), n)
         tau = t_f - t
         s = sum(c[i] * tau**i * whole[i] for i in range(n))
         worst = max(worst, abs(float(derivative(t) * tau ** (eta + n - 1) / s - 1.0)))

@@ -7,7 +7,7 @@ intervals that lie before t = 0 or after t_end have length zero and count for no
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ class Anchored:
         """How many samples there are."""
         return self.before + self.after
 
-    def long_enough_for(self, others: Sequence["Anchored"]) -> "Anchored":
+    def long_enough_for(self, others: Sequence[Any]) -> "Anchored":
         """The same with as many samples on either side of the hand-over as the longest of these."""
         return replace(self, before=max(one.before for one in others), after=max(one.after for one in others))
 
@@ -77,7 +77,7 @@ class Flight:
     sampled: ClassVar[bool] = True
     anchored: ClassVar[bool] = False
 
-    def long_enough_for(self, others: Sequence["Flight"]) -> "Flight":
+    def long_enough_for(self, others: Sequence[Any]) -> "Flight":
         """The same with as many samples as the longest of these."""
         return replace(self, count=max(one.count for one in others))
 
@@ -106,7 +106,7 @@ class Graded:
     sampled: ClassVar[bool] = False
     anchored: ClassVar[bool] = False
 
-    def long_enough_for(self, others: Sequence["Graded"]) -> "Graded":
+    def long_enough_for(self, others: Sequence[Any]) -> "Graded":
         """The same: its number of steps follows from its own accuracy."""
         return self
 

@@ -7,9 +7,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
-from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.simulation.rollout import Parts
-from ptsmc_jax.theory.solutions import _start, _surface, starts, state_envelope, visited
+from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
@@ -32,11 +31,8 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
 @programs.jit
 def _outset(parts: Parts) -> Scalar:
     """s0, the 2-norm of s at t = 0."""
-    law = parts.controller
-    if isinstance(parts.plant, Chain):
-        return jnp.abs(_surface(law.t_f, law.eta, parts.initial))
-    error, error_rate = _start(parts)
-    return jnp.linalg.norm(law.t_f * error_rate + law.eta * error)
+    _, s = parts.controller.exact(jnp.zeros_like(parts.t_end), starts(parts))
+    return jnp.linalg.norm(s)
 
 
 def switching_rate(parts: Parts) -> float:

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.formulas import surface_roots
+from ptsmc_jax.laws.closed_forms import ChainMotion
 from ptsmc_jax.numerics import guards, integrators
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes, solutions
-from ptsmc_jax.theory.solutions import ChainMotion
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]

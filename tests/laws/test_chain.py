@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from ptsmc_jax import formulas
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws import closed_forms
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
@@ -69,8 +69,8 @@ def test_surface_is_the_derivative_that_defines_it(n):
     at = jnp.stack([state(t) for state in states])
     _, s = torque(law, vector(t), BEFORE, at, None, jnp.zeros(1), vector(0.0))
     np.testing.assert_allclose(s[0], derivative(t) * (t_f - t) ** (eta + n - 1), rtol=1e-11)
-    assert [float(c) for c in prescribed_time.expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
-    assert [float(c) for c in prescribed_time.expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
+    assert [float(c) for c in closed_forms.expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
+    assert [float(c) for c in closed_forms.expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])

@@ -9,7 +9,8 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem, expansion
+from ptsmc_jax.laws.closed_forms import expansion
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError

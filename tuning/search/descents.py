@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -301,7 +302,8 @@ class Descents:
 
         A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
         """
-        clock, bounds = problem.parts.clock, self._evaluate.bounds
+        clock: Any = problem.parts.clock
+        bounds = self._evaluate.bounds
         if "delta" not in problem.names or not clock.anchored:
             return []
         named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")

@@ -1,0 +1,112 @@
+"""Exact motions of Theorems 1 to 3 before the hand-over, without sampling, noise and switching: pure formulas."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " n"]
+
+
+class ExactError(NamedTuple):
+    """Attitude error vector, its derivatives and s before the hand-over."""
+
+    error: Array  # [-]
+    error_rate: Array  # [1/s]
+    s: Array  # [-]
+    acceleration: Array  # [1/s^2]
+
+
+class ChainMotion(NamedTuple):
+    """States of a chain, s, and x_n'."""
+
+    x: Array  # (n,)
+    s: Array
+    acceleration: Array  # x_n', the input where f = 0, g = 1 and d = 0
+
+
+def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: Vector) -> ExactError:
+    """Closed form of the second-order law before the hand-over, for each component of the attitude error vector.
+
+    x(t) = r^eta (x(0) + s(0) L), s(t) = s(0) r^eta, s(0) = t_f x'(0) + eta x(0). t, t_f [s], t < t_f; error and
+    error_rate are those at t = 0.
+    """
+    tau = t_f - t
+    r = tau / t_f
+    s0 = t_f * error_rate + eta * error
+    decay = r**eta
+    x, s = decay * (error - s0 * jnp.log(r)), s0 * decay
+    x_dot = (s - eta * x) / tau
+    return ExactError(x, x_dot, s, -(eta - 1.0) * x_dot / tau - eta * s / tau**2)
+
+
+def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
+    """Closed form of law (52) on a chain of any order n before the hand-over, d = 0 and K = 0; x0: (n,) at t = 0.
+
+    In the states' own units; s(t) = s(0) r^(eta+n-2), and y = x_1 / tau^eta obeys y^(n-1) = s(0) t_f^-(eta+n-2) / tau,
+    integrated n-1 times.
+    """
+    n = x0.shape[0]
+    s0 = surface_at_start(t_f, eta, x0)
+    y = [free + s0 * forced for free, forced in zip(*modes(t, t_f, eta, x0), strict=True)]
+    x = from_modes(t, t_f, eta, y)
+    return ChainMotion(jnp.stack(x[:n]), s0 * ((t_f - t) / t_f) ** (eta + n - 2), x[n])
+
+
+def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
+    """The surface s of (37) at t = 0."""
+    c = expansion(eta, x.shape[0])
+    return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
+
+
+def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
+    """y, y', .. y^(n) of y = x_1 / r^eta: what the initial state gives, and what s(0) = 1 gives besides."""
+    n, tau = x0.shape[0], t_f - t
+    rising = [jnp.ones_like(eta)]
+    for k in range(n):
+        rising.append(rising[-1] * (eta + k))
+    start = [
+        sum((math.comb(k, j) * x0[j] * rising[k - j] * t_f ** (j - k) for j in range(k + 1)), jnp.zeros_like(t))
+        for k in range(n - 1)
+    ]
+    free, forced = [], []
+    for j in range(n + 1):
+        terms = (start[k] * t ** (k - j) / math.factorial(k - j) for k in range(j, n - 1))
+        free.append(sum(terms, jnp.zeros_like(t)))
+        gained = _integral(t, t_f, n - 2 - j) if j < n - 1 else tau ** (n - 2 - j)
+        forced.append(t_f ** (2 - n) * gained)
+    return free, forced
+
+
+def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
+    """Integral over 0 < u < t of (t - u)^p / p! / (t_f - u) [s^p]."""
+    tau = t_f - t
+    total = (-tau) ** p * jnp.log(t_f / tau)
+    for j in range(1, p + 1):
+        total += math.comb(p, j) * (-tau) ** (p - j) * (t_f**j - tau**j) / j
+    return total / math.factorial(p)
+
+
+def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda v: v) -> list[Scalar]:
+    """x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule; size = abs: bounds on them from bounds on y."""
+    r = (t_f - t) / t_f
+    falling = [jnp.ones_like(eta)]
+    for k in range(len(y)):
+        falling.append(-falling[-1] * (eta - k))
+    slopes = [size(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
+    return [
+        sum((math.comb(k, j) * slopes[k - j] * y[j] for j in range(k + 1)), jnp.zeros_like(r)) for k in range(len(y))
+    ]
+
+
+def expansion(eta: Scalar, order: int) -> list[Scalar]:
+    """c_0 .. c_(n-1) of (37) for order n, c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i) [-].
+
+    The paper only calls them expansion parameters (and says "expand (35)" for (36)). Order 2: (eta, 1), which is (7).
+    """
+    rising = [jnp.ones_like(eta)]
+    for k in range(order - 1):
+        rising.append(rising[-1] * (eta + k))
+    return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
