@@ -13,6 +13,8 @@ from ptsmc_jax.figures.style import RC, STYLES
 from ptsmc_jax.simulation.rollout import Log, Parts
 
 SIDES = (0.5, 0.35, 0.25)  # half edges of the box that is drawn; shapes say nothing of the inertia
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
+_EDGES = np.array([(i, j) for i, j in combinations(range(8), 2) if np.sum(_CORNERS[i] != _CORNERS[j]) == 1])
 
 
 class Animation:
@@ -36,6 +38,12 @@ def turned(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return vectors + 2.0 * np.cross(v, np.cross(v, vectors) + scalar * vectors)
 
 
+def body(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of the box (12, 2, 3) and the body's axes (3, 2, 3), from end to end in inertial axes; q (4,)."""
+    tips = turned(q, np.eye(3))
+    return turned(q, _CORNERS)[_EDGES], np.stack([np.zeros_like(tips), tips], axis=1)
+
+
 def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     """The body of a run with its axes, and the reference's axes dashed; log with numpy arrays (time, component).
 
@@ -48,12 +56,10 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     t = np.asarray(log.t)
     shown = np.searchsorted(t, np.linspace(0.0, t[-1], frames) * (1.0 - 1e-12))
     q, q_f = np.asarray(log.x.q)[shown], np.broadcast_to(np.asarray(log.reference.q), (len(t), 4))[shown]
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
-    edges = [(i, j) for i, j in combinations(range(8), 2) if np.sum(corners[i] != corners[j]) == 1]
     with matplotlib.rc_context({**RC, "animation.embed_limit": 1e4}):  # MB; beyond it frames would be dropped
         figure = Figure(figsize=(4.6, 4.6), dpi=70)
         axes = figure.add_subplot(projection="3d")
-        box = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in edges]
+        box = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in _EDGES]
         own = [axes.plot([], [], [], color=STYLES[k][0], lw=2.6)[0] for k in range(3)]
         wanted = [axes.plot([], [], [], color=STYLES[k][0], lw=1.4, ls="--")[0] for k in range(3)]
         axes.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xticks=[], yticks=[], zticks=[])
@@ -61,12 +67,10 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
         title = axes.set_title("")
 
         def draw(k: int) -> list:
-            at = turned(q[k], corners)
-            for line, (i, j) in zip(box, edges, strict=True):
-                line.set_data_3d(*at[[i, j]].T)  # pyright: ignore[reportAttributeAccessIssue]
-            for lines, attitude in ((own, q[k]), (wanted, q_f[k])):
-                for line, axis in zip(lines, turned(attitude, np.eye(3)), strict=True):
-                    line.set_data_3d(*np.stack([np.zeros(3), axis]).T)  # pyright: ignore[reportAttributeAccessIssue]
+            edges, axes_of_body = body(q[k])
+            for lines, ends in ((box, edges), (own, axes_of_body), (wanted, body(q_f[k])[1])):
+                for line, both in zip(lines, ends, strict=True):
+                    line.set_data_3d(*both.T)  # pyright: ignore[reportAttributeAccessIssue]
             title.set_text(f"t = {t[shown[k]]:.1f} s; dashed: reference")
             return [*box, *own, *wanted, title]
 

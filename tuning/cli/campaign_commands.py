@@ -24,7 +24,7 @@ from tuning.cli.options import (
 from tuning.errors import UsageError
 from tuning.output import campaign_terminal, terminal
 
-CAMPAIGN_SEED = "1000"  # not that of a search: a proof does without the trials that gains were tuned on
+CAMPAIGN_SEED = 1000  # not that of a search: a proof does without the trials that gains were tuned on
 MOST = 2**32  # trials: their numbers have 32 bits
 
 CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
@@ -35,7 +35,8 @@ def montecarlo(
     /,
     *,
     trials: Annotated[
-        str | None, Parameter(help="Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.")
+        int | None,
+        whole("--trials", "Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.", 1, MOST),
     ] = None,
     plan: Annotated[
         Path | None,
@@ -47,8 +48,13 @@ def montecarlo(
     seed: Seed = CAMPAIGN_SEED,
     out: Out = None,
     until_confident: Annotated[
-        str | None,
-        Parameter(help="Stop once every requirement's share is known to within this width, a number between 0 and 1."),
+        float | None,
+        between(
+            "--until-confident",
+            "Stop once every requirement's share is known to within this width, a number between 0 and 1.",
+            0.0,
+            1.0,
+        ),
     ] = None,
     metrics: Annotated[
         str | None, Parameter(help="FILE.py:NAME of a function that adds metrics of your own to the rows.")
@@ -82,8 +88,7 @@ def montecarlo(
     Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
     input or a full disk, 130 interrupted.
     """
-    count, key = whole("--trials", "10000" if trials is None else trials, 1, MOST), whole("--seed", seed)
-    width = None if until_confident is None else between("--until-confident", until_confident, 0.0, 1.0)
+    width = until_confident
     share = _shard(shard)
     tls = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
     tls = {name: str(path) for name, path in tls.items() if path is not None}
@@ -109,7 +114,7 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning.studies import campaign_folder
 
-    folder = campaign_folder.Folder(path, loaded, key, count, metrics, bits)
+    folder = campaign_folder.Folder(path, loaded, seed, 10_000 if trials is None else trials, metrics, bits)
     if plan is not None:
         from ptsmc_jax.campaigns import plans
 
@@ -169,7 +174,7 @@ def worst(
     /,
     *,
     by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
-    n: Annotated[str, Parameter(name=["--n", "-n"], help="Trials, a whole number from 1 to 10000.")] = "5",
+    n: Annotated[int, whole("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))] = 5,
     why: Annotated[
         bool,
         Parameter(
@@ -183,19 +188,18 @@ def worst(
 
     Exit status: 0 done, 2 bad input.
     """
-    count = whole("--n", n, 1, 10_000)
     _configured(folder)
     from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
     from tuning.studies import campaign_folder, campaign_summary
 
     opened = campaign_folder.opened(folder)
-    frame = campaign_summary.worst(opened, by, count)
+    frame = campaign_summary.worst(opened, by, n)
     store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
     told = []
     if why:
         asked = [one.metric for one in scenarios.requirements(opened.scenario)]
-        told = campaign_summary.why(opened, list(dict.fromkeys((by, *asked))), count)
+        told = campaign_summary.why(opened, list(dict.fromkeys((by, *asked))), n)
         store.write_csv(folder / "why.csv", list(told[0]) if told else [], [list(one.values()) for one in told])
     if not quiet:
         campaign_terminal.worst(frame, by, folder)
@@ -207,7 +211,7 @@ def replay(
     folder: CampaignFolder,
     /,
     *,
-    trial: Annotated[str, Parameter(help="Number of the trial.")],
+    trial: Annotated[int, whole("--trial", "Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
     trust: Trust = False,
     force: Force = False,
@@ -218,21 +222,20 @@ def replay(
 
     Exit status: 0 the run equals its row to 1e-12 (or has none yet), 1 it does not, 2 bad input.
     """
-    number = whole("--trial", trial)
     _configured(folder)
     from ptsmc_jax.campaigns import store
     from tuning.search import own_parts
     from tuning.studies import campaign_folder, campaign_summary, single
 
     opened = campaign_folder.opened(folder)
-    if number >= opened.trials:
-        raise UsageError(f"--trial is {number}, but must be a whole number from 0 to {opened.trials - 1}")
-    place = out if out is not None else folder / "replay" / str(number)
+    if trial >= opened.trials:
+        raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
+    place = out if out is not None else folder / "replay" / str(trial)
     store.check(place, force or out is None)  # a replay of the same trial is the same
     own_parts.allow(opened.programs, folder, opened.told, trust)
     opened = replace(opened, trusted=True)
-    found = campaign_summary.replay(opened, number)
-    store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, number, figures))
+    found = campaign_summary.replay(opened, trial)
+    store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, trial, figures))
     if not quiet:
         terminal.run(single.summary(found.run, opened.scenario), opened.scenario.plant.kind, place)
         campaign_terminal.replayed(found.off, found.rounding)
@@ -258,9 +261,9 @@ def _summarised(folder, quiet: bool, figures: bool) -> int:
 
 
 def _shard(value: str) -> tuple[int, int]:
-    number, _, of = value.partition("/")
+    trial, _, of = value.partition("/")
     try:
-        share = int(number), int(of)
+        share = int(trial), int(of)
     except ValueError:
         share = (0, 0)
     if not 1 <= share[0] <= share[1]:

@@ -27,8 +27,8 @@ def export(
     *,
     out: Out = None,
     name: Annotated[str | None, Parameter(help="Name of the C files; by default the scenario file's.")] = None,
-    trials: Annotated[str, Parameter(help="Trials in vectors.csv, a whole number from 1 to 100.")] = "3",
-    seed: Seed = "0",
+    trials: Annotated[int, whole("--trials", "Trials in vectors.csv, a whole number from 1 to 100.", 1, 100)] = 3,
+    seed: Seed = 0,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -37,7 +37,6 @@ def export(
 
     Exit status: 0 done, 2 bad input, or something in it that C cannot say.
     """
-    key, count = whole("--seed", seed), whole("--trials", trials, 1, 100)
     loaded, folder = prepare(scenario, "export", out, trust=trust)
     from ptsmc_jax.campaigns import store
 
@@ -46,7 +45,7 @@ def export(
     from ptsmc_jax.onboard import templates
 
     made = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
-    store.write(folder, lambda making: controllers.write(making, made, key, count))
+    store.write(folder, lambda making: controllers.write(making, made, seed, trials))
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code).items() if n)
         terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")

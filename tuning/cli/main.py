@@ -49,10 +49,9 @@ def simulate(
     /,
     *,
     out: Out = None,
-    seed: Seed = "0",
+    seed: Seed = 0,
     trial: Annotated[
-        str | None,
-        Parameter(help="Draw this trial's dispersions; without it nominal, with trial 0's noise."),
+        int | None, whole("--trial", "Draw this trial's dispersions; without it nominal, with trial 0's noise.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
@@ -64,8 +63,6 @@ def simulate(
 
     Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
     """
-    key = whole("--seed", seed)
-    number = None if trial is None else whole("--trial", trial)
     loaded, folder = prepare(scenario, "simulate", out, trust=trust)
     from ptsmc_jax.campaigns import store
 
@@ -76,11 +73,11 @@ def simulate(
 
     computer = None if controller is None else flight_commands.Compiled(controller)
     loaded = loaded if computer is None else computer.flown(loaded)
-    ready = study(loaded, drawn=number is not None)
+    ready = study(loaded, drawn=trial is not None)
     if timing.steps(ready.parts) > LONG and not quiet:
         terminal.say(f"flying {timing.steps(ready.parts)} integration steps, with their history")
-    run, said = (runs.fly(ready, key, number), {}) if computer is None else computer.fly(ready, key, number)
-    store.write(folder, lambda making: single.write(making, loaded, run, key, number, figures, **said))
+    run, said = (runs.fly(ready, seed, trial), {}) if computer is None else computer.fly(ready, seed, trial)
+    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, **said))
     if not quiet:
         terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
     return 0 if run.met else 1
@@ -115,9 +112,11 @@ def map_(
     *,
     x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
     y: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "controller.delta=0.05:5:9",
-    trials: Annotated[str, Parameter(help="Trials of each pair, a whole number from 1 to 1000000.")] = "32",
+    trials: Annotated[
+        int, whole("--trials", "Trials of each pair, a whole number from 1 to 1000000.", 1, 1_000_000)
+    ] = 32,
     out: Out = None,
-    seed: Seed = "0",
+    seed: Seed = 0,
     device: Device = "cpu",
     trust: Trust = False,
     force: Force = False,
@@ -128,7 +127,6 @@ def map_(
 
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
-    key, count = whole("--seed", seed), whole("--trials", trials, 1, 1_000_000)
     loaded, folder = prepare(scenario, "map", out, device, trust=trust)
     from ptsmc_jax.campaigns import store
 
@@ -142,8 +140,8 @@ def map_(
     if across.key == up.key:
         raise UsageError(f"--y is {y}, but must be another key than --x")
     with terminal.Progress(quiet) as told:
-        cells = mapping.fly(loaded, across, up, key, count, lambda done, total: told("flying pairs", done, total))
-    store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, key, figures))
+        cells = mapping.fly(loaded, across, up, seed, trials, lambda done, total: told("flying pairs", done, total))
+    store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, seed, figures))
     if not quiet:
         terminal.grid(cells, folder)
     return 0
@@ -184,7 +182,7 @@ def tune(
     /,
     *,
     out: Out = None,
-    seed: Seed = "0",
+    seed: Seed = 0,
     global_check: Annotated[
         bool, Parameter(negative="", help="Compare with differential evolution, and report the distance.")
     ] = False,
@@ -201,16 +199,15 @@ def tune(
 
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
     """
-    key = whole("--seed", seed)
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from tuning.studies import tune_files, tuner
 
     loaded = _with_tune(loaded)
     goal = tuner.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
-    known_by = tune_files.told(loaded, key, globally=global_check)
+    known_by = tune_files.told(loaded, seed, globally=global_check)
     return _search(
         loaded, folder, known_by, force, quiet, goal,
-        work=lambda told, journal: tuner.tune(loaded, key, told, journal, globally=global_check),
+        work=lambda told, journal: tuner.tune(loaded, seed, told, journal, globally=global_check),
         write=lambda making, found: tune_files.write(making, loaded, found, figures, known_by),
         summary=tune_files.summary,
         shown=terminal.tuning,
@@ -222,9 +219,11 @@ def pareto(
     scenario: ScenarioFile = None,
     /,
     *,
-    points: Annotated[str, Parameter(help="Limits on the torque to tune for, a whole number from 3 to 100.")] = "20",
+    points: Annotated[
+        int, whole("--points", "Limits on the torque to tune for, a whole number from 3 to 100.", 3, 100)
+    ] = 20,
     out: Out = None,
-    seed: Seed = "0",
+    seed: Seed = 0,
     device: Device = "cpu",
     trust: Trust = False,
     force: Force = False,
@@ -238,16 +237,15 @@ def pareto(
     Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
     interrupted.
     """
-    key, count = whole("--seed", seed), whole("--points", points, 3, 100)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
     from tuning.studies import pareto as fronts
 
     loaded = _with_tune(loaded)
     fronts.check(loaded)
-    known_by = fronts.told(loaded, key, count)
+    known_by = fronts.told(loaded, seed, points)
     return _search(
         loaded, folder, known_by, force, quiet, "window error",
-        work=lambda told, journal: fronts.trace(loaded, key, count, told, journal),
+        work=lambda told, journal: fronts.trace(loaded, seed, points, told, journal),
         write=lambda making, found: fronts.write(making, loaded, found, figures, known_by),
         summary=lambda found: fronts.summary(found, loaded),
         shown=terminal.front,
@@ -260,7 +258,7 @@ def compare(
     /,
     *,
     out: Out = None,
-    seed: Seed = "0",
+    seed: Seed = 0,
     against: Against = None,
     law: Laws = (),
     device: Device = "cpu",
@@ -276,7 +274,6 @@ def compare(
     Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
     interrupted.
     """
-    key = whole("--seed", seed)
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from tuning.studies import compare as comparing
 
@@ -284,10 +281,10 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = _with_tune(loaded)
-    known_by = comparing.told(loaded, key, rivals)
+    known_by = comparing.told(loaded, seed, rivals)
     return _search(
         loaded, folder, known_by, force, quiet, "",
-        work=lambda told, journal: comparing.compare(loaded, key, told, journal, rivals),
+        work=lambda told, journal: comparing.compare(loaded, seed, told, journal, rivals),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
         summary=comparing.summary,
         shown=terminal.comparison,
@@ -316,7 +313,8 @@ def main() -> None:
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        _fail(" ".join(str(error).split()))
+        refused = error.__cause__  # of one of `options`' converters
+        _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
     except ValueError as error:
         if _expected(error):
             _fail(str(error))

@@ -1,14 +1,44 @@
 """What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from tuning.errors import UsageError
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
+
+
+def whole(option: str, said: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()) -> Parameter:
+    """An option that is a whole number; said: its help. What is none raises UsageError, as `main` tells it."""
+
+    def read(_: Any, tokens: Sequence[Token]) -> int:
+        value = tokens[0].value
+        if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
+            raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
+        return int(value)
+
+    return Parameter(name=names or None, converter=read, help=said)
+
+
+def between(option: str, said: str, least: float, most: float) -> Parameter:
+    """An option that is a number between two others; likewise."""
+
+    def read(_: Any, tokens: Sequence[Token]) -> float:
+        value = tokens[0].value
+        try:
+            found = float(value)
+        except ValueError:
+            found = float("nan")
+        if not least < found < most:
+            raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
+        return found
+
+    return Parameter(converter=read, help=said)
+
 
 ScenarioFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
@@ -17,7 +47,7 @@ SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
 Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
-Seed = Annotated[str, Parameter(help="Seed of every draw, a whole number from 0 to 4294967295.")]
+Seed = Annotated[int, whole("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
@@ -43,24 +73,6 @@ Trust = Annotated[
 ]
 
 INTERRUPTED = 130  # exit status
-
-
-def whole(option: str, value: str, least: int = 0, most: int = 2**32 - 1) -> int:
-    """A whole number."""
-    if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
-        raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
-    return int(value)
-
-
-def between(option: str, value: str, least: float, most: float) -> float:
-    """A number between two others."""
-    try:
-        found = float(value)
-    except ValueError:
-        found = float("nan")
-    if not least < found < most:
-        raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
-    return found
 
 
 def prepare(

@@ -1,12 +1,11 @@
 """Interactive charts of a result, as Plotly's JSON: histories, a turning body, a front, a search."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.figures.animation import SIDES, turned
+from ptsmc_jax.figures import animation
 from ptsmc_jax.figures.style import STYLES
 
 Chart = dict[str, Any]
@@ -77,18 +76,14 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
 def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
     """The body as a box with its axes, turning; q (time, 4) scalar last, body relative to inertial."""
     shown = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], FRAMES) * (1.0 - 1e-12)))
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
-    edges = [(i, j) for i, j in combinations(range(8), 2) if np.sum(corners[i] != corners[j]) == 1]
 
     def lines(at: np.ndarray) -> list[Chart]:
-        box = np.full((3 * len(edges), 3), np.nan)
-        turned_corners = turned(at, corners)
-        for k, (i, j) in enumerate(edges):
-            box[3 * k : 3 * k + 2] = turned_corners[[i, j]]
-        made = [_line(box, "body", "#888", 3)]
-        for k, axis in enumerate(turned(at, np.eye(3))):
-            made.append(_line(np.stack([np.zeros(3), axis]), f"body axis {k + 1}", COLOURS[k], 7))
-        return made
+        edges, axes = animation.body(at)
+        box = np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)  # a gap after each edge
+        return [
+            _line(box, "body", "#888", 3),
+            *(_line(axis, f"body axis {k + 1}", COLOURS[k], 7) for k, axis in enumerate(axes)),
+        ]
 
     fixed = [
         _line(np.stack([np.zeros(3), 1.2 * axis]), f"inertial axis {k + 1}", COLOURS[k], 2, "dash")
