@@ -35,7 +35,7 @@ def primal(ready, trials: int):
     """What flies so many trials as campaigns do, by scan and by kernel."""
 
     def flight(whole: bool):
-        block = min(trials, montecarlo.ABREAST)
+        block = min(trials, montecarlo.BLOCK_ON_GPU)
         return lambda: (
             montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials), block=block, kernel=whole).metrics
         )

@@ -157,7 +157,7 @@ def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
     for kind, struct in kinds.items():
         given = [f'`kind = "{kind}"`']
         for k in keys.of(struct):
-            said = [f"default {shown}" if (shown := _default(k.default)) else "", k.told]
+            said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
             given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
         yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]
 

@@ -122,8 +122,8 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
 
     Raises ScenarioError, with one sentence, where it cannot be flown.
     """
-    _whole("seed", seed)
-    _whole("trial", 0 if trial is None else trial)
+    _check_whole_number("seed", seed)
+    _check_whole_number("trial", 0 if trial is None else trial)
     known = what if isinstance(what, Scenario) else scenario.read(what)
     return Flight(known, runs.fly(scenario.study(known, drawn=trial is not None), seed, trial))
 
@@ -137,14 +137,14 @@ def trials(
     and metrics of one's own (see `montecarlo.one`). count: how many trials, or a plan, a table with a row for each, see
     `plans`; raises RefusedError, with one sentence, where it cannot be flown.
     """
-    _whole("seed", seed)
+    _check_whole_number("seed", seed)
     known = what if isinstance(what, Scenario) else scenario.read(what)
     if isinstance(count, pl.DataFrame):
         ready = scenario.study(known)
         names = campaign.Campaign(ready, seed, own).own_names()
         asked = plans.checked(count, ready.parts, own=names)
         return campaign.of_plan(ready, seed, asked, own).fly(range(asked.count))
-    _whole("count", count, 1)
+    _check_whole_number("count", count, 1)
     return campaign.Campaign(scenario.study(known), seed, own).fly(range(count))
 
 
@@ -153,7 +153,7 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 
     Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies.
     """
-    _whole("seed", seed)
+    _check_whole_number("seed", seed)
     if not isinstance(what, Study):
         what = scenario.study(what if isinstance(what, Scenario) else scenario.read(what))
     return runs.floor(what, seed)
@@ -164,7 +164,7 @@ def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdi
 
     Margins are those of its loop, see `margin_verdicts`; where inertias are drawn, of the loops of this seed's trials.
     """
-    _whole("seed", seed)
+    _check_whole_number("seed", seed)
     asked = scenario.margin_requirements(what)
     judged = margin_verdicts.over_trials(scenario.study(what), seed) if asked else []
     return [*campaign.verdicts(scenario.requirements(what), rows), *judged]
@@ -175,7 +175,7 @@ def units(kind: str = "spacecraft") -> dict[str, str]:
     return {name: entry.unit for name, entry in catalogues.CATALOGUES[kind].items()}
 
 
-def _whole(name: str, value: object, least: int = 0) -> None:
+def _check_whole_number(name: str, value: object, least: int = 0) -> None:
     """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards."""
     if not isinstance(value, int | np.integer) or not least <= value < 2**32:
         raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")

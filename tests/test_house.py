@@ -74,7 +74,7 @@ HOUSE = {
     "tuning": {
         ".": "errors",
         "search": """
-            abreast gains journal own_parts progress
+            lockstep gains journal own_parts progress
             design flights shares
             margin_rows
             objective

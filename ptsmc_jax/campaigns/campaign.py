@@ -63,7 +63,7 @@ class Campaign:
         heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
         numbers = {
             "bad_time": flown.bad_time,
-            **({} if self.plan is None else self.plan.told(wanted)),
+            **({} if self.plan is None else self.plan.origin(wanted)),
             **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
             **flown.drawn,
             **flown.own,
@@ -76,7 +76,7 @@ class Campaign:
         wanted = np.asarray(trials, dtype=np.uint32)
         padded = np.resize(wanted, -(-wanted.size // PART) * PART)
         drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), self.rows(padded))
-        whose = {} if self.plan is None else self.plan.told(wanted)
+        whose = {} if self.plan is None else self.plan.origin(wanted)
         numbers = {name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}
         return pl.DataFrame({"trial": wanted, **whose, **numbers})
 
@@ -178,7 +178,7 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
     Yields each part that is on the disk, and how many of its trials did not end well. make: numbers of trials -> rows.
     Accelerators, which fly more than a part at a time, make several in one go.
     """
-    together = max(1, montecarlo.abreast() * len(jax.local_devices()) // PART)
+    together = max(1, montecarlo.block_size() * len(jax.local_devices()) // PART)
     writing: deque[tuple[Any, int]] = deque()
     with ThreadPoolExecutor(1) as writer:
         for group, made in _made(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
@@ -229,8 +229,8 @@ def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
-    t, error, lasts = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows)
-    kept = np.asarray(lasts)[0]
+    t, error, has_length = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows)
+    kept = np.asarray(has_length)[0]
     return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
 
 
@@ -240,6 +240,6 @@ def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.
         about = planned.about(parts, dispersion, seed, trial)
         log = rollout.simulate(about.drawn, about.seed, about.trial, record=True).log
         assert log is not None
-        return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.lasts
+        return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.has_length
 
     return montecarlo.blocks(one, trials)

@@ -103,7 +103,7 @@ def worst(
         if not some.size:
             return {name: _over(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
         some = np.resize(some, JUDGED)  # one shape, one program
-        full = _of_some(loops, some, late="delay_margin" in names)
+        full = _of_some(loops, some, with_delay="delay_margin" in names)
         found = np.stack([_over(name, full[name]) for name in names])
         apart = np.abs(_nearness(found, limit, names) - near[:, some])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
@@ -117,9 +117,9 @@ def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np
     return np.where(np.isnan(near), -np.inf, near)
 
 
-def _of_some(loops: linear.Loop, some: np.ndarray, *, late: bool) -> dict[str, np.ndarray]:
+def _of_some(loops: linear.Loop, some: np.ndarray, *, with_delay: bool) -> dict[str, np.ndarray]:
     """Margins of some of the loops in full, (loops, m)."""
-    found = margins.of_each(jax.tree.map(lambda v: v[some], loops), late=late)
+    found = margins.of_each(jax.tree.map(lambda v: v[some], loops), with_delay=with_delay)
     return {name: np.asarray(v) for name, v in found.each().items()}
 
 

@@ -23,7 +23,7 @@ from ptsmc_jax.simulation.rollout import Parts
 FEW = 64  # trials; fewer are flown at once, by a program for so many: a step costs nearly as much for one
 CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
-ABREAST = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
+BLOCK_ON_GPU = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def run(
     trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(jax.local_devices())
-    block = -(-FEW // devices) if count < FEW else abreast() if block is None else block
+    block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if count >= FEW else 1
     size = devices * rows * block
     calls = []
@@ -153,7 +153,7 @@ def run(
 
 def prepare(parts: Parts, dispersion: Dispersion) -> None:
     """Begin to compile what flies many trials of such parts, beside what is being done."""
-    devices, block = len(jax.local_devices()), abreast()
+    devices, block = len(jax.local_devices()), block_size()
     numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, kernel=False)
 
@@ -203,18 +203,18 @@ def _fly(
     return spread(in_one_kernel if kernel else in_blocks, trials, devices)
 
 
-def abreast() -> int:
+def block_size() -> int:
     """How many trials a device flies at a time, unless it is told."""
-    return BLOCK if jax.default_backend() == "cpu" else ABREAST
+    return BLOCK if jax.default_backend() == "cpu" else BLOCK_ON_GPU
 
 
 def blocks(fly: Callable, trials: Any) -> Any:
-    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `abreast()` trials each.
+    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block_size()` trials each.
 
     trials: what `fly` takes, a number or a tree of arrays, with a leading axis over the trials.
     """
     count = jax.tree.leaves(trials)[0].shape[0]
-    rows = max(1, -(-count // abreast()))
+    rows = max(1, -(-count // block_size()))
     size = -(-count // rows)
     if rows == 1:
         return lanes.vmap(fly)(trials)

@@ -68,7 +68,7 @@ class Plan:
         """The same without quantities that are what would be drawn anyway."""
         return replace(self, given={name: values for name, values in self.given.items() if name not in same})
 
-    def told(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
+    def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
         """Whose draws these rows have, as rows tell it."""
         known = {TRIAL: self.trial, SEED: self.seed}
         return {OF_ROWS[name]: values[numbers] for name, values in known.items() if values is not None}
@@ -127,7 +127,7 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     whose_draws = {}
     for name, other in OF_ROWS.items():  # of rows that are flown again, `trial` is but their number
         column = other if other in table.columns else name
-        whose_draws[name] = _whole(table, column, where) if column in table.columns else None
+        whose_draws[name] = _whole_numbers(table, column, where) if column in table.columns else None
     if whose_draws[TRIAL] is not None and np.array_equal(whose_draws[TRIAL], np.arange(table.height)):
         whose_draws[TRIAL] = None  # their own numbers
     angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
@@ -170,7 +170,7 @@ def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     return found
 
 
-def _whole(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
+def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """A column of whole numbers below 2^32."""
     values = _numbers(table, column, where)
     bad = (values != np.floor(values)) | (values < 0) | (values >= MOST)

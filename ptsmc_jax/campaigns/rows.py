@@ -95,9 +95,9 @@ class Rows:
         return found.hexdigest()
 
 
-def key_of(scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bytes:
+def key_of(scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bytes:
     """What tells one campaign's parts from another's: scenario, seed and what else its rows depend on."""
-    text = json.dumps([scenario, told], sort_keys=True, default=lambda value: f"<{type(value).__name__}>")
+    text = json.dumps([scenario, made_by], sort_keys=True, default=lambda value: f"<{type(value).__name__}>")
     return hashlib.sha256(text.encode()).digest()
 
 

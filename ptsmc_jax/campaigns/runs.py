@@ -93,8 +93,8 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
     result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True, software=software))
     assert result.log is not None
-    lasts = result.log.lasts
-    log = jax.tree.map(lambda rows: rows[lasts], result.log)
+    has_length = result.log.has_length
+    log = jax.tree.map(lambda rows: rows[has_length], result.log)
     status, reason = rollout.STATUS[int(result.status)]
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
     finished = np.asarray(int(result.status) in rollout.FINISHED)

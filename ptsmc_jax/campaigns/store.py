@@ -46,26 +46,26 @@ def packages() -> dict[str, str]:
 def made(folder: Path) -> dict[str, Any]:
     """What `versions` said when the results in a folder were made; empty where it cannot be read."""
     try:
-        told = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+        made_by = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return told if isinstance(told, dict) else {}
+    return made_by if isinstance(made_by, dict) else {}
 
 
-def previous(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The summary of the same scenario with the same command, seed and what else `versions` was told; None: none."""
+def previous(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The summary of the same scenario with the same command, seed and what else made it (`versions`); None: none."""
     try:
-        return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, told) else None
+        return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, made_by) else None
     except (OSError, ValueError, RecursionError):
         return None
 
 
-def begun(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+def begun(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
     """Whether the folder holds the beginning of the same run, by the same versions: see `begin`."""
-    return (folder / JOURNAL).exists() and _same(folder, scenario, versions(**told))
+    return (folder / JOURNAL).exists() and _same(folder, scenario, versions(**made_by))
 
 
-def begin(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any], *, fresh: bool) -> Path:
+def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any], *, fresh: bool) -> Path:
     """Make the folder of a run that can go on where it was interrupted; returns the path of its journal.
 
     fresh: forget what the folder's journal holds, and the summary of what was there.
@@ -75,7 +75,7 @@ def begin(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any], *,
         end(folder)
         (folder / "summary.json").unlink(missing_ok=True)  # it would pass for this run's
     write_toml(folder / "scenario.toml", scenario)
-    write_json(folder / "versions.json", versions(**told))
+    write_json(folder / "versions.json", versions(**made_by))
     (folder / JOURNAL).touch()
     return folder / JOURNAL
 
@@ -85,11 +85,11 @@ def end(folder: Path) -> None:
     (folder / JOURNAL).unlink(missing_ok=True)
 
 
-def _same(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
-    return difference(folder, scenario, told) is None
+def _same(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
+    return difference(folder, scenario, made_by) is None
 
 
-def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any]) -> str | None:
+def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> str | None:
     """What tells the run in the folder from this one, in words; None: nothing does."""
     there = made(folder)
     try:
@@ -99,7 +99,7 @@ def difference(folder: Path, scenario: Mapping[str, Any], told: Mapping[str, Any
     if not there or not all(isinstance(table, dict) for table in known.values()):
         return "something else"
     wanted = json.loads(json.dumps(_named(scenario)))
-    for name, value in told.items():
+    for name, value in made_by.items():
         if there.get(name) != value:
             return f"a run with {name} {there.get(name)}, not {value}"
     for table in dict.fromkeys((*known, *wanted)):

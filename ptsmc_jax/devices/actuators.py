@@ -86,7 +86,7 @@ class Actuators:
         """The same as the flight software knows them."""
         return replace(self, scale=None, directions=None, fails=None)
 
-    def told(self, drive: Drive, dt: Scalar) -> Push:
+    def assumed(self, drive: Drive, dt: Scalar) -> Push:
         """What flight software takes to have acted in a period dt [s], torques in N m: as `over` of what it knows."""
         return self.known.over(drive if self.spares is not None else drive._replace(works=None), jnp.zeros_like(dt), dt)
 
@@ -153,8 +153,8 @@ class Actuators:
         limited = limited | jnp.any(cut != wanted)
         if self.rate_limit is not None:
             assert state.v is not None
-            reach = self.rate_limit * (dt if self.lag is None else dt + self.lag)
-            limited = limited | jnp.any(jnp.abs(cut - state.v) > reach)
+            farthest = self.rate_limit * (dt if self.lag is None else dt + self.lag)
+            limited = limited | jnp.any(jnp.abs(cut - state.v) > farthest)
         works = None if self.fails is None else t < self.fails
         return Drive(state.v if self.moves else None, cut, state.h, limited, works), queue
 
@@ -189,8 +189,8 @@ class Actuators:
         near = gap  # what the lag closes, after a ramp of this length and slope
         ramp, slope = jnp.zeros_like(gap), jnp.zeros_like(gap)
         if self.rate_limit is not None:
-            reach = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
-            near = jnp.clip(gap, -reach, reach)
+            by_lag = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
+            near = jnp.clip(gap, -by_lag, by_lag)
             ramp = jnp.abs(gap - near) / self.rate_limit
             slope = self.rate_limit * jnp.sign(gap)
         ramping = s < ramp
@@ -221,13 +221,13 @@ class Actuators:
 
         So momentum is, and to leading order the attitude, whatever a lag or a rate limit does within a step.
         """
-        v, slope, lasts = drive.c, None, dt > 0.0
+        v, slope, has_length = drive.c, None, dt > 0.0
         if drive.v is not None:
             (_, first, second), (_, first_next, second_next) = (self.channels(drive, s) for s in (start, start + dt))
-            long = jnp.where(lasts, dt, 1.0)
-            v = jnp.where(lasts, (first_next - first) / long, drive.v)
+            long = jnp.where(has_length, dt, 1.0)
+            v = jnp.where(has_length, (first_next - first) / long, drive.v)
             moment = (first + first_next) / 2 * dt - (second_next - second)  # of the torque about the middle
-            slope = jnp.where(lasts, 12.0 * moment / long**3, 0.0)
+            slope = jnp.where(has_length, 12.0 * moment / long**3, 0.0)
         stored = None if self.wheels is None else self.on_body(self.wheels_at(drive, start)[0])
         mean = self.on_body(self.given(drive, v))
         return Push(mean, None if slope is None else self.on_body(self.given(drive, slope)), stored, dt)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ptsmc_jax.devices.sensors import Sensor
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws, guards
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 Scalar = Float[Array, ""]
@@ -57,7 +57,7 @@ class OwnSensors(Sensor):
         """Noise of one sample, (draws,) [-]."""
         return self.loud * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
 
-    def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> tuple:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> tuple:
         """Memory before the first sample of positive length [s], which is now."""
         key = draws.stream(seed, trial, OWN_NOISE)
         return key, self.noise(key, now.sample), self.own.begin(x0)

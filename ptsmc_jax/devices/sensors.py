@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
 
@@ -34,7 +34,7 @@ class Sensor(ABC):
     """What the rollout, linear theory and campaigns ask of a sensor."""
 
     @abstractmethod
-    def begin(self, seed: Whole, trial: Whole, x0: Any, now: Ticks) -> Any:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
         """Memory before the first sample of positive length, which is now."""
 
     @abstractmethod
@@ -49,7 +49,7 @@ class Sensor(ABC):
     def quiet(self) -> Any:
         """The same without noise."""
 
-    def drawn(self, seed: Whole, trial: Whole) -> dict[str, Array]:
+    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """What the sensor draws once a trial, by the names of a row's columns."""
         return {}
 
@@ -115,7 +115,7 @@ class Sensors(Sensor):
         assert self.filter is not None
         return -0.5 * jnp.log1p(-self.filter.attitude_gain) / (period * self.every)
 
-    def keys(self, seed: Whole, trial: Whole) -> tuple[draws.Key, draws.Key, draws.Key]:
+    def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key]:
         """Streams of a trial's noise: attitude, rate, change of the bias."""
         return (
             draws.stream(seed, trial, ATTITUDE_NOISE),
@@ -130,7 +130,7 @@ class Sensors(Sensor):
             self.rate_noise * draws.normals(keys[1], 3, sample),
         )
 
-    def first_bias(self, seed: Whole, trial: Whole) -> Float[Array, "3"]:
+    def first_bias(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "3"]:
         """Bias of the gyro at the first sample, (3,) [rad/s]."""
         if self.given_bias is not None:
             return self.given_bias
@@ -138,7 +138,7 @@ class Sensors(Sensor):
             return jnp.zeros(3)
         return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
 
-    def begin(self, seed: Whole, trial: Whole, x0: AttitudeState, now: Ticks) -> Memory:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> Memory:
         """Memory before the first sample of positive length, which is now."""
         keys, bias, estimate = self.keys(seed, trial), None, None
         if any(bias is not None for bias in (self.rate_bias, self.bias_rate, self.given_bias)):
@@ -185,7 +185,7 @@ class Sensors(Sensor):
         quiet = replace(self, attitude_noise=none, rate_noise=none, filter=known)
         return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
 
-    def drawn(self, seed: Whole, trial: Whole) -> dict[str, Array]:
+    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Bias of the gyro at the first sample [rad/s]."""
         if self.rate_bias is None and self.given_bias is None:
             return {}
@@ -228,7 +228,7 @@ class StateSensor(Sensor):
 
     sigma: Leaf  # (n,) 1 sigma of each state
 
-    def key(self, seed: Whole, trial: Whole) -> draws.Key:
+    def key(self, seed: WholeNumber, trial: WholeNumber) -> draws.Key:
         """Stream of a trial's noise."""
         return draws.stream(seed, trial, STATE_NOISE)
 
@@ -236,7 +236,7 @@ class StateSensor(Sensor):
         """Noise of one sample, (n,)."""
         return self.sigma * draws.normals(key, self.sigma.shape[-1], sample)
 
-    def begin(self, seed: Whole, trial: Whole, x0: Float[Array, " n"], now: Ticks) -> tuple:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Float[Array, " n"], now: Ticks) -> tuple:
         """Memory before the first sample of positive length, which is now."""
         key = self.key(seed, trial)
         return key, self.noise(key, now.sample)

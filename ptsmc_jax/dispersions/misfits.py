@@ -74,7 +74,7 @@ def _failure() -> Quantity:
             parts, actuators=replace(_actuators(parts), fails=jnp.where(wheel == given[1], given[0], jnp.inf))
         )
 
-    def whole(given: np.ndarray) -> np.ndarray:
+    def with_whole_wheel(given: np.ndarray) -> np.ndarray:
         UnfitError.check(given[:, 1] == np.round(given[:, 1]), lambda k: "a time and the number of a wheel, from 1 on")
         return given
 
@@ -82,7 +82,7 @@ def _failure() -> Quantity:
         wheels = None if parts.actuators is None else parts.actuators.wheels
         return [] if wheels is None else ["wheel_failure_time", "wheel_failure_wheel"]
 
-    return Quantity(columns, read, write, whole)
+    return Quantity(columns, read, write, with_whole_wheel)
 
 
 def _of_sensors(key: str, columns: list[str], nominal: list[float], checked: Any = lambda given: given) -> Quantity:

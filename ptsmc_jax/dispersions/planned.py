@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.simulation.rollout import Parts
 
 
@@ -21,7 +21,7 @@ class About(NamedTuple):
 
     parts: Parts  # about which it is drawn
     dispersion: Dispersion  # what is drawn
-    seed: Whole
+    seed: WholeNumber
     trial: Any
     given: tuple[str, ...]  # quantities that are not drawn
 
@@ -31,7 +31,7 @@ class About(NamedTuple):
         return self.dispersion.apply(self.parts, self.seed, self.trial)
 
 
-def about(parts: Parts, dispersion: Dispersion, seed: Whole, trial: Whole | Row) -> About:
+def about(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> About:
     """What a trial is drawn from: given quantities [SI units] = the nominal ones of its row, which are not drawn.
 
     A stream of draws is one quantity's own, so that the others are what they would be without it.

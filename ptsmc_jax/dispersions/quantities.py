@@ -203,7 +203,7 @@ QUANTITIES: dict[str, Quantity] = {
 }
 
 
-def told(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
+def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
     """The numbers of these quantities by their columns, [rad], [rad/s], [kg m^2] or [N m]: `write` of them = parts."""
     found = {}
     for name, quantity in QUANTITIES.items():

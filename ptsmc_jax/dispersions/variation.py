@@ -27,7 +27,7 @@ from ptsmc_jax.dispersions.misfits import Misfit
 from ptsmc_jax.dispersions.numbers import Factor, Normal, Uniform, UniformPhase
 from ptsmc_jax.dispersions.quantities import LEVELS, QUANTITIES
 from ptsmc_jax.numerics import draws
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
@@ -79,7 +79,7 @@ class Dispersion:
         kinds |= self.misfits
         return {name: kind for name, kind in kinds.items() if kind is not None}
 
-    def coordinates(self, seed: Whole, trial: Whole) -> Coordinates:
+    def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
         """Coordinates of a trial; each name has a stream of its own, so one more of them changes no other."""
         return {
             name: (draws.normals if kind.drawn == "normal" else draws.uniforms)(
@@ -132,7 +132,7 @@ class Dispersion:
             found = disturbances.with_bias(found, bias)
         return found
 
-    def apply(self, parts: Parts, seed: Whole, trial: Whole) -> Parts:
+    def apply(self, parts: Parts, seed: WholeNumber, trial: WholeNumber) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
         return self.at(parts, self.coordinates(seed, trial))
 
@@ -144,7 +144,7 @@ class Dispersion:
         """
         angle = parts.controller.angle(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
         names = {INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, *self.kinds, *given}
-        return {"initial_angle": angle, **quantities.told(parts, names)}
+        return {"initial_angle": angle, **quantities.read_columns(parts, names)}
 
     def without(self, names: Iterable[str]) -> "Dispersion":
         """The same, with nothing drawn from these streams; each of the others draws what it drew."""

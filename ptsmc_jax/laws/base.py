@@ -101,20 +101,20 @@ class Prescribed(Law):
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
     prescribed: ClassVar[bool] = True
 
-    def landing(self, now: Sample, s: Vector, power: Scalar, pull: Scalar, reach: Scalar) -> Vector:
+    def landing(self, now: Sample, s: Vector, power: Scalar, rate: Scalar, switching: Scalar) -> Vector:
         """Where s is to be at the end of the period that begins, implicit (backward Euler) sampling; (m,).
 
-        Where the law in continuous time would bring it, r^power s before the hand-over and e^(-pull h) s after it, and
-        from there toward zero by what the switching term can do in the period, `reach`: s+ = target - reach sign(s+),
-        whose solution is sign(target) max(|target| - reach, 0). Acary, Brogliato, Orlov, Chattering-free digital
+        Where the law in continuous time would bring it, r^power s before the hand-over and e^(-rate h) s after it, and
+        from there toward zero by what the switching term can do in the period, k = `switching`: s+ = target - k
+        sign(s+), whose solution is sign(target) max(|target| - k, 0). Acary, Brogliato, Orlov, Chattering-free digital
         sliding-mode control with state observer and disturbance rejection, IEEE Trans. Automatic Control 57(5), 2012.
         There is no boundary layer to choose, and no border for delta.
         """
         left = jnp.where(now.hold, 1.0, self.t_f - now.t)
         kept = (self.remaining(now) / left) ** power
-        target = jnp.where(now.hold, jnp.exp(-pull * now.dt), kept) * s
+        target = jnp.where(now.hold, jnp.exp(-rate * now.dt), kept) * s
         # slope 1 where there is nothing to switch against, at rest too
-        return jnp.where(jnp.abs(target) < reach, 0.0, target - reach * jnp.sign(target))
+        return jnp.where(jnp.abs(target) < switching, 0.0, target - switching * jnp.sign(target))
 
     def remaining(self, now: Sample) -> Scalar:
         """What is left to t_f at the end of the period that begins [s]; 1 after the hand-over. Never quite nothing."""
@@ -165,19 +165,19 @@ class SecondOrder(Prescribed):
     s = eps' + c eps and 2 eps'' = -2 c eps' - b s - N K2 sign(s) after it (28), tau = t_f - t. N is the Frobenius norm
     of 2 d(eps'')/dd, |T J^-1| in (57) and 2 |dF/dx2| in (29): the paper names no norm; this one is smooth and not below
     the spectral norm that the proof needs where K2 bounds the 2-norm of the estimation error. c is `surface_rate`, in
-    the paper 1 1/s, and b is `pull`.
+    the paper 1 1/s, and b is `reaching_gain`.
 
     Differences from the paper: (29) lacks the x_1' of s = x_1 + x_1' after t_f and dF/dt for a moving reference; (60)
     and (57) have them. sign(s) is tanh(s / sign_width), per component (0: exact).
     """
 
-    def pull(self) -> Scalar:
+    def reaching_gain(self) -> Scalar:
         """The coefficient b after the hand-over [1/s]: 2 K1 of (29)."""
         return 2.0 * self.k1
 
     def reaching_rate(self) -> Scalar:
-        """Half of `pull` [1/s]: s' = -b/2 s but for the switching term."""
-        return 0.5 * self.pull()
+        """Half of `reaching_gain` [1/s]: s' = -b/2 s but for the switching term."""
+        return 0.5 * self.reaching_gain()
 
     def surface(self) -> Float[Array, "1"]:
         """(c,) [1/s]."""
@@ -204,7 +204,7 @@ class SecondOrder(Prescribed):
             c=tau,
             e=jnp.where(hold, self.surface_rate, self.eta),
             a=jnp.where(hold, 2.0 * self.surface_rate, 2.0 * (self.eta - 1.0) / tau),
-            b=jnp.where(hold, self.pull(), 2.0 * self.eta / tau**2),
+            b=jnp.where(hold, self.reaching_gain(), 2.0 * self.eta / tau**2),
         )
 
     def torque(
@@ -232,6 +232,6 @@ class SecondOrder(Prescribed):
         s = gains.c * error_rate + gains.e * error
         s_0 = c * error_rate + gains.e * (error + h * error_rate)
         g = h * c + gains.e * h**2 / 2.0
-        reach = g * 0.5 * self.influence(x, target) * k2
-        landed = self.landing(now, s, self.eta, 0.5 * self.pull(), reach)
+        switching = g * 0.5 * self.influence(x, target) * k2
+        landed = self.landing(now, s, self.eta, 0.5 * self.reaching_gain(), switching)
         return self.invert(x, target, 2.0 * (landed - s_0) / g, d_hat), s, memory

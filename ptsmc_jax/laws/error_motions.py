@@ -37,7 +37,7 @@ class ErrorMotion:
         """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
         return jnp.ones(())
 
-    def whole_clearance(self, first: Scalar) -> Scalar:
+    def clearance_unit(self, first: Scalar) -> Scalar:
         """The unit of `clearance`, by that of the initial state: its sign, so that every run begins on the side 1."""
         return jnp.where(first < 0.0, -1.0, 1.0)
 
@@ -172,7 +172,7 @@ class ErrorOfSystem(ErrorMotion):
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         return matrices.determinant(slope @ gain)
 
-    def whole_clearance(self, first: Scalar) -> Scalar:
+    def clearance_unit(self, first: Scalar) -> Scalar:
         """The determinant at the start: the ratio does not depend on units."""
         return first
 

@@ -41,6 +41,6 @@ class FixedTime(SlidingLaw):
         kappa = self.a1 * guards.signed_power(jnp.abs(error), bend) + self.b1
         kappa_slope = self.a1 * bend * guards.signed_power(error, bend - 1.0)
         s = error + guards.signed_power(error_rate / kappa, self.p)
-        pull = guards.signed_power(error_rate, 2.0 - self.p)
-        pull = pull + self.a2 * guards.signed_power(s, self.m) + self.b2 * guards.signed_power(s, self.n)
-        return s, kappa_slope * error_rate * error_rate / kappa - guards.signed_power(kappa, self.p) / self.p * pull
+        reaching = guards.signed_power(error_rate, 2.0 - self.p)
+        reaching = reaching + self.a2 * guards.signed_power(s, self.m) + self.b2 * guards.signed_power(s, self.n)
+        return s, kappa_slope * error_rate * error_rate / kappa - guards.signed_power(kappa, self.p) / self.p * reaching

@@ -15,7 +15,7 @@ Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
 
 
-def pull(x: Vector, q: Scalar, settling: Scalar) -> Vector:
+def phi(x: Vector, q: Scalar, settling: Scalar) -> Vector:
     """Phi = pi/(2 q T) (sig^(1+q)(x) + sig^(1-q)(x)) [1/s]: x' = -Phi is at zero after T [s], wherever it starts."""
     return jnp.pi / (2.0 * q * settling) * (guards.signed_power(x, 1.0 + q) + guards.signed_power(x, 1.0 - q))
 
@@ -24,7 +24,7 @@ def pull(x: Vector, q: Scalar, settling: Scalar) -> Vector:
 class PredefinedTime(AccelerationLaw):
     """s = eps' + sig^(1/2)(sig^2(eps') + 2 sig^2(Phi_1(eps))), a = -Phi_2(s) - (K + 2 Phi_1 Phi_1'(eps)) sign(s).
 
-    Phi_i is `pull` with q_i and T_i. On s = 0 the error obeys eps' = -Phi_1(eps): s is at zero within T_2, the error
+    Phi_i is `phi` of q_i and T_i. On s = 0 the error obeys eps' = -Phi_1(eps): s is at zero within T_2, the error
     within T_1 after it, whatever the start and a disturbance |d| <= K. Sanchez-Torres, Gomez-Gutierrez, Lopez,
     Loukianov, A class of predefined-time stable dynamical systems, IMA J. Mathematical Control and Information 35,
     2018; of second order Jimenez-Rodriguez, Munoz-Vazquez, Sanchez-Torres, Defoort, Loukianov, A Lyapunov-like
@@ -41,7 +41,7 @@ class PredefinedTime(AccelerationLaw):
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """As the class says, (m,) each."""
         first, second = self.share * self.t_f, (1.0 - self.share) * self.t_f
-        surface = pull(error, self.q1, first)
+        surface = phi(error, self.q1, first)
         squares = error_rate * jnp.abs(error_rate) + 2.0 * surface * jnp.abs(surface)
         s = error_rate + guards.signed_root(squares, jnp.zeros_like(bound))
         size = jnp.abs(error)
@@ -52,4 +52,4 @@ class PredefinedTime(AccelerationLaw):
         factor = (jnp.pi / (2.0 * self.q1 * first)) ** 2
         turning = factor * ((1.0 + self.q1) * grown + 1.0 - self.q1) * rest
         switching = (bound + 2.0 * turning) * guards.smooth_sign(s, self.sign_width)
-        return -pull(s, self.q2, second) - switching, s
+        return -phi(s, self.q2, second) - switching, s

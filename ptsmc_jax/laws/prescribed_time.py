@@ -34,7 +34,7 @@ class _Attitude(SecondOrder):
 
     model: Spacecraft  # the nominal plant
 
-    def pull(self) -> Scalar:
+    def reaching_gain(self) -> Scalar:
         """K1 of (60) [1/s]: half of what (29)'s K1 does."""
         return self.k1
 
@@ -161,8 +161,8 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         weights = [jnp.where(hold, held, c[i] * tau**i) for i, held in enumerate([*a, 1.0])]
         s = jnp.dot(jnp.stack(weights), x)
         rates = [jnp.where(hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
-        pull = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
-        known = jnp.dot(jnp.stack(rates), x[1:]) + pull * s
+        reaching = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
+        known = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
         wanted = -known - k2 * guards.smooth_sign(s, self.sign_width)
         u = (wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, jnp.reshape(s, 1)

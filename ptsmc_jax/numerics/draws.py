@@ -19,7 +19,7 @@ from ptsmc_jax.numerics import elementary
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
-Whole = int | np.integer | Array  # a whole number, negative ones wrap to 32 bits
+WholeNumber = int | np.integer | Array  # a whole number, negative ones wrap to 32 bits
 
 
 class Key(NamedTuple):
@@ -29,7 +29,7 @@ class Key(NamedTuple):
     b: Array
 
 
-def _word(value: Whole) -> Array:
+def _word(value: WholeNumber) -> Array:
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF))
     return jnp.asarray(value).astype(jnp.uint32)
@@ -52,7 +52,7 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
     return (both >> 32).astype(jnp.uint32), both.astype(jnp.uint32)
 
 
-def stream(seed: Whole, trial: Whole, name: str) -> Key:
+def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
     """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
     label = jnp.uint32(zlib.crc32(name.encode()))
     return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
@@ -63,7 +63,7 @@ def derive(seed: int, name: str) -> int:
     return int(stream(seed, 0, name).a)
 
 
-def _pairs(key: Key, sample: Whole, count: int) -> tuple[Word, Word]:
+def _pairs(key: Key, sample: WholeNumber, count: int) -> tuple[Word, Word]:
     """The words of so many numbers, two a block: (blocks,) each."""
     blocks = jnp.arange((count + 1) // 2, dtype=jnp.uint32)
     number = _word(sample)
@@ -77,7 +77,7 @@ def _unit(word: Array) -> Array:
     return jnp.minimum((word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32), below_one)
 
 
-def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
+def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
     """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits).
 
     >>> key = stream(seed=0, trial=7, name="attitude_noise")
@@ -87,7 +87,7 @@ def uniforms(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"
     return _unit(jnp.stack(_pairs(key, sample, count), axis=1).reshape(-1)[:count])
 
 
-def normals(key: Key, count: int, sample: Whole = 0) -> Float[Array, " {count}"]:
+def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
     """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
     a, b = _pairs(key, sample, count)
     radius = jnp.sqrt(-2.0 * elementary.log(_unit(a)))

@@ -95,9 +95,11 @@ class FiniteTimeObserver(Observer):
         """
         d_hat, off = jnp.split(memory, 2)
         pulled = off + dt * d_hat - impulse
-        reach, half = 1.1 * self.gain * dt * dt, 0.75 * jnp.sqrt(self.gain) * dt
-        xi = jnp.clip(pulled / jnp.where(reach > 0.0, reach, 1.0), -1.0, 1.0)
-        root = jnp.sqrt(half * half + jnp.maximum(jnp.abs(pulled) - reach, 0.0) + jnp.where(dt > 0.0, 0.0, 1.0)) - half
+        switched, half = 1.1 * self.gain * dt * dt, 0.75 * jnp.sqrt(self.gain) * dt
+        xi = jnp.clip(pulled / jnp.where(switched > 0.0, switched, 1.0), -1.0, 1.0)
+        root = (
+            jnp.sqrt(half * half + jnp.maximum(jnp.abs(pulled) - switched, 0.0) + jnp.where(dt > 0.0, 0.0, 1.0)) - half
+        )
         off = jnp.where(jnp.abs(xi) < 1.0, 0.0, root * root * xi)
         return jnp.concatenate([d_hat - 1.1 * self.gain * dt * xi, off])
 

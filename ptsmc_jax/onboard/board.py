@@ -73,7 +73,7 @@ def real(*shape: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
 
-def whole() -> jax.ShapeDtypeStruct:
+def integer() -> jax.ShapeDtypeStruct:
     """The shape of a yes or no."""
     return jax.ShapeDtypeStruct((), jnp.int32)
 
@@ -159,7 +159,7 @@ def _tracking(made: Board) -> None:
 
 def _filtering(made: Board, filter_: Any) -> None:
     """Star tracker and gyro through the attitude filter."""
-    made.inputs |= {"attitude": real(4), "attitude_valid": whole(), "rate": real(3)}
+    made.inputs |= {"attitude": real(4), "attitude_valid": integer(), "rate": real(3)}
     made.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
     made.about |= _MEASURED | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
@@ -262,7 +262,7 @@ def _commanding(made: Board, law: Law, observer: Observer) -> None:
             return {"out.command": u, "out.s": s, "now.law": after}
         last_unit, last_u, last_s = read[len(made.seen) :]
         distance = known.clearance(now, reference)
-        unit = jnp.where(tracking != 0, last_unit, known.whole_clearance(distance))
+        unit = jnp.where(tracking != 0, last_unit, known.clearance_unit(distance))
         clearance = distance / unit
         u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: (last_u, last_s, kept))
         return {"out.command": u, "out.s": s, "now.law": after, "now.clearance": clearance, "now.clearance_unit": unit}

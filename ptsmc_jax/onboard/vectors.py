@@ -72,7 +72,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         x_next = over_period(parts, now.t, x, drive, pushed, dt)
         known = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
-        unit = jnp.where(jnp.isnan(unit), law.whole_clearance(distance), unit)
+        unit = jnp.where(jnp.isnan(unit), law.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=dt > 0.0, measured=measured,
             valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,

@@ -45,7 +45,7 @@ class Actuators(Table, frozen=True):
         return {} if self.command_filter is None else self.command_filter.gains
 
     @property
-    def periods_late(self) -> int:
+    def delay_periods(self) -> int:
         """Control periods from measuring to acting."""
         return self.delay or 0
 
@@ -71,10 +71,10 @@ class Actuators(Table, frozen=True):
         from ptsmc_jax.numerics.pytrees import vector
 
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
-        if wheels is None and self.periods_late == 0 and all(value is None for value in values):
+        if wheels is None and self.delay_periods == 0 and all(value is None for value in values):
             return None
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
-        return Physics(limit, rate_limit, lag, step, wheels, self.periods_late)
+        return Physics(limit, rate_limit, lag, step, wheels, self.delay_periods)
 
 
 class Hardware(Actuators, frozen=True):

@@ -21,7 +21,7 @@ class Key(NamedTuple):
     default: Any  # None: off, or said in `meaning`; NODEFAULT: needed
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """Meaning and unit."""
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 

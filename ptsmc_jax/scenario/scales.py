@@ -34,9 +34,9 @@ def largest_k1(scenario: Any) -> float:
     order above 2 that of the slowest pole of its surface: an estimate. 0: there is none.
     """
     h = scenario.loop.period
-    late = float(scenario.devices.periods_late)
+    delay = float(scenario.devices.delay_periods)
     implicit = scenario.controller.implicit
-    border = borders.largest_reaching(scenario.controller.surface_rate * h, late, implicit=implicit)
+    border = borders.largest_reaching(scenario.controller.surface_rate * h, delay, implicit=implicit)
     reaching = min(border, math.log(1.0 / LEFT)) / h
     return scenario.reaching * reaching
 

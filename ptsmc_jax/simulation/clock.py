@@ -137,9 +137,9 @@ class Graded:
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 
 
-def anchored(period: float, t_end: float, t_f_max: float, late_max: float) -> Anchored:
-    """Anchored clock for any t_f up to t_f_max and any hand-over at most late_max before t_end; all in s."""
-    before, after = math.ceil(t_f_max / period), math.ceil(late_max / period) + 1
+def anchored(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
+    """Anchored clock for any t_f up to t_f_max and any hand-over at most longest_after before t_end; all in s."""
+    before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
     return Anchored(jnp.asarray(float(period)), jnp.asarray(float(t_end)), before, after)
 
 

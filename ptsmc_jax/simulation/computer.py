@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.simulation.assembly import Parts
 
 Scalar = Float[Array, ""]
@@ -80,7 +80,7 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
     return (ticks, length_before, partial_before), about, started
 
 
-def boot(parts: Parts, seed: Whole, trial: Whole, x0: Any, first: Ticks) -> Computer:
+def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ticks) -> Computer:
     """A flight computer before its first sample; x0: what sensors without noise see of the true state."""
     sensing = None if parts.sensors is None else parts.sensors.begin(seed, trial, x0, first)
     none = jnp.zeros(parts.plant.inputs)
@@ -159,5 +159,5 @@ def _kept(flown: Array, new: Any, old: Any) -> Any:
 
 def brought_about(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
     """What the flight software knows of what its actuators did in a period."""
-    push = actuators.told(drive, dt)
+    push = actuators.assumed(drive, dt)
     return push.mean, push.middle

@@ -34,7 +34,7 @@ class Start(NamedTuple):
     snapshot: Snapshot
     inputs: int  # of the plant
     wheel_momentum: Array | None  # (wheels,) [N m s]; None: no wheels
-    told: bool = False  # the law sees something else than the true state
+    measured: bool = False  # the law sees what sensors measure, not the true state
 
 
 class Arrival(NamedTuple):

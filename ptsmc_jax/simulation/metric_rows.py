@@ -24,14 +24,14 @@ class Running(NamedTuple):
 class Metric:
     """How a metric comes about; its unit and meaning stand in `catalogues`, for the plants that have it.
 
-    It changes after every interval of positive length by `update`, or by `update_late`, which sees intervals that
+    It changes after every interval of positive length by `update`, or by `update_after_t_f`, which sees intervals that
     reach beyond t_f only, and the errors at their ends. Its value is what it remembers at t_end, unless `value` makes
     another one of it. A metric that a run lacks is NaN from t = 0 on.
     """
 
     begin: Callable[[Start, Criteria], Any] = lambda start, criteria: jnp.zeros_like(criteria.t_f)
     update: Callable[[Any, Interval, Criteria], Any] | None = None
-    update_late: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
+    update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
     value: Callable[[Any, Running, Criteria], Array] = lambda memory, running, criteria: memory
     may_lack: bool = False  # a run that is finite may end with NaN
 
@@ -122,7 +122,7 @@ def _ringing(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     return largest if ringing is None else jnp.maximum(largest, ringing)
 
 
-def _late_ringing(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     """The largest at ends of intervals from t_f on; before, what it was."""
     ringing = interval.end.ringing
     if ringing is None:
@@ -191,9 +191,9 @@ def _pointing_rows() -> dict[str, Metric]:
             for k, axis in enumerate(pointing.AXES):
                 none, value = (lambda start, criteria: None), _from(first, of, k)
                 found[f"{index}_{axis}"] = Metric(begin=none, value=value, may_lack=True)
-    found["ape_x"] = replace(found["ape_x"], begin=_tally, update_late=_pointing)
-    told = lambda start, criteria: _tally(start, criteria) if start.told else None  # noqa: E731
-    found["ake_x"] = replace(found["ake_x"], begin=told, update_late=_knowledge)
+    found["ape_x"] = replace(found["ape_x"], begin=_tally, update_after_t_f=_pointing)
+    measured = lambda start, criteria: _tally(start, criteria) if start.measured else None  # noqa: E731
+    found["ake_x"] = replace(found["ake_x"], begin=measured, update_after_t_f=_knowledge)
     return found
 
 
@@ -201,17 +201,17 @@ METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
     "window_error": Metric(
-        update_late=_square_error, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
+        update_after_t_f=_square_error, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
     ),
     "hold_error": Metric(
-        update_late=_hold_error,
+        update_after_t_f=_hold_error,
         value=lambda largest, run, criteria: jnp.maximum(largest, guards.norm(run.arrival.error)),
     ),
     "window_angle": Metric(
-        update_late=_square_angle, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
+        update_after_t_f=_square_angle, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
     ),
     "hold_angle": Metric(
-        update_late=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
+        update_after_t_f=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
     ),
     "peak_torque": Metric(
         update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.commanded))
@@ -233,7 +233,7 @@ METRICS = {
         may_lack=True,
     ),
     "chattering": Metric(
-        begin=lambda start, criteria: jnp.zeros(start.inputs), update_late=_variation, value=_chattering
+        begin=lambda start, criteria: jnp.zeros(start.inputs), update_after_t_f=_variation, value=_chattering
     ),
     "peak_rate": Metric(
         begin=lambda start, criteria: start.snapshot.rate,
@@ -248,6 +248,6 @@ METRICS = {
         begin=lambda start, criteria: 0.0 * _wheels_at_start(start, criteria), update=_wheel_torque
     ),
     "peak_modal": Metric(begin=_ringing_at_start, update=_ringing),
-    "residual_modal": Metric(begin=_ringing_at_start, update=_late_ringing),
+    "residual_modal": Metric(begin=_ringing_at_start, update=_ringing_after_t_f),
     **_pointing_rows(),
 }

@@ -25,27 +25,27 @@ def begin(start: Start, criteria: Criteria) -> Running:
 
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
     """What is remembered after one interval; one of length zero changes nothing."""
-    lasts = interval.length > 0.0
+    has_length = interval.length > 0.0
     old = running.memories
     new = {
         name: old[name] if metric.update is None else metric.update(old[name], interval, criteria)
         for name, metric in METRICS.items()
-        if metric.update_late is None
+        if metric.update_after_t_f is None
     }
-    late = {name: old[name] for name, metric in METRICS.items() if metric.update_late is not None}
-    arrival, late = jax.lax.cond(
-        lasts & (interval.t_next >= criteria.t_f),
-        lambda: _update_late(running.arrival, late, interval, criteria),
-        lambda: (running.arrival, late),
+    after_t_f = {name: old[name] for name, metric in METRICS.items() if metric.update_after_t_f is not None}
+    arrival, after_t_f = jax.lax.cond(
+        has_length & (interval.t_next >= criteria.t_f),
+        lambda: _update_after_t_f(running.arrival, after_t_f, interval, criteria),
+        lambda: (running.arrival, after_t_f),
     )
-    return Running(arrival, {**guards.select(lasts, new, {name: old[name] for name in new}), **late})
+    return Running(arrival, {**guards.select(has_length, new, {name: old[name] for name in new}), **after_t_f})
 
 
-def _update_late(arrival: Arrival, memories: dict, interval: Interval, criteria: Criteria) -> tuple[Arrival, dict]:
+def _update_after_t_f(arrival: Arrival, memories: dict, interval: Interval, criteria: Criteria) -> tuple[Arrival, dict]:
     """What is judged from t_f on, after an interval that reaches t_f."""
     errors = interval.errors()
     arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: arrival)
-    updates = {name: METRICS[name].update_late for name in memories}
+    updates = {name: METRICS[name].update_after_t_f for name in memories}
     return arrival, {
         name: update(memories[name], interval, errors, criteria) for name, update in updates.items() if update
     }

@@ -13,7 +13,7 @@ import numpy as np
 from ptsmc_jax.simulation.catalogues import CATALOGUE, WITHIN
 
 
-def least_within(trials: int, quantile: float | None, confidence: float | None) -> int | None:
+def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
     """How many of so many trials must keep a limit; None: so few trials cannot show it.
 
     All of them where no quantile is asked for; with a confidence, the least number with which the one-sided lower bound
@@ -89,7 +89,7 @@ class Verdict:
             return self.quantile is not None and self.shown >= self.quantile
         if self.interpretation == "temporal":
             return self.failures == 0
-        least = least_within(self.trials, self.quantile, self.confidence)
+        least = must_keep(self.trials, self.quantile, self.confidence)
         return least is not None and self.trials - self.failures >= least
 
     def __str__(self) -> str:
@@ -161,7 +161,7 @@ def verdict_text(
         seen = "no value" if trials == 1 else "no worst value"
     else:
         seen = f"worst {worst:.4g}" if trials > 1 else f"{worst:.4g}"
-    least = least_within(trials, quantile, confidence)
+    least = must_keep(trials, quantile, confidence)
     if least is None:
         assert quantile is not None
         assert confidence is not None
@@ -215,7 +215,7 @@ class Requirement:
         known = np.where(ok, values, np.nan)
         worst = float(np.min(known) if self.at_least else np.max(known))
         share = (None, None) if single else (self.quantile, self.confidence)
-        least = least_within(values.size, *share)
+        least = must_keep(values.size, *share)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan
         margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)

@@ -15,7 +15,7 @@ from ptsmc_jax.devices.actuators import Actuators, Drive
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import draws, guards, integrators, matrices
-from ptsmc_jax.numerics.draws import Whole
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
@@ -56,7 +56,7 @@ class Log(NamedTuple):
     reference: Any  # what the reference is then
     error: Array  # what the law drives to zero: the attitude error vector [-], for a chain x_1
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
-    lasts: Array  # bool: the row starts an interval of positive length, or is the last
+    has_length: Array  # bool: the row starts an interval of positive length, or is the last
 
 
 class Result(NamedTuple):
@@ -97,7 +97,7 @@ class _World(NamedTuple):
 
 
 def simulate(
-    parts: Parts, seed: Whole = 0, trial: Whole = 0, record: bool = False, software: Software = OURS
+    parts: Parts, seed: WholeNumber = 0, trial: WholeNumber = 0, record: bool = False, software: Software = OURS
 ) -> Result:
     """One closed-loop run. seed, trial: whole numbers below 2^32 that name its noise; record: return the history too.
 
@@ -108,7 +108,7 @@ def simulate(
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, parts.pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
-    clearance = parts.controller.whole_clearance(parts.controller.clearance(x0, target))
+    clearance = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
     arrival = parts.reference(criteria.t_f)
     course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(clearance), _gap(ticks, parts.t_end))
     if parts.clock.sampled:
@@ -123,7 +123,7 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
-def walk_stream(seed: Whole, trial: Whole) -> draws.Key:
+def walk_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
     """The stream that a trial's random walk of the disturbance is drawn from."""
     return draws.stream(seed, trial, DISTURBANCE_WALK)
 
@@ -278,10 +278,10 @@ class _Torques(NamedTuple):
     wheel_torque: Array | None = None
 
 
-def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step, told=None) -> _State:
+def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torques, until, step, seen=None) -> _State:
     """The state after an interval: metrics and status. until: time in it -> the plant's state then.
 
-    step: longest integration step taken in it [s]; told: what the law was told of the state at its start.
+    step: longest integration step taken in it [s]; seen: what the law saw of the state at its start.
     """
     law, criteria, target_next = parts.controller, course.criteria, parts.reference(now.t_next)
     snapshot = _snapshot(parts, target_next, x)
@@ -298,7 +298,7 @@ def _advance(parts, course, state: _State, now: Ticks, target, x, torques: _Torq
         frame, length = parts.pointing.frame, now.t_next - now.t
         observed = (
             lambda: pointing.course((state.x, target), (x, target_next), frame, length),
-            None if told is None else lambda: pointing.held(told.q, state.x.q, frame, length),
+            None if seen is None else lambda: pointing.held(seen.q, state.x.q, frame, length),
         )
     interval = Interval(now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, *torques, *observed)
     after = state._replace(
@@ -343,7 +343,7 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
 
 
 def _start(parts: Parts, snapshot: Snapshot, wheels: Array | None) -> Start:
-    return Start(snapshot, parts.plant.inputs, wheels, told=parts.sensors is not None)
+    return Start(snapshot, parts.plant.inputs, wheels, measured=parts.sensors is not None)
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
@@ -364,7 +364,7 @@ def _watch(
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)
 
 
-def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, lasts, pushed=None, wheels=None) -> Log:
+def _row(parts: Parts, t, x, target, d_hat, u, commanded, s, has_length, pushed=None, wheels=None) -> Log:
     d = parts.disturbance(t, x)
     error, _ = parts.controller.errors(x, target)
-    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, wheels, lasts)
+    return Log(t, x, d_hat, u, commanded, s, d if pushed is None else d + pushed, target, error, wheels, has_length)

@@ -1,7 +1,7 @@
 """Borders of stability of the sampled double integrator under proportional and derivative feedback, in closed form.
 
 Near the reference each component of the attitude error obeys eps'' = a, with the law's a = -kp eps - kd eps' computed
-from samples and held, periods late where there is a delay: kp and kd are (57)'s and (60)'s with the smooth sign's
+from samples and held, periods later where there is a delay: kp and kd are (57)'s and (60)'s with the smooth sign's
 slope. What bounds of gains and the lines of a map are drawn from, before there is a loop to linearise (`linear`).
 """
 
@@ -25,10 +25,10 @@ def gains(
     return kp, kd
 
 
-def _closed(kp: float, kd: float, h: float, late: float) -> np.ndarray:
-    """Matrix of a period of the frozen loop; late: delay in periods, any number of at least 0."""
-    whole = int(np.floor(late))
-    part = late - whole  # the command of `whole` periods ago acts from here on, the one before until then
+def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
+    """Matrix of a period of the frozen loop; delay: in periods, any number of at least 0."""
+    whole = int(np.floor(delay))
+    part = delay - whole  # the command of `whole` periods ago acts from here on, the one before until then
     n = 2 + whole + (part > 0)
     move = np.eye(n)
     move[0, 1] = h
@@ -56,9 +56,9 @@ def _closed(kp: float, kd: float, h: float, late: float) -> np.ndarray:
     return move
 
 
-def radius(kp: float, kd: float, h: float, late: float = 0.0) -> float:
-    """Largest modulus of the frozen loop's poles: below 1 it is stable. h: period [s]; late: delay in periods."""
-    return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, late))).max())
+def radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
+    """Largest modulus of the frozen loop's poles: below 1 it is stable. h: period [s]; delay: in periods."""
+    return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, delay))).max())
 
 
 def _last(stable, low: float, high: float) -> float:
@@ -82,7 +82,7 @@ def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
     return eta * (1.0 - share) / g, (tau - 1.0 + eta - share * tau) / g
 
 
-def largest_index(eta: float, late: float = 0.0, *, implicit: bool = False) -> float:
+def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> float:
     """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay.
 
     implicit: with implicit sampling; infinite where it is stable down to a period before t_f.
@@ -91,24 +91,24 @@ def largest_index(eta: float, late: float = 0.0, *, implicit: bool = False) -> f
     def stable(index: float) -> bool:
         tau = (2 * eta - 1) / index
         kp, kd = implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
-        return radius(kp, kd, 1.0, late) < 1.0
+        return radius(kp, kd, 1.0, delay) < 1.0
 
     return _last(stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
 
 
-def smallest_delta(eta: float, h: float, late: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
+def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
     """Smallest delta [s] for which the last sample before the hand-over is stable.
 
     On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
     may lie at the hand-over itself: (eta - 1/2) h. With implicit sampling and without delay there is no border: 0.
     """
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, late, implicit=implicit) - float(anchored)) * h)
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - float(anchored)) * h)
 
 
-def largest_reaching(surface: float, late: float = 0.0, *, implicit: bool = False) -> float:
+def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = False) -> float:
     """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
 
-    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. late: delay in periods.
+    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. delay: in periods.
     The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
     a period whatever the loop does, as long as it knows the torque that acts.
 
@@ -120,6 +120,6 @@ def largest_reaching(surface: float, late: float = 0.0, *, implicit: bool = Fals
         if implicit:
             moved = -np.expm1(-reaching)
             kp, kd = surface * moved / (1 + surface / 2), (surface + moved) / (1 + surface / 2)
-        return radius(kp, kd, 1.0, late) < 1.0
+        return radius(kp, kd, 1.0, delay) < 1.0
 
     return _last(stable, 1e-6, 40.0 if implicit else 4.0) if stable(1e-6) else 0.0

@@ -117,7 +117,7 @@ def brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], 
     far.append(jnp.where(even, jnp.abs(left), jnp.inf))
     near = jnp.abs(1.0 + seen) ** 2
     least = jnp.append(jnp.inf, jnp.where((near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:]), near[1:-1], jnp.inf))
-    values, places = zip(*(_least(v) for v in (*far, least)), strict=True)
+    values, places = zip(*(_smallest(v) for v in (*far, least)), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
     slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
     zero = [jnp.append(imag[j + e][: SPLIT[0]], size[j + e][SPLIT[0] :]) for e in (0, 1)]
@@ -126,7 +126,7 @@ def brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], 
     return (*begin, *off), jnp.isfinite(jnp.concatenate(values)), w[jnp.stack([jnp.argmin(near), 0, -1])]
 
 
-def _least(values: Array) -> tuple[Array, Array]:
+def _smallest(values: Array) -> tuple[Array, Array]:
     """The `NEAREST` least of them and their places, in order; several times as fast as to sort them all."""
     found = []
     for _ in range(NEAREST):
@@ -159,7 +159,7 @@ def _even(seen: Array) -> tuple[Array, Array]:
     return there, size[:-1] / jnp.where(there, size[:-1] - size[1:], 1.0)
 
 
-def late_at(w: Array, seen: Array) -> tuple[Array, Array]:
+def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
     """Delays [s] that turn L to -1 where |L| is 1, and frequencies [rad/s]; infinite where it is not, (points - 1,)."""
     there, left = even_at(seen)
     at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _even(seen)[1], 0.0)

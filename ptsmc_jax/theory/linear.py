@@ -6,10 +6,11 @@ of the actuators among it. Closed are
 
     z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
 
-with x_seen the part of x that sensors see; u_new, u_old = u, `delay` periods ago, which acts from `late` on, and a
-period before that, until then; d a torque on the plant. The flight computer is told what its own model of the actuators
-makes of u: a gain or a delay at the plant's input is one that it does not know. About the nominal run: no noise and no
-disturbance; of a star tracker that is slower than the loop the mean over its interval.
+with x_seen the part of x that sensors see; u_new the command of `delay` periods ago, which acts from the share `part`
+of the period on, and u_old the one before it, which acts until then; d a torque on the plant. The flight computer is
+told what its own model of the actuators makes of u: it knows nothing of a gain or a delay at the plant's input. All is
+linearised about the nominal run, without noise and disturbance; of a star tracker that is slower than the loop the mean
+over its interval is taken.
 """
 
 from collections.abc import Sequence
@@ -52,7 +53,7 @@ class Loop:
 
     a: Leaf  # (n, n) A
     seen: Leaf  # (n, k) B
-    new: Leaf  # (nodes, n, m) N, for `late` at NODES of a period
+    new: Leaf  # (nodes, n, m) N, for `part` at NODES of a period
     old: Leaf  # (nodes, n, m) O
     command: Leaf  # (m, n) C
     direct: Leaf  # (m, k) D
@@ -172,11 +173,11 @@ class _Local:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
         near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
-        acting, memory, told, model, kept, law, filtered = near
+        acting, memory, applied, model, kept, law, filtered = near
         inside = base.computer.sensing
         inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
         law = _with_numbers(base.computer.law, law)
-        computer = Computer(inside, self._model.moved(base.computer.seen, seen), memory, law, told, filtered)
+        computer = Computer(inside, self._model.moved(base.computer.seen, seen), memory, law, applied, filtered)
         return Carry(plant.moved(base.x, x), acting, computer, model)
 
     def apart(self, other: Carry) -> Array:
@@ -226,9 +227,9 @@ def opened(parts: Parts, during: Nominal) -> Opened:
         x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
         return there.apart(Carry(x, acting, computer, model)), decision.u, decision.s
 
-    def pushed(late: Scalar) -> tuple[Array, Array, Array]:
+    def pushed(part: Scalar) -> tuple[Array, Array, Array]:
         def ended(old: Array, new: Array, d: Array) -> Array:
-            commands = [(arriving + old, now.t, late * dt), (arriving + new, now.t + late * dt, (1.0 - late) * dt)]
+            commands = [(arriving + old, now.t, part * dt), (arriving + new, now.t + part * dt, (1.0 - part) * dt)]
             x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
             return there.apart(after._replace(x=x, acting=acting))
 
@@ -290,16 +291,16 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
-def whole_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
+def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
     ticks, period = run.period.now, parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
     whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
     return np.flatnonzero(whole & (np.asarray(ticks.hold) == hold))
 
 
-def acting(loop: Loop, late: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
+def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
     """N and O, (n, m) each, for a command [N m] that is late by a share of a period, by polynomials through NODES."""
-    gap = late - xp.asarray(NODES)
+    gap = part - xp.asarray(NODES)
     on = xp.abs(gap) < 1e-14
     weights = xp.asarray(_WEIGHTS) / xp.where(on, 1.0, gap)
     weights = xp.where(xp.any(on), on.astype(float), weights / xp.sum(weights))
@@ -325,10 +326,10 @@ class Opening(NamedTuple):
         return -self.c @ jnp.linalg.solve(z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j)
 
 
-def at_input(loop: Loop, late: float = 0.0, xp: Any = jnp) -> Opening:
+def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
     """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
     a, command = loop.closed_at_sensors(xp)
-    (m, n), total = command.shape, loop.delay + late
+    (m, n), total = command.shape, loop.delay + extra_delay
     whole = int(np.floor(total + 1e-12))
     part = max(total - whole, 0.0)
     pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # of the commands of so many periods ago
@@ -353,20 +354,20 @@ def at_sensors(loop: Loop) -> Opening:
     return Opening(full, b, jnp.eye(k, n + kept))
 
 
-def one_late(loop: Loop, z: Array, late: Scalar, axis: Any) -> Complex[Array, "m m"]:
+def delayed_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Complex[Array, "m m"]:
     """L(z) [-] at the plant's input, (m, m), one axis late by any number of periods more."""
     a, command = loop.closed_at_sensors()
-    whole = jnp.floor(late)
-    new, old = acting(loop, late - whole)
+    whole = jnp.floor(extra_delay)
+    new, old = acting(loop, extra_delay - whole)
     delayed = (new + old / z) * z**-whole
     sent = jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0])
     return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent))
 
 
-def radius(loop: Loop, gain: Any = 1.0, late: float = 0.0) -> float:
+def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
     """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1.
 
     In NumPy: with every delay the matrix has another size, and would be another program.
     """
-    closed = at_input(jax.tree.map(np.asarray, loop), late, np).closed(gain)
+    closed = at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
     return float(np.abs(np.linalg.eigvals(closed)).max())

@@ -56,11 +56,10 @@ class Margins(NamedTuple):
 FIELDS = Margins._fields[:5]  # that are margins
 
 
-@programs.jit(static_argnames=("sensors", "late"))
-@programs.jit(static_argnames=("sensors", "late"))
-def of_each(loops: Loop, sensors: bool = False, late: bool = True) -> Margins:
+@programs.jit(static_argnames=("sensors", "with_delay"))
+def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Margins of several loops, arrays over them first; see `of`."""
-    return jax.lax.map(partial(of, sensors=sensors, late=late), loops)
+    return jax.lax.map(partial(of, sensors=sensors, with_delay=with_delay), loops)
 
 
 class _Seen(NamedTuple):
@@ -99,10 +98,10 @@ def _look(loop: Loop, sensors: bool) -> _Seen:
     return _Seen(finite, loop, opening, quick, stable, w, each.T)
 
 
-def of(loop: Loop, sensors: bool = False, late: bool = True) -> Margins:
+def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Margins of each axis of an opened loop; sensors: opened there, of each coordinate that they see, not of delay.
 
-    NaN where the loop has a number that is not finite; late: of delay too, else it is NaN.
+    NaN where the loop has a number that is not finite; with_delay: of delay too, else it is NaN.
     """
     seen = _look(loop, sensors)
     begin, there, elsewhere = jax.vmap(partial(crossings.brackets, seen.w))(seen.each)
@@ -111,7 +110,7 @@ def of(loop: Loop, sensors: bool = False, late: bool = True) -> Margins:
     found = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, there, seen.stable)
     axes = jnp.arange(root.shape[0])
     delay = jnp.full(axes.size, jnp.nan)
-    if late and not sensors:
+    if with_delay and not sensors:
         delay = jax.vmap(partial(_delay, seen.loop, seen.w))(seen.each, axes)
     found = found._replace(delay=jnp.where(seen.stable, delay, 0.0))
     return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(seen.finite, v, jnp.nan), found)
@@ -154,12 +153,12 @@ def roughly(loop: Loop) -> dict[str, Array]:
     """
     found = _look(loop, sensors=False)
     gain, phase, modulus = jax.vmap(crossings.straight)(found.each)
-    late = jnp.min(jax.vmap(partial(crossings.late_at, found.w))(found.each)[0], axis=1)
+    delay = jnp.min(jax.vmap(partial(crossings.delay_at, found.w))(found.each)[0], axis=1)
     sign = jnp.where(found.stable, 1.0, -1.0)
     each = {
         "gain_margin": jnp.where(found.stable & (gain >= MOST), jnp.inf, sign * jnp.minimum(gain, MOST)),
         "phase_margin": sign * phase,
-        "delay_margin": jnp.where(found.stable, late, 0.0),
+        "delay_margin": jnp.where(found.stable, delay, 0.0),
         "modulus_margin": jnp.where(found.stable, modulus, MOST),
     }
     return {name: jnp.where(found.finite, v, jnp.nan) for name, v in each.items()}
@@ -193,14 +192,14 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
 
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    sizes, crossed = crossings.late_at(w, seen)
+    sizes, crossed = crossings.delay_at(w, seen)
     j = jnp.argmin(sizes)
     known = jnp.isfinite(sizes[j])
     start = jnp.stack([jnp.log(crossed[j]), sizes[j] / loop.period])
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
-        value = -crossings.one_axis(linear.one_late(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
+        value = -crossings.one_axis(linear.delayed_axis(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
     def step(x: Array) -> Array:
@@ -332,7 +331,7 @@ def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     Without a whole period before the hand-over those in hold are both.
     """
     run = linear.nominal_jit(parts)
-    before = linear.whole_periods(parts, run, hold=False)[-1:]
+    before = linear.full_periods(parts, run, hold=False)[-1:]
     left = float(parts.controller.t_f) - np.asarray(run.period.now.t)[before]
     found = at(parts, jnp.asarray(left), run)
     ends = {"hand_over": 0, "hold": -1}
@@ -346,8 +345,8 @@ def together(loop: Loop) -> dict[str, float]:
     [dB], [deg], [s]: infinite beyond 80 dB and 200 periods, `nan` where the loop itself is unstable.
     """
 
-    def unstable(gain: Any = 1.0, late: float = 0.0) -> bool:
-        return not linear.radius(loop, gain, late) < 1.0 + NEUTRAL
+    def unstable(gain: Any = 1.0, delay: float = 0.0) -> bool:
+        return not linear.radius(loop, gain, delay) < 1.0 + NEUTRAL
 
     def first(lost: Callable[[float], bool], values: np.ndarray) -> float:
         """The least of these values, closed in on, at which it is unstable."""
@@ -371,7 +370,7 @@ def together(loop: Loop) -> dict[str, float]:
         first(lambda dB: unstable(10.0 ** (dB / 20.0)), decibels),
         first(lambda dB: unstable(10.0 ** (-dB / 20.0)), decibels),
         first(lambda angle: unstable(np.exp(-1j * np.deg2rad(angle))), degrees),
-        first(lambda late: unstable(late=late), periods) * float(loop.period),
+        first(lambda delay: unstable(delay=delay), periods) * float(loop.period),
         float(-20.0 * np.log10(least)),
     )
     return dict(zip(FIELDS, found, strict=True))

@@ -120,7 +120,7 @@ def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, togethe
     """As accelerators make them: some of a shard's, which do not follow one another, and the last one is short."""
     made, frame = flown
     monkeypatch.setattr(campaign, "PART", 40)
-    monkeypatch.setattr(montecarlo, "abreast", lambda: 40 * together // len(jax.local_devices()))
+    monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(jax.local_devices()))
     flights = []
 
     def make(trials):
@@ -165,7 +165,7 @@ def test_failures_are_tallied(flown, tmp_path):
 def overshoot(result, parts):
     error = jnp.sqrt(jnp.sum(result.log.error**2, axis=-1))
     late = result.log.t > parts.controller.t_f
-    return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.lasts)}
+    return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.has_length)}
 
 
 def test_metrics_of_ones_own_stand_in_the_rows(flown):

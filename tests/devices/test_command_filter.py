@@ -77,7 +77,7 @@ def test_the_loop_of_linear_theory_has_the_filter_in_it():
     for hardware in ({}, {"hardware": {"command_filter": {"kind": "second_order", "corner": 6.0, "damping": 0.7}}}):
         parts = scenario.study(scenario.from_tables({**ALONE, **hardware})).parts
         run = linear.nominal_jit(parts)
-        loops = linear.loops_in(parts, run, linear.whole_periods(parts, run, hold=True)[-1:])
+        loops = linear.loops_in(parts, run, linear.full_periods(parts, run, hold=True)[-1:])
         opening = linear.at_input(jax.tree.map(lambda v: v[0], loops))
         found.append([np.asarray(opening.response(jnp.exp(1j * w * H))) for w in tones])
     b, a = signal.bilinear([36.0], [1.0, 2 * 0.7 * 6.0, 36.0], fs=6.0 / (2 * np.tan(6.0 * H / 2)))

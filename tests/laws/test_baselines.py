@@ -112,7 +112,7 @@ def flown(law, angle, rate, t_end, period=0.005):
                         t_end=t_end, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
     run = replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))
     log = rollout.simulate_jit(run, record=True).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     return np.asarray(log.t)[kept], np.asarray(log.error)[kept, 2]
 
 

@@ -267,7 +267,7 @@ def flown(run, trial=0, status=rollout.OK) -> Any:
     found = rollout.simulate_jit(run, trial=np.uint32(trial), record=True)
     assert found.status == status
     log = jax.tree.map(np.asarray, found.log)
-    return jax.tree.map(lambda v: v[log.lasts] if v.ndim else v, log)
+    return jax.tree.map(lambda v: v[log.has_length] if v.ndim else v, log)
 
 
 def looped(name, law, x0, times, disturbance=(0.0, 1.0, 0.0, 0.0), bound=0.0):
@@ -476,10 +476,10 @@ MEASURED = {1e-3: 0.051, 1.0: 0.308, 1e3: 0.553}  # share of T_1 + T_2 that it n
 def test_what_pulls_is_at_zero_when_its_closed_form_says(x):
     """T 2/pi atan(|x|^q), below T wherever it starts; integrated over y = x^q, without the singularity at zero."""
     q, settling = 0.3, 4.0
-    pull = jax.jit(lambda x: predefined_time.pull(x, vector(q), vector(settling)))
+    phi = jax.jit(lambda x: predefined_time.phi(x, vector(q), vector(settling)))
 
     def passing(y):
-        return y ** (1.0 / q - 1.0) / q / float(pull(vector([y ** (1.0 / q)]))[0])
+        return y ** (1.0 / q - 1.0) / q / float(phi(vector([y ** (1.0 / q)]))[0])
 
     arrival = quad(passing, 0.0, x**q, epsrel=1e-10)[0]
     np.testing.assert_allclose(arrival, settling * 2.0 / np.pi * np.arctan(x**q), rtol=1e-9)

@@ -46,7 +46,7 @@ def study(order=2, bound=0.0, disturbance=0.0, x0=None, **controller):
 def flown(parts):
     """Times, states and s at the samples."""
     log = rollout.simulate_jit(parts, record=True).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     return tuple(np.asarray(v)[kept][:-1] for v in (log.t, log.x, log.s[:, 0], log.u[:, 0]))
 
 

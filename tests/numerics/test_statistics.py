@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.simulation.requirements import fewest_trials, least_within
+from ptsmc_jax.simulation.requirements import fewest_trials, must_keep
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (3, 20), (20, 20), (2398, 2400), (999_999, 1_000_000)])
@@ -25,8 +25,8 @@ def test_the_fewest_trials_are_those_of_the_tables():
         assert statistics.fewest_for(0, quantile, confidence) == fewest_trials(quantile, confidence)
         for failures in (1, 7):
             n = statistics.fewest_for(failures, quantile, confidence)
-            assert least_within(n, quantile, confidence) == n - failures
-            fewer = least_within(n - 1, quantile, confidence)
+            assert must_keep(n, quantile, confidence) == n - failures
+            fewer = must_keep(n - 1, quantile, confidence)
             assert fewer is None or fewer > n - 1 - failures
 
 

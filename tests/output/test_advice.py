@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 
-from ptsmc_jax.simulation.requirements import Requirement, least_within
+from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from tuning.cli import campaign_commands
 from tuning.output import search_sentences
 from tuning.search import confirm
@@ -31,7 +31,7 @@ def test_a_quantile_takes_as_many_trials_as_may_break_it(quantile, confidence):
     """With 299 trials 99 % at 95 % allows none beyond the limit: a search on them asks for every one."""
     wanted = [Requirement("peak_torque", 0.5, None, quantile, confidence)]
     trials = confirm.training_trials(wanted, 256)
-    least = least_within(trials, quantile, confidence)
+    least = must_keep(trials, quantile, confidence)
     assert least is not None
     assert trials - least >= 1
     assert confirm.training_trials(wanted, 5000) == 5000

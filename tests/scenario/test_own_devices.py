@@ -79,7 +79,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     """u = -2 x_1 - 2 x_2 of what is seen: x_1 of the sample before, and the noise of (seed, trial, sample)."""
     parts = parts_of(sensors={**NOISY, "sigma": [0.02, 0.03]}, disturbance={"kind": "none"})
     log = rollout.simulate_jit(parts, 3, 7, record=True).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     sample = np.asarray(ticks.sample)[np.asarray(ticks.t_next > ticks.t)]

@@ -181,7 +181,7 @@ def test_a_disturbance_and_an_observer_do_what_they_say(here):
     assert steps[0] == steps[1]  # `fastest` sets the pace as the keys of the built-in one do
 
     watched = flown({**own_one, "observer": {"kind": "own", "code": "other.py:Filtered", "share": 0.7}})
-    kept = np.asarray(watched.log.lasts)
+    kept = np.asarray(watched.log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (watched.log.t, watched.log.x, watched.log.u))
     seen = np.diff(x[:, 1]) / np.diff(t) - u[:-1, 0]  # x_2' = u + d: the mean of d over each period
     wanted = 0.7 * seen[1:] + 0.3 * seen[:-1]
@@ -351,7 +351,7 @@ def test_a_law_flies_what_its_step_remembers():
 
     tables = {**CHAIN, "controller": {"kind": "own", "code": Integral, "t_f": 5.0}}
     log = flown(tables).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
     total = np.cumsum(np.diff(t) * x[:-1, 0])
     np.testing.assert_allclose(u[:-1, 0], -2.0 * x[:-1, 0] - 2.0 * x[:-1, 1] - 0.3 * total, atol=1e-13)

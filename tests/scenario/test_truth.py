@@ -44,7 +44,7 @@ def test_the_truth_flies_under_a_law_that_knows_the_model():
     """
     parts = scenario.study(scenario.from_tables(TABLES)).parts
     log = rollout.simulate_jit(parts, record=True).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     x, u = np.asarray(log.x)[kept], np.asarray(log.u)[kept]
     block = expm(PERIOD * np.array([[0.0, 1.0, 0.0], [-0.5, -0.3, 1.2], [0.0, 0.0, 0.0]]))
     state = np.array([1.0, -0.2])
@@ -59,7 +59,7 @@ def test_the_observer_sees_what_the_model_leaves_out():
     """At rest off the origin the truth pulls by -0.5 x_1: what an observer that knows 1/s^2 takes for a disturbance."""
     tables = {**TABLES, "observer": {"kind": "nonlinear", "gain": [5.0]}}
     log = rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts, record=True).log
-    kept = np.asarray(log.lasts)
+    kept = np.asarray(log.has_length)
     x, u, seen = (np.asarray(v)[kept] for v in (log.x, log.u, log.d_hat))
     left_out = -0.5 * x[:, 0] - 0.3 * x[:, 1] + 0.2 * u[:, 0]
     # the estimate follows at 5 1/s what changes at about 1 1/s: a fifth of its rate, and a period, behind

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.simulation.requirements import Requirement, least_within
+from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from tests import helpers
 from tests.search.test_tuning import SPREAD, problem
 from tuning.search import confirm, gains, objective, optimise, shares
@@ -23,7 +23,7 @@ def test_probability_is_the_verdicts_over_shares_that_the_count_allows(requireme
     """The share integrated out by brute force: Bayes with a uniform prior on a grid, then the verdict's binomial."""
     share = (np.arange(20_000) + 0.5) / 20_000
     weight = binom.pmf(beyond, 4096, share)
-    least = least_within(1000, requirement.quantile, requirement.confidence)
+    least = must_keep(1000, requirement.quantile, requirement.confidence)
     assert least is not None
     most = 1000 - least
     expected = np.sum(weight * binom.cdf(most, 1000, share)) / np.sum(weight)
@@ -54,7 +54,7 @@ def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch):
     limit, seed = 0.7, 2  # whose first eight angles lie within 100 degrees; others go up to 140
     wanted = [Requirement("peak_torque", limit, None, 0.9)]
     parts = problem(peak_torque=limit).parts
-    some = replace(objective.problem(parts, SPREAD, seed, np.arange(8), limits.names, wanted), least=(8,))
+    some = replace(objective.problem(parts, SPREAD, seed, np.arange(8), limits.names, wanted), must_keep=(8,))
     found = optimise.search(Evaluator(limits), some, wanted, np.array([3.0, 0.5]), 2, 20, 1)
     (last,) = found.counts
     assert last.held

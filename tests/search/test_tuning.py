@@ -167,7 +167,7 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
 @pytest.mark.parametrize("least", helpers.short([1, 5, 8], [5]))
 def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
     """The largest c is that order statistic of the averaged trials; of added trials those count that are said to."""
-    some = replace(problem(peak_torque=0.7, effort=5.0), least=(least, None))
+    some = replace(problem(peak_torque=0.7, effort=5.0), must_keep=(least, None))
     some = objective.with_trials(some, np.arange(8, 11))  # they must keep what every trial must keep
     _, c, _ = measure(some, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
@@ -177,7 +177,7 @@ def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(leas
 
 
 def test_slopes_of_tail_and_share_agree_with_central_differences():
-    some = replace(problem(peak_torque=0.7), tail=2, least=(6,))
+    some = replace(problem(peak_torque=0.7), tail=2, must_keep=(6,))
 
     @jax.jit
     def value(gains):
@@ -327,11 +327,11 @@ def test_gains_that_active_limits_hang_on_are_held_but_for_two(rows, held):
 
 
 def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
-    some = replace(problem(peak_torque=0.7, effort=5.0), least=(6, None), tail=2)
+    some = replace(problem(peak_torque=0.7, effort=5.0), must_keep=(6, None), tail=2)
     some = objective.with_trials(some, np.arange(8, 11))
     fewer = objective.fewer_trials(some, 4)
     assert np.asarray(fewer.trials).tolist() == [0, 1, 2, 3, 8, 9, 10]
-    assert (fewer.averaged, fewer.least, fewer.tail) == (4, (3, None), 1)
+    assert (fewer.averaged, fewer.must_keep, fewer.tail) == (4, (3, None), 1)
     _, c, _ = measure(fewer, vector([3.0, 0.7]))
     flown = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.r_[:4, 8:11])
     np.testing.assert_allclose(c[1] + 1, flown.metrics.effort / 5.0, rtol=1e-10)

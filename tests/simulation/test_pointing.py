@@ -166,7 +166,7 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     ready, result = flown
     frame = np.array(ready.parts.pointing.frame)
     log = jax.tree.map(np.array, result.log)
-    kept = log.lasts
+    kept = log.has_length
     t, q, w = log.t[kept], log.x.q[kept], log.x.w[kept]
     target, rate = log.reference.q[kept], log.reference.w[kept]
 

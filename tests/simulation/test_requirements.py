@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from ptsmc_jax.simulation.catalogues import CATALOGUE
-from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, must_keep
 
 LIMIT = 0.5
 BEYOND = np.nextafter(LIMIT, 1.0)
@@ -75,7 +75,7 @@ def test_a_verdict_in_words():
 def test_a_share_is_shown_when_chance_alone_would_seldom_show_it(quantile, confidence, trials):
     """The definition by the binomial distribution: were the true share no better, at most 1 - confidence of campaigns
     would see as many trials within the limit; one trial fewer would not be enough."""
-    least = least_within(trials, quantile, confidence)
+    least = must_keep(trials, quantile, confidence)
     if least is None:
         assert trials < fewest_trials(quantile, confidence)
         assert quantile**trials > 1 - confidence  # not even all of them would do
@@ -87,10 +87,10 @@ def test_a_share_is_shown_when_chance_alone_would_seldom_show_it(quantile, confi
 
 def test_the_usual_three_sigma_requirement_takes_852_trials():
     assert fewest_trials(0.9973, 0.9) == 852
-    assert least_within(852, 0.9973, 0.9) == 852
-    assert least_within(851, 0.9973, 0.9) is None
-    assert least_within(1000, 0.9973, None) == 998  # what is seen, with no confidence
-    assert least_within(1000, None, None) == 1000
+    assert must_keep(852, 0.9973, 0.9) == 852
+    assert must_keep(851, 0.9973, 0.9) is None
+    assert must_keep(1000, 0.9973, None) == 998  # what is seen, with no confidence
+    assert must_keep(1000, None, None) == 1000
 
 
 @pytest.mark.parametrize(("beyond", "quantile", "confidence", "met"), [
@@ -110,7 +110,7 @@ def test_a_requirement_on_a_share_of_the_trials(beyond, quantile, confidence, me
             assert moved.verdict(values, np.ones(1000, bool)).met == does
         assert (told.margin <= 1.0) == met
     else:
-        assert least_within(1000, quantile, confidence) is None
+        assert must_keep(1000, quantile, confidence) is None
 
 
 def test_trials_that_failed_use_up_what_a_share_allows():
@@ -140,7 +140,7 @@ def test_as_many_trials_as_it_takes_are_enough_whatever_rounding_says(trials, qu
         confidence = float(1.0 - quantile**trials * (1.0 + digits * 2.0**-52))
         needed = fewest_trials(quantile, confidence)
         assert needed in (trials, trials + 1)
-        assert least_within(needed, quantile, confidence) == needed
+        assert must_keep(needed, quantile, confidence) == needed
 
 
 def test_a_share_in_words():

@@ -190,7 +190,7 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     run = with_controller(run, t_f=vector(20.02))
     result = fly(run, record=True)
     log = jax.tree.map(np.asarray, result.log)
-    k = np.flatnonzero((log.t < 20.02) & log.lasts)[-1]
+    k = np.flatnonzero((log.t < 20.02) & log.has_length)[-1]
     assert 20.02 - log.t[k] > 1e-3  # not on a sample
     halves = 64  # Euler-free check: RK4 in many small steps from the sample before, under the same torque
     x = jax.tree.map(lambda v: jnp.asarray(v[k]), log.x)

@@ -61,8 +61,8 @@ def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
     assert posed["Scaling"].controller.code == where
     assert posed["Scaling"].requirements == base.requirements
     assert tuned(posed["Scaling"]).free == ("delta", "m", "k1", "k", "observer_gain")
-    assert compare.told(base, 3, rivals)["laws"] == ["prescribed_time", "pd", "Scaling"]
-    assert compare.told(base, 3) == {"command": "compare", "seed": 3}
+    assert compare.identity(base, 3, rivals)["laws"] == ["prescribed_time", "pd", "Scaling"]
+    assert compare.identity(base, 3) == {"command": "compare", "seed": 3}
     for wrong, said in ((compare.Rivals(("lqr",)), "--against is lqr"), (compare.Rivals(None, ("x",)), "--law is x")):
         with pytest.raises(UsageError, match=said):
             wrong.check()
@@ -124,7 +124,7 @@ def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
     """The plant that flies is a tenth heavier and lighter, or a period later; law and observer know what they knew."""
     base = scenario.from_tables(TABLES)
     parts = scenario.study(base).parts
-    others = compare.untold(base)
+    others = compare.perturbed(base)
     assert tuple(others) == compare.UNTOLD
     for name, factor in (("heavier", 1.1), ("lighter", 0.9), ("later", 1.0)):
         other = scenario.study(others[name]).parts
@@ -132,7 +132,7 @@ def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
         np.testing.assert_array_equal(other.controller.model.inertia, parts.controller.model.inertia)
         assert getattr(other.actuators, "delay", 0) == (1 if name == "later" else 0)
     twice = scenario.replace(others["heavier"], hardware__delay=1)
-    again = compare.untold(twice)
+    again = compare.perturbed(twice)
     np.testing.assert_allclose(
         scenario.study(again["lighter"]).parts.plant.inertia, 0.9 * 1.1 * np.asarray(parts.plant.inertia), rtol=1e-15
     )
@@ -153,7 +153,7 @@ def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path)
     names = ["paper", *compare.laws()]
     found = compare.Comparison(dict.fromkeys(names, one), 0, False)
     (tmp_path / "out").mkdir()
-    compare.write(tmp_path / "out", base, found, True, compare.told(base, 0))
+    compare.write(tmp_path / "out", base, found, True, compare.identity(base, 0))
     rows = list(csv.DictReader((tmp_path / "out" / "compare.csv").read_text().splitlines()))
     said = json.loads((tmp_path / "out" / "summary.json").read_text())
     low, high = said["laws"]["pd"]["window_error_interval"]
@@ -289,7 +289,7 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
     assert replace(made, contenders=lost).status == "not met"
-    assert compare.told(made.contenders["paper"].flown, 5) != compare.told(made.contenders["paper"].flown, 6)
+    assert compare.identity(made.contenders["paper"].flown, 5) != compare.identity(made.contenders["paper"].flown, 6)
 
 
 def test_an_interruption_ends_the_comparison(monkeypatch, eight):
@@ -320,7 +320,7 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
     }  # fmt: skip
     found = compare.Comparison(made, 0, False)
     (tmp_path / "out").mkdir()
-    compare.write(tmp_path / "out", base, found, False, compare.told(base, 0))
+    compare.write(tmp_path / "out", base, found, False, compare.identity(base, 0))
     rows = list(csv.DictReader((tmp_path / "out" / "compare.csv").read_text().splitlines()))
     assert [row["gain_margin"] for row in rows] == ["5.04", "nan"]
     assert [row["delay_margin"] for row in rows] == ["inf", "0.2"]

@@ -34,7 +34,7 @@ def chain(**changes):
 
 def opened(parts, hold=True):
     run = linear.nominal_jit(parts)
-    index = linear.whole_periods(parts, run, hold=hold)[-1:]
+    index = linear.full_periods(parts, run, hold=hold)[-1:]
     return jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, index))
 
 
@@ -93,7 +93,7 @@ def test_gain_margin_of_a_sampled_double_integrator():
 def test_slopes_of_margins_are_those_of_central_differences():
     parts, _, _ = chain(hardware={"delay": 1, "state_noise": [1e-6, 1e-6]})
     run = linear.nominal_jit(parts)
-    index = jnp.asarray(linear.whole_periods(parts, run, hold=True)[-1])
+    index = jnp.asarray(linear.full_periods(parts, run, hold=True)[-1])
 
     @jax.jit
     def values(at):
@@ -203,7 +203,7 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
             table["observer"] = {"gain": RNG.uniform(5.0, 60.0, 3).tolist()}
         parts = scenario.study(scenario.from_tables(table)).parts
         run = linear.nominal_jit(parts)
-        index = linear.whole_periods(parts, run, hold=True)[-1]
+        index = linear.full_periods(parts, run, hold=True)[-1]
         loop = jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, np.asarray([index])))
         found, m = of(loop), loop.command.shape[0]
         axis = int(RNG.integers(m))
@@ -274,7 +274,7 @@ def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
     tables = {**BODY, "controller": law, "hardware": hardware, "filter": {"kind": "steady_state", "bandwidth": 1.0}}
     parts = scenario.study(scenario.from_tables(tables)).parts
     run = linear.nominal_jit(parts)
-    last = int(linear.whole_periods(parts, run, hold=True)[-1])
+    last = int(linear.full_periods(parts, run, hold=True)[-1])
     each = linear.opened_in(parts, run, np.arange(last - every + 1, last + 1)).loop
     means = linear.loops_in(parts, run, np.array([last]))
     for mean, several in zip(jax.tree.leaves(means), jax.tree.leaves(each), strict=True):

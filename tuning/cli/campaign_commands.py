@@ -17,9 +17,9 @@ from tuning.cli.options import (
     ScenarioFile,
     Seed,
     Trust,
-    between,
+    number_between,
     prepare,
-    whole,
+    whole_number,
 )
 from tuning.errors import UsageError
 from tuning.output import campaign_terminal, terminal
@@ -36,7 +36,9 @@ def montecarlo(
     *,
     trials: Annotated[
         int | None,
-        whole("--trials", "Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.", 1, MOST),
+        whole_number(
+            "--trials", "Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.", 1, MOST
+        ),
     ] = None,
     plan: Annotated[
         Path | None,
@@ -49,7 +51,7 @@ def montecarlo(
     out: Out = None,
     until_confident: Annotated[
         float | None,
-        between(
+        number_between(
             "--until-confident",
             "Stop once every requirement's share is known to within this width, a number between 0 and 1.",
             0.0,
@@ -130,18 +132,18 @@ def montecarlo(
         elsewhere = None
     campaign_folder.begin(folder, force)
     try:
-        with campaign_terminal.Progress(quiet) as told:
+        with campaign_terminal.Progress(quiet) as report:
             if dry_run:
-                campaign_folder.write_plan(folder, told)
+                campaign_folder.write_plan(folder, report)
             elif width is not None:
                 from tuning.studies import campaign_summary  # takes a second to import, which flying need not wait for
 
                 stopped = campaign_summary.until_confident(
-                    folder, width, lambda first: campaign_folder.fly(folder, share, told, elsewhere, first)
+                    folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
                 )
                 folder = campaign_folder.settle(folder, stopped)
             else:
-                campaign_folder.fly(folder, share, told, elsewhere)
+                campaign_folder.fly(folder, share, report, elsewhere)
             if not dry_run:
                 campaign_folder.find_floor(folder)
     except KeyboardInterrupt:
@@ -174,7 +176,9 @@ def worst(
     /,
     *,
     by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
-    n: Annotated[int, whole("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))] = 5,
+    n: Annotated[
+        int, whole_number("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))
+    ] = 5,
     why: Annotated[
         bool,
         Parameter(
@@ -211,7 +215,7 @@ def replay(
     folder: CampaignFolder,
     /,
     *,
-    trial: Annotated[int, whole("--trial", "Number of the trial.")],
+    trial: Annotated[int, whole_number("--trial", "Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
     trust: Trust = False,
     force: Force = False,
@@ -232,7 +236,7 @@ def replay(
         raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(trial)
     store.check(place, force or out is None)  # a replay of the same trial is the same
-    own_parts.allow(opened.programs, folder, opened.told, trust)
+    own_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
     found = campaign_summary.replay(opened, trial)
     store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, trial, figures))

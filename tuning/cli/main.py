@@ -23,7 +23,7 @@ from tuning.cli.options import (
     Seed,
     Trust,
     prepare,
-    whole,
+    whole_number,
 )
 from tuning.errors import UsageError
 from tuning.output import terminal
@@ -51,7 +51,7 @@ def simulate(
     out: Out = None,
     seed: Seed = 0,
     trial: Annotated[
-        int | None, whole("--trial", "Draw this trial's dispersions; without it nominal, with trial 0's noise.")
+        int | None, whole_number("--trial", "Draw this trial's dispersions; without it nominal, with trial 0's noise.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
@@ -113,7 +113,7 @@ def map_(
     x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
     y: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "controller.delta=0.05:5:9",
     trials: Annotated[
-        int, whole("--trials", "Trials of each pair, a whole number from 1 to 1000000.", 1, 1_000_000)
+        int, whole_number("--trials", "Trials of each pair, a whole number from 1 to 1000000.", 1, 1_000_000)
     ] = 32,
     out: Out = None,
     seed: Seed = 0,
@@ -139,8 +139,8 @@ def map_(
         raise UsageError(str(error)) from None
     if across.key == up.key:
         raise UsageError(f"--y is {y}, but must be another key than --x")
-    with terminal.Progress(quiet) as told:
-        cells = mapping.fly(loaded, across, up, seed, trials, lambda done, total: told("flying pairs", done, total))
+    with terminal.Progress(quiet) as report:
+        cells = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
     store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, seed, figures))
     if not quiet:
         terminal.grid(cells, folder)
@@ -204,10 +204,10 @@ def tune(
 
     loaded = _with_tune(loaded)
     goal = tuner.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
-    known_by = tune_files.told(loaded, seed, globally=global_check)
+    known_by = tune_files.identity(loaded, seed, globally=global_check)
     return _search(
         loaded, folder, known_by, force, quiet, goal,
-        work=lambda told, journal: tuner.tune(loaded, seed, told, journal, globally=global_check),
+        work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, found: tune_files.write(making, loaded, found, figures, known_by),
         summary=tune_files.summary,
         shown=terminal.tuning,
@@ -220,7 +220,7 @@ def pareto(
     /,
     *,
     points: Annotated[
-        int, whole("--points", "Limits on the torque to tune for, a whole number from 3 to 100.", 3, 100)
+        int, whole_number("--points", "Limits on the torque to tune for, a whole number from 3 to 100.", 3, 100)
     ] = 20,
     out: Out = None,
     seed: Seed = 0,
@@ -242,10 +242,10 @@ def pareto(
 
     loaded = _with_tune(loaded)
     fronts.check(loaded)
-    known_by = fronts.told(loaded, seed, points)
+    known_by = fronts.identity(loaded, seed, points)
     return _search(
         loaded, folder, known_by, force, quiet, "window error",
-        work=lambda told, journal: fronts.trace(loaded, seed, points, told, journal),
+        work=lambda report, journal: fronts.trace(loaded, seed, points, report, journal),
         write=lambda making, found: fronts.write(making, loaded, found, figures, known_by),
         summary=lambda found: fronts.summary(found, loaded),
         shown=terminal.front,
@@ -281,10 +281,10 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = _with_tune(loaded)
-    known_by = comparing.told(loaded, seed, rivals)
+    known_by = comparing.identity(loaded, seed, rivals)
     return _search(
         loaded, folder, known_by, force, quiet, "",
-        work=lambda told, journal: comparing.compare(loaded, seed, told, journal, rivals),
+        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, rivals),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
         summary=comparing.summary,
         shown=terminal.comparison,
@@ -380,8 +380,8 @@ def _search(
 
     journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
     try:
-        with terminal.Progress(quiet, goal) as told:
-            found = work(told, journal)
+        with terminal.Progress(quiet, goal) as report:
+            found = work(report, journal)
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return _STATUS["interrupted"]

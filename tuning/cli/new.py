@@ -193,7 +193,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
 
 def _meaning(key: keys.Key) -> str:
     choice = f"{key.allowed.replace(' or ', ' | ')}: " if key.allowed.startswith('"') and " or " in key.allowed else ""
-    return choice + key.told
+    return choice + key.text
 
 
 def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
 
 
-def whole(option: str, said: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()) -> Parameter:
+def whole_number(
+    option: str, said: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()
+) -> Parameter:
     """An option that is a whole number; said: its help. What is none raises UsageError, as `main` tells it."""
 
     def read(_: Any, tokens: Sequence[Token]) -> int:
@@ -24,7 +26,7 @@ def whole(option: str, said: str, least: int = 0, most: int = 2**32 - 1, names: 
     return Parameter(name=names or None, converter=read, help=said)
 
 
-def between(option: str, said: str, least: float, most: float) -> Parameter:
+def number_between(option: str, said: str, least: float, most: float) -> Parameter:
     """An option that is a number between two others; likewise."""
 
     def read(_: Any, tokens: Sequence[Token]) -> float:
@@ -47,7 +49,7 @@ SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
 Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
-Seed = Annotated[int, whole("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
+Seed = Annotated[int, whole_number("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, least_within, over
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, must_keep, over
 from tuning.search import flights
 from tuning.search.objective import Problem
 
@@ -55,7 +55,7 @@ def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) 
     """
     from scipy.stats import betabinom  # takes a while to import, which most runs need not wait for
 
-    least = least_within(fresh, requirement.quantile, requirement.confidence)
+    least = must_keep(fresh, requirement.quantile, requirement.confidence)
     return 0.0 if least is None else float(betabinom.cdf(fresh - least, fresh, beyond + 1, trials - beyond + 1))
 
 

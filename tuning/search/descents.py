@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.search.abreast import Ask, in_step
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.lockstep import Ask, in_step
 from tuning.search.objective import FAILED, Problem, failures, fewer_trials
 from tuning.search.progress import Report
 from tuning.search.refine import GENERATIONS, WIDELY, refine
@@ -182,13 +182,13 @@ class Descents:
         before = {k: list(self._history.get(k, ())) for k in starts}
         for count, steps in rungs:
             some = {k: _Start(starts[k], scales[k % len(scales)], seen[k], before[k]) for k in ranked[:count]}
-            self._descend_abreast(problem, some, steps, what, afresh=afresh)
+            self._descend_in_lockstep(problem, some, steps, what, afresh=afresh)
             afresh = False
             known = [k for k in ranked if k in self._ends]
             ranked = sorted(known, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
         return ranked
 
-    def _descend_abreast(
+    def _descend_in_lockstep(
         self,
         problem: Problem,
         starts: Mapping[int, _Start],

@@ -36,7 +36,7 @@ class Rules:
     counted: Leaf
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})
-    least: tuple[int | None, ...] = field(metadata={"static": True})
+    must_keep: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(metadata={"static": True})
     tail: int | None = field(metadata={"static": True})
     torque_weight: float = field(metadata={"static": True})
@@ -58,7 +58,7 @@ class Problem:
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
     # of the averaged trials, how many must keep each limit; None: every trial must
-    least: tuple[int | None, ...] = field(metadata={"static": True})
+    must_keep: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
     torque_weight: float = field(default=0.0, metadata={"static": True})
@@ -112,7 +112,7 @@ def problem(
         averaged=len(trials),
         names=names,
         metrics=tuple(r.metric for r in requirements),
-        least=(None,) * len(requirements),
+        must_keep=(None,) * len(requirements),
     )
     return replace(with_trials(made, trials), **others)
 
@@ -141,7 +141,7 @@ def with_trials(
     """
     if coordinates is None:
         coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
-    rows = np.asarray(whole_rows(problem) if counted is None else counted, dtype=bool)
+    rows = np.asarray(kept_by_every_trial(problem) if counted is None else counted, dtype=bool)
     return replace(
         problem,
         trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
@@ -165,14 +165,14 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
         counted=problem.counted[:, kept],
         coordinates={name: v[kept] for name, v in problem.coordinates.items()},
         averaged=averaged,
-        least=tuple(share(count) for count in problem.least),
+        must_keep=tuple(share(count) for count in problem.must_keep),
         tail=share(problem.tail),
     )
 
 
-def whole_rows(problem: Problem) -> np.ndarray:
+def kept_by_every_trial(problem: Problem) -> np.ndarray:
     """(requirements,) bool: limits that every trial must keep."""
-    return np.asarray([least is None for least in problem.least], dtype=bool)
+    return np.asarray([must_keep is None for must_keep in problem.must_keep], dtype=bool)
 
 
 def watched(problem: Problem) -> tuple[str, ...]:
@@ -216,8 +216,10 @@ def judge(
     if rules.torque_weight:
         weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
     rows = [
-        _asked(judged(near(one, limit, at_least=False), status) - 1.0, least, rules.averaged, counted[rules.averaged :])
-        for one, limit, least, counted in zip(limited, rules.limits, rules.least, rules.counted, strict=True)
+        _asked(
+            judged(near(one, limit, at_least=False), status) - 1.0, must_keep, rules.averaged, counted[rules.averaged :]
+        )
+        for one, limit, must_keep, counted in zip(limited, rules.limits, rules.must_keep, rules.counted, strict=True)
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
     return weighted, constraints, value
@@ -250,10 +252,10 @@ def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array,
 
 
 def _asked(
-    over: Float[Array, " trials"], least: int | None, averaged: int, counted: Bool[Array, " added"]
+    over: Float[Array, " trials"], must_keep: int | None, averaged: int, counted: Bool[Array, " added"]
 ) -> Float[Array, " trials"]:
-    """What is asked of c: of the averaged trials all but the worst beyond `least`, of the others those counted."""
+    """What is asked of c: of the averaged trials all but the worst beyond `must_keep`, of the others those counted."""
     first = over[:averaged]
-    if least is not None:
-        first = jnp.minimum(first, -jax.lax.top_k(-first, least)[0][-1])
+    if must_keep is not None:
+        first = jnp.minimum(first, -jax.lax.top_k(-first, must_keep)[0][-1])
     return jnp.concatenate([first, jnp.where(counted, over[averaged:], -1.0)])

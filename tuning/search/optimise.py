@@ -16,7 +16,7 @@ from tuning.search import worst as worst_case
 from tuning.search.descent import BROKEN
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
-from tuning.search.objective import Problem, coordinates_of, whole_rows, with_trials
+from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, with_trials
 from tuning.search.progress import Report
 from tuning.search.refine import NEARBY
 from tuning.search.work import ROUND, Work
@@ -110,7 +110,7 @@ def search(
         problem, _ = _harder_margins(problem, run.gains)
         if sure:  # what is hardest for gains that are about right
             harder = _hardest(problem, *screened(run.gains))
-            problem, joined = _add(problem, joined, Joining(harder, whole_rows(problem))), harder.size
+            problem, joined = _add(problem, joined, Joining(harder, kept_by_every_trial(problem))), harder.size
         if sloped:
             run.descend(problem, run.explore(problem, starts, seed) if starts > 1 else {0: run.share})
         else:
@@ -131,11 +131,13 @@ def search(
                 report("looking for the worst case", 0, 0, *run.best_so_far)
                 hardest = worst_case.hardest(problem, sure, found, screened(found))
                 if hardest.beyond and not hardest.unbounded:
-                    joining.append(Joining(np.asarray([hardest.trial]), whole_rows(problem), hardest.coordinates))
+                    joining.append(
+                        Joining(np.asarray([hardest.trial]), kept_by_every_trial(problem), hardest.coordinates)
+                    )
             elif sure:
                 known = screened(found)
                 if np.any(known[1] > 1.0):
-                    joining.append(Joining(_hardest(problem, *known), whole_rows(problem)))
+                    joining.append(Joining(_hardest(problem, *known), kept_by_every_trial(problem)))
             if not (joining or beyond) or rounds == ROUNDS:
                 break
             problem = others if beyond else problem

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from tuning.search.evaluate import Evaluator
 from tuning.search.progress import Report
 
-WHOLE = 100  # what all of the work is told as
+PERCENT = 100  # what all of the work is told as
 SLOPED = 5.0  # what a rollout with slopes takes beside one without (benchmarks/gradients.py)
 ROUND = "harder trials"  # how the name of a further round begins
 
@@ -36,7 +36,7 @@ class Work:
         left = sum(cost for _, cost in self._left)
         if self._left and self._left[0][0] == what.partition(",")[0]:
             left -= min(self._left[0][1], flown - self._base)
-        self._report(what, round(WHOLE * flown / (flown + left)) if flown else 0, WHOLE, value, over)
+        self._report(what, round(PERCENT * flown / (flown + left)) if flown else 0, PERCENT, value, over)
 
     def _turn(self, name: str) -> None:
         """What is left from this step on."""

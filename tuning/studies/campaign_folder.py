@@ -66,7 +66,7 @@ class Folder:
         return own_parts.named(self.scenario, self.own)
 
     @cached_property
-    def told(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
         names = {own.digest_name(key): where for key, where in self.programs.items()}
         digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
@@ -80,7 +80,7 @@ class Folder:
     def versions(self) -> dict[str, Any]:
         """What its `versions.json` says."""
         names = None if self.own is None else self.own_names
-        told = {**self.told, "trials": self.trials, "metrics_names": names, "plan": self.plan}
+        told = {**self.identity, "trials": self.trials, "metrics_names": names, "plan": self.plan}
         return store.versions(**{name: value for name, value in told.items() if value is not None})
 
     @cached_property
@@ -106,7 +106,7 @@ class Folder:
 
     @property
     def _key(self) -> bytes:
-        return rows.key_of(parsing.dump(self.scenario), self.told)
+        return rows.key_of(parsing.dump(self.scenario), self.identity)
 
     @cached_property
     def ready(self) -> Study | None:
@@ -164,7 +164,7 @@ class Folder:
 
     def _check_unchanged(self, key: str) -> None:
         if self.made is not None:
-            own_parts.check_unchanged({key: self.programs[key]}, self.path, self.told)
+            own_parts.check_unchanged({key: self.programs[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
@@ -195,7 +195,7 @@ def begin(wanted: Folder, force: bool) -> None:
     else:
         store.check(path, force=True)
         there = path.is_dir() and any(path.iterdir())
-        other = store.difference(path, tables, {**wanted.told, **store.packages()}) if there else None
+        other = store.difference(path, tables, {**wanted.identity, **store.packages()}) if there else None
         if other is not None:
             raise RefusedError(
                 f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew"
@@ -206,7 +206,7 @@ def begin(wanted: Folder, force: bool) -> None:
                 raise RefusedError(
                     f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
                 )
-            if before.trials == wanted.trials and before.made == _made(wanted) and before.told == wanted.told:
+            if before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity:
                 return
 
     def fill(making: Path) -> None:

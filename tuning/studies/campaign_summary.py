@@ -18,7 +18,7 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.requirements import Requirement, Verdict, least_within
+from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, floor_of, margins_of
 
@@ -138,7 +138,7 @@ def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> d
         for axis, name in names.items():
             values = frame[name].to_numpy().astype(float)
             ordered = np.sort(np.where(finished & np.isfinite(values), values, np.inf))
-            least = least_within(ordered.size, SHOWN, CONFIDENCE)
+            least = must_keep(ordered.size, SHOWN, CONFIDENCE)
             bound = None if least is None or not np.isfinite(ordered[least - 1]) else float(ordered[least - 1])
             budget.setdefault(index, {})[axis] = bound
     told = {"boresight": table.boresight, "window": table.window, "after": table.after}

@@ -48,7 +48,7 @@ class Contender:
     verdicts: list[Verdict]
     floor: float | None  # RMS window error that no controller can beat
     margins: dict[str, dict[str, Any]] | None = None  # of the nominal loop, see `stability.worst`
-    changed: Mapping[str, Trials] = field(default_factory=dict)  # with what it is not told, see `untold`
+    changed: Mapping[str, Trials] = field(default_factory=dict)  # with what it is not told, see `perturbed`
 
     @property
     def met(self) -> bool:
@@ -120,7 +120,7 @@ class Rivals:
             found[name if name not in found else f"own {name}"] = {"kind": "own", "code": code}
         return found
 
-    def told(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """By what a comparison with them is known again; nothing where they are all the kinds that there are."""
         digests = {where: systems.digest(where) for where in self.own}
         return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
@@ -157,7 +157,7 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
     return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
-def untold(flown: Scenario) -> dict[str, Scenario]:
+def perturbed(flown: Scenario) -> dict[str, Scenario]:
     """The scenario with what its law is not told of: another inertia, a control period of delay; those that can fly."""
     assert isinstance(flown, SpacecraftScenario)
     body, device = flown.spacecraft, flown.hardware
@@ -178,7 +178,7 @@ def untold(flown: Scenario) -> dict[str, Scenario]:
 def _with_more(one: Contender, fresh_seed: int) -> Contender:
     """With its margins, and flown once more with what its law is not told of."""
     requirements = study(one.flown).requirements
-    changed = {name: judging.judge(other, fresh_seed, requirements) for name, other in untold(one.flown).items()}
+    changed = {name: judging.judge(other, fresh_seed, requirements) for name, other in perturbed(one.flown).items()}
     return dataclasses.replace(one, margins=stability.worst(study(one.flown)), changed=changed)
 
 
@@ -200,16 +200,16 @@ def compare(
     stopped = False
     for law, posed in rivals.items():
 
-        def told(what: str, *others: Any, law: str = law) -> None:
+        def report(what: str, *others: Any, law: str = law) -> None:
             tell(f"{law}: {what}", *others)
 
-        tuned = tuner.tune(posed, seed, told, journal, trusted=False)
+        tuned = tuner.tune(posed, seed, report, journal, trusted=False)
         fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
         made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
         stopped = tuned.search.interrupted
         if stopped:
             break
-        told("flying with what it is not told", 0, 0, np.nan, 0.0)
+        report("flying with what it is not told", 0, 0, np.nan, 0.0)
         made[law] = _with_more(made[law], fresh_seed)
     return Comparison(made, fresh_seed, stopped, refused)
 
@@ -248,12 +248,12 @@ def figures_of(one: Contender) -> dict[str, Any]:
         "settling_by_angle": float(rank(angle[settled], known)[0]) if spread else None,
         "settling_near_far": _near_far(angle, late) if spread else None,
         "margins": one.margins,
-        "untold": {name: _told_nothing(other) for name, other in one.changed.items()},
+        "untold": {name: _perturbed_figures(other) for name, other in one.changed.items()},
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
     }
 
 
-def _told_nothing(trials: Trials) -> dict[str, Any]:
+def _perturbed_figures(trials: Trials) -> dict[str, Any]:
     """What is said of trials with something that the law is not told of."""
     done = trials.finished
     errors, peaks = (np.asarray(v)[done] for v in (trials.metrics.window_error, trials.metrics.peak_torque))
@@ -347,6 +347,6 @@ def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
     )  # fmt: skip
 
 
-def told(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
     """By what a finished or interrupted comparison is known again."""
-    return {"command": "compare", "seed": seed, **own.digests(scenario), **against.told()}
+    return {"command": "compare", "seed": seed, **own.digests(scenario), **against.identity()}

@@ -18,7 +18,7 @@ from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins
 
 PERIOD, DELTA = "loop.period", "controller.delta"
-WHOLE = ("hardware.delay", "hardware.star_tracker_every")
+WHOLE_NUMBERS = ("hardware.delay", "hardware.star_tracker_every")
 WIDE = 5.0  # axes that span more than this factor are spaced by factors
 
 
@@ -85,7 +85,7 @@ def axis(text: str, option: str) -> Axis:
         raise AxisError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
     wide = low > 0 and high > WIDE * low
     values = np.geomspace(low, high, count) if wide else np.linspace(low, high, count)
-    if key in WHOLE:
+    if key in WHOLE_NUMBERS:
         values = np.unique(np.round(values))
     return Axis(key, tuple(float(f"{v:.6g}") for v in values))
 
@@ -126,7 +126,7 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
         table, _, name = key.partition(".")
         name, _, place = name.partition("[")
         current = changes.get(f"{table}__{name}", getattr(getattr(scenario, table, None), name, None))
-        number: Any = int(value) if key in WHOLE else value
+        number: Any = int(value) if key in WHOLE_NUMBERS else value
         if isinstance(current, tuple | list):
             one = place.removesuffix("]")
             chosen = {int(one)} if one.isdecimal() else set(range(len(current)))
@@ -194,9 +194,9 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     if delay > 1:
         labels[f"with {delay} periods of delay"] = float(delay)
     found = {}
-    for label, late in labels.items():
+    for label, delay in labels.items():
         how = {"anchored": anchored, "implicit": scenario.controller.implicit}
-        delta = np.array([borders.smallest_delta(eta, float(period), late, **how) for period in h])
+        delta = np.array([borders.smallest_delta(eta, float(period), delay, **how) for period in h])
         found[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return found
 

@@ -102,17 +102,17 @@ def trace(
     def under(limit: float) -> Problem:
         return replace(problem, limits=jnp.asarray(problem.limits).at[at].set(limit))
 
-    def told(what: str) -> Report:
+    def report_as(what: str) -> Report:
         return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
 
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
-    free = search(evaluate, under(OFF), loose, own, table.starts, report=told("most torque"), **common)
+    free = search(evaluate, under(OFF), loose, own, table.starts, report=report_as("most torque"), **common)
     _unless_interrupted(free)
     problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
     tight = HARDLY * highest
-    least = search(evaluate, under(tight), (), own, FEWER, report=told("least torque"), **common)
+    least = search(evaluate, under(tight), (), own, FEWER, report=report_as("least torque"), **common)
     _unless_interrupted(least)
     lowest = least.ended[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
@@ -256,7 +256,7 @@ def knee_of(points: np.ndarray) -> int:
     return int(np.argmax(off[:, 0] * along[1] - off[:, 1] * along[0]))
 
 
-def told(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
     """By what a finished or interrupted front is known again."""
     source = own.digests(scenario)
     return {"command": "pareto", "seed": seed, "points": points, **source}

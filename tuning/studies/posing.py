@@ -7,7 +7,7 @@ import numpy as np
 from ptsmc_jax.scenario import Study, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
-from ptsmc_jax.simulation.requirements import Requirement, least_within
+from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from tuning.search import confirm, gains, margin_rows, objective
 from tuning.search import shares as gain_bounds
 from tuning.search.evaluate import Evaluator
@@ -43,7 +43,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
         np.arange(trained),
         bounds.names,
         asked,
-        least=tuple(_least(r, trained) for r in asked),
+        must_keep=tuple(_must_keep(r, trained) for r in asked),
         goal=T_F if table.objective == T_F else "window_error",
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
@@ -77,11 +77,11 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
     )
 
 
-def _least(requirement: Requirement, trials: int) -> int | None:
+def _must_keep(requirement: Requirement, trials: int) -> int | None:
     """How many training trials must keep a limit."""
     if requirement.quantile is None:
         return None
-    return least_within(trials, requirement.quantile, requirement.confidence) or trials
+    return must_keep(trials, requirement.quantile, requirement.confidence) or trials
 
 
 def _tail(table: tables.Tune, trials: int) -> int | None:

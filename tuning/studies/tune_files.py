@@ -151,7 +151,7 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
-    """Fill a result folder; known_by: see `told`."""
+    """Fill a result folder; known_by: see `identity`."""
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     store.write_toml(folder / "tuned.toml", parsing.dump(tuning.tuned))
     store.write_json(folder / "versions.json", store.versions(**known_by))
@@ -175,7 +175,7 @@ def _paths(history: Sequence[Step]) -> list[list[Step]]:
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
-def told(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
     """By what a finished or interrupted run is known again."""
     source = own.digests(scenario)
     return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from tuning.search.abreast import in_step
+from tuning.search.lockstep import in_step
 
 
 def counting(upto, found, name):
