@@ -80,7 +80,7 @@ HOUSE = {
             objective
             confirm evaluate worst
             descent starts trust
-            refine work
+            refine rounds work
             descents
             optimise
             evolution

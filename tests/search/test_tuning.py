@@ -18,7 +18,7 @@ from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, chain_parts, parts, vector
 from tuning.output import search_sentences
-from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, shares, starts, worst
+from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, rounds, shares, starts, worst
 from tuning.search.evaluate import Evaluator, Sloped
 from tuning.studies import judging, posing, tune_files
 
@@ -495,7 +495,7 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), 2, 20, 0)
     expected = eta * np.sqrt(2 * 14.0 * np.tan(theta / 2) / limit)
     # it keeps SURE_MARGIN of the limit, which costs half as much of t_f
-    np.testing.assert_allclose(found.gains[0], expected * (1 + optimise.SURE_MARGIN / 2), rtol=2e-4)
+    np.testing.assert_allclose(found.gains[0], expected * (1 + rounds.SURE_MARGIN / 2), rtol=2e-4)
     np.testing.assert_allclose(found.value, found.gains[0], rtol=1e-9)
     assert found.worst[0] <= 1.0
 

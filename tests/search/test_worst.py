@@ -12,7 +12,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, short, small_search, vector
-from tuning.search import objective, optimise, worst
+from tuning.search import objective, optimise, rounds, worst
 from tuning.search.evaluate import Evaluator
 from tuning.search.shares import Bounds
 
@@ -136,7 +136,7 @@ def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 1, 1, 0, robust=True)
-    assert found.margin == optimise.MARGIN
+    assert found.margin == rounds.MARGIN
 
 
 def test_coordinates_given_are_flown_as_drawn_ones():
@@ -145,10 +145,10 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     problem, _ = posed(spread)
     more = objective.with_trials(problem, np.asarray([40]))
     own = {name: np.asarray(v)[0] for name, v in objective.coordinates_of(spread, 5, np.asarray([40])).items()}
-    roomy = optimise._with_room(problem, optimise.SPARE)
-    assert roomy.trials.size == 8 + optimise.SPARE
+    roomy = rounds._with_room(problem, rounds.SPARE)
+    assert roomy.trials.size == 8 + rounds.SPARE
     drawn = {name: v.tolist() for name, v in own.items()}
-    given = optimise._add(roomy, 0, optimise.Joining(np.asarray([7]), np.array([True]), drawn))
+    given = rounds._add(roomy, 0, rounds.Joining(np.asarray([7]), np.array([True]), drawn))
     at = vector([3.2, 0.9])
     measure = jax.jit(objective.measure)
     f, c, _ = measure(more, at)
@@ -160,11 +160,11 @@ def test_coordinates_given_are_flown_as_drawn_ones():
 
 def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
     problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
-    problem, joined = optimise._with_room(problem, 16), 0
+    problem, joined = rounds._with_room(problem, 16), 0
     for count in (8, 8, 3, 8, 1):
         new = np.arange(200 + joined, 200 + joined + count)
-        more = optimise.Joining(new, np.array([True]))
-        problem, joined = optimise._add(problem, joined, more), joined + count
+        more = rounds.Joining(new, np.array([True]))
+        problem, joined = rounds._add(problem, joined, more), joined + count
         # the last 16 of those that joined, in whatever order, and the first trial where there is room
         kept = [0] * max(0, 16 - joined) + [*range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)

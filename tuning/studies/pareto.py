@@ -27,9 +27,10 @@ from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
-from tuning.search.optimise import MARGIN, Search, search
+from tuning.search.optimise import Search, search
 from tuning.search.progress import Report
 from tuning.search.refine import NEARBY
+from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing, tuner
 
 TORQUE = "peak_torque"

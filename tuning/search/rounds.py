@@ -1,0 +1,152 @@
+"""Rounds of a search: which trials, and which loops, join the constraints for the gains that were found last."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.simulation.requirements import Requirement
+from tuning.search import confirm, margin_rows
+from tuning.search import worst as worst_case
+from tuning.search.evaluate import Evaluator
+from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, with_trials
+from tuning.search.worst import Hardest
+
+MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
+SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
+HARDEST = 8  # of the screened trials, that join the constraints
+SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
+ROUNDS = 6  # searches again with hardest trials added, at most
+
+
+@dataclass(frozen=True)
+class Joining:
+    """Trials that join the constraints."""
+
+    trials: np.ndarray  # that name the noise
+    counted: np.ndarray  # (requirements,) bool: the limits that they must keep
+    coordinates: dict[str, list[float]] | None = None  # of a single one, where they are not its own
+
+
+class Rounds:
+    """A problem that becomes harder from round to round.
+
+    A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
+    screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
+    not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
+    on others after each search: where more of them break it than may, the hardest of the rest join.
+    """
+
+    def __init__(self, evaluate: Evaluator, problem: Problem, requirements: Sequence[Requirement], *, robust: bool):
+        self._evaluate, self._robust = evaluate, robust
+        every = [r for r in requirements if r.quantile is None]
+        self._every = every if problem.dispersion.varies else []  # limits on every trial
+        several = problem.trials.size > 1
+        self._shares = [r for r in requirements if r.quantile is not None] if several else []  # of the trials
+        self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
+        if self._every or self._shares:
+            problem = _with_room(problem, HARDEST + SPARE if self._every else SPARE)
+        self.problem = problem
+        self.count = 0  # rounds so far
+        self.hardest: Hardest | None = None  # for the gains found last
+        self.counts: list[confirm.Count] = []
+        self._joined = 0
+        self._known: worst_case.Screened | None = None
+
+    def begin(self, gains: np.ndarray) -> None:
+        """What is hardest for gains that are about right, (gains,), joins."""
+        self.problem, _ = _harder_margins(self.problem, gains)
+        if self._every:
+            hardest = _hardest(self.problem, *self._screened(gains))
+            self._join(Joining(hardest, kept_by_every_trial(self.problem)))
+
+    def harder(self, gains: np.ndarray, tell: Callable[[str], None]) -> bool:
+        """Whether anything joins that gains (gains,) do not meet, and a round is left: the search then goes on."""
+        if not (self._every or self._shares or self.problem.margins is not None):
+            return False
+        joining = list[Joining]()
+        others, beyond = _harder_margins(self.problem, gains)
+        if self._shares:  # each time on other trials, which those screened are not among
+            tell("confirming on other trials")
+            joining += self._confirmed(gains)
+        if self._every and self._robust:
+            tell("looking for the worst case")
+            self.hardest = worst_case.hardest(self.problem, self._every, gains, self._screened(gains))
+            if self.hardest.beyond and not self.hardest.unbounded:
+                kept = kept_by_every_trial(self.problem)
+                joining.append(Joining(np.asarray([self.hardest.trial]), kept, self.hardest.coordinates))
+        elif self._every:
+            self._known = self._screened(gains)
+            if np.any(self._known[1] > 1.0):
+                joining.append(Joining(_hardest(self.problem, *self._known), kept_by_every_trial(self.problem)))
+        if not (joining or beyond) or self.count == ROUNDS:
+            return False
+        self.problem = others if beyond else self.problem
+        for more in joining:
+            self._join(more)
+        self.hardest = None  # it was the worst case of gains that are searched on from
+        self.count += 1
+        return True
+
+    def judge(self, gains: np.ndarray, tell: Callable[[str], None]) -> None:
+        """Look for the worst case of the gains found in the end, (gains,), where that is not known already."""
+        if self._every and self.hardest is None:
+            tell("looking for the worst case")
+            self.hardest = worst_case.hardest(self.problem, self._every, gains, self._known)
+
+    def _screened(self, gains: np.ndarray) -> worst_case.Screened:
+        self._evaluate.rollouts += worst_case.SCREENED
+        return worst_case.screen(self.problem, self._every, gains)
+
+    def _confirmed(self, gains: np.ndarray) -> list[Joining]:
+        """Trials that join since more of those counted break a limit than may."""
+        first = self.problem.averaged + worst_case.SCREENED
+        self.counts = confirm.count(self.problem, self._shares, gains, first, self.count)
+        self._evaluate.rollouts += self.counts[0].trials
+        return [
+            Joining(one.harder[:HARDEST], np.asarray([metric == asked.metric for metric in self.problem.metrics]))
+            for asked, one in zip(self._shares, self.counts, strict=True)
+            if not one.held
+        ]
+
+    def _join(self, more: Joining) -> None:
+        self.problem, self._joined = _add(self.problem, self._joined, more), self._joined + more.trials.size
+
+
+def _with_room(problem: Problem, places: int) -> Problem:
+    """With so many places more, that hold the first trial again: it must keep what every trial must keep, twice."""
+    return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], places))
+
+
+def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
+    """With the loops whose margins are least by these gains, and whether one of them breaks a limit."""
+    if problem.margins is None:
+        return problem, False
+    asked, near = margin_rows.hardest(problem.margins, gains)
+    return replace(problem, margins=asked), near > 1.0
+
+
+def _add(problem: Problem, joined: int, more: Joining) -> Problem:
+    """The problem with more trials in the places left for them, and then in those of the ones that joined first.
+
+    joined: how many have been added to `_with_room`'s.
+    """
+    places = problem.trials.size - problem.averaged
+    at = problem.averaged + (joined + np.arange(more.trials.size)) % places
+    if more.coordinates is None:
+        own = coordinates_of(problem.dispersion, int(problem.seed), more.trials)
+    else:
+        own = {name: jnp.asarray(v)[None] for name, v in more.coordinates.items()}
+    return replace(
+        problem,
+        trials=problem.trials.at[at].set(jnp.asarray(more.trials, dtype=jnp.uint32)),
+        counted=problem.counted.at[:, at].set(jnp.asarray(more.counted)[:, None]),
+        coordinates={name: v.at[at].set(own[name]) for name, v in problem.coordinates.items()},
+    )
+
+
+def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Of screened trials those nearest to a limit that are not in the problem yet."""
+    known = set(np.asarray(problem.trials).tolist())
+    return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)
