@@ -25,7 +25,8 @@ CALL = 32  # of them that are flown and linearised at once
 JUDGED = 16  # loops judged in full at a time
 # how far off what `margins.roughly` reads may be, with room: in dB, deg, periods, dB
 OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "modulus_margin": 0.01}
-BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)  # nothing that was read: of an unstable loop, or no limit
+# values that are not read between frequencies: of an unstable loop, or of one that no gain or phase makes unstable
+BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 
 
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
@@ -60,7 +61,7 @@ def differ(dispersion: Dispersion) -> bool:
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:
-    """How near margins come to their limit, which is 1, see `over`; without its floor, so that each has its place."""
+    """As `requirements.over`, but negative values stay: margins far from their limit can be put in order, too."""
     return 2.0 - value / limit if MARGINS[name][2] else value / limit
 
 
@@ -74,13 +75,14 @@ def worst(
 ) -> dict[str, np.ndarray]:
     """Margins of each trial, (trials,), those that have a limit; the worst over its axes and times; NaN without slopes.
 
-    To the last digit where something hangs on them: the worst of each margin, and those of so many `places` of the
-    trials that come nearest to a limit. Of the others it is known that they lie behind, and on which side of a limit.
+    Exact are the worst of each margin, and the margins of the `places` trials that come nearest to a limit. All others
+    are rough: it is known that they are farther from their limits than these, and on which side of a limit they lie.
 
-    Every loop is looked at on the same frequencies as in full, of which many are around every pole, and its margins are
-    read by lines between them: off by less than half of `OFF`, see the tests. A loop is judged in full while it, `OFF`
-    nearer to a limit, may be one of those that count, or `OFF` to either side may be at a limit. What is judged shows
-    how far off lines were; where that is more than half of `OFF`, all others are taken to be off by twice as much.
+    First the margins of every loop are read roughly, by straight lines between the frequencies that exact margins are
+    found by: the error is below half of `OFF`, as the tests show. Then loops are judged exactly, the nearest first, as
+    long as an error of `OFF` could make one of the others count, or could move it across a limit. Each exact margin
+    also shows how large the error of the lines was: where it is more than half of `OFF`, twice as much is reckoned with
+    from then on.
     """
     trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]

@@ -20,7 +20,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 
-FEW = 64  # trials; fewer are flown at once, by a program for so many: a step costs nearly as much for one
+FEW = 64  # fewer trials are flown at once, by a program for this many: a step of one costs nearly as much
 CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
 BLOCK_ON_GPU = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
@@ -204,7 +204,7 @@ def _fly(
 
 
 def block_size() -> int:
-    """How many trials a device flies at a time, unless it is told."""
+    """How many trials a device flies at a time, where a caller does not say."""
     return BLOCK if jax.default_backend() == "cpu" else BLOCK_ON_GPU
 
 

@@ -87,7 +87,7 @@ class Actuators:
         return replace(self, scale=None, directions=None, fails=None)
 
     def assumed(self, drive: Drive, dt: Scalar) -> Push:
-        """What flight software takes to have acted in a period dt [s], torques in N m: as `over` of what it knows."""
+        """What acted in a period dt [s] as far as flight software knows, torques in N m: `over` of `known`."""
         return self.known.over(drive if self.spares is not None else drive._replace(works=None), jnp.zeros_like(dt), dt)
 
     def given(self, drive: Drive, v: Array) -> Array:

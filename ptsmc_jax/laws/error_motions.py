@@ -34,11 +34,11 @@ class ErrorMotion:
         return x
 
     def clearance(self, x: Any, target: Any) -> Scalar:
-        """How far the law is from a singularity of its own, its sign that of the side; 1 where it has none."""
+        """How far the law is from a singularity of its own: 0 on it, of either sign beside it; 1 where it has none."""
         return jnp.ones(())
 
     def clearance_unit(self, first: Scalar) -> Scalar:
-        """The unit of `clearance`, by that of the initial state: its sign, so that every run begins on the side 1."""
+        """What a run divides clearances by, from that of its initial state: its sign, so that it begins above 0."""
         return jnp.where(first < 0.0, -1.0, 1.0)
 
     def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:

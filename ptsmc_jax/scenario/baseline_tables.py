@@ -60,7 +60,11 @@ class BaselineTable(LawTable, frozen=True):
 
 
 def _over_t_f(low: float, high: float, power: int = 1) -> GainBounds:
-    """Bounds low / t_f^power and high / t_f^power."""
+    """Bounds low / t_f^power and high / t_f^power: a law that is judged at t_f needs rates of that order.
+
+    A spring k_p = 2 / t_f^2 turns through about 1 rad of its oscillation until t_f, one of 2000 / t_f^2 through 30; a
+    damping of 0.3 / t_f leaves three quarters of a rate until t_f, one of 100 / t_f takes it away within t_f / 100.
+    """
     return GainBounds(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
 
 

@@ -27,11 +27,12 @@ def dead_beat_gain(scenario: Any, left: float = LEFT) -> float:
 
 
 def largest_k1(scenario: Any) -> float:
-    """K1 [1/s] at which the sampled loop after the hand-over ends to be stable, with this delay and `surface_rate`.
+    """The largest K1 [1/s] with which the sampled loop is stable after the hand-over, by delay and `surface_rate`.
 
-    `borders.largest_reaching` = K1 h / 2 for a spacecraft (60), K1 h for what has the K1 of (10), (29); without delay
-    it is 2 - c h, and with implicit sampling, which has no border then, where `LEFT` of s is left after a period. Of an
-    order above 2 that of the slowest pole of its surface: an estimate. 0: there is none.
+    `borders.largest_reaching` is K1 h / 2 for a spacecraft (60), K1 h for laws with the K1 of (10) and (29); without
+    delay it is 2 - c h. Implicit sampling without delay has no border: there the largest K1 is the one that leaves
+    `LEFT` of s after a period. For an order above 2 it is an estimate, by the slowest pole of the surface. 0: no K1 is
+    stable.
     """
     h = scenario.loop.period
     delay = float(scenario.devices.delay_periods)

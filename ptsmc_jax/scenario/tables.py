@@ -117,11 +117,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # a table, or one for each kind, the default first
     metrics: ClassVar[Mapping[str, Entry]] = {}
     motion: ClassVar[str] = ""  # what the laws drive to zero: "spacecraft", "chain" or "system"
-    reaching: ClassVar[float] = 1.0  # how often K1 goes into what makes s decay after the hand-over: (60) halves it
+    reaching: ClassVar[float] = 1.0  # K1 over the rate at which s decays after the hand-over: 2 where (60) halves it
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """Defaults that no single key tells, by table; given: keys of [plant] that are there, law: its kind."""
+        """Defaults that depend on other keys, by table; given: keys of [plant] that are there, law: its kind."""
         return {}
 
     @property

@@ -44,10 +44,10 @@ def fewest_trials(quantile: float, confidence: float) -> int:
 
 
 def over(values: Any, limit: Any, *, at_least: bool) -> Any:
-    """How near arrays, NumPy's or JAX's, come to a limit, which is 1: as a share of it, or 2 less that.
+    """Arrays, NumPy's or JAX's, as shares of a limit: 1 is at the limit, less is within it, more is beyond it.
 
-    The latter where they are to be larger; one that is infinite is then as far from the limit as there is: 0. Of a
-    limit of zero: 0 where it is kept, beyond 1 where it is not.
+    Where values must be at least the limit, it is 2 - value / limit, and 0 for an infinite value. Of a limit of zero it
+    is 0 where the limit is kept, and above 1 where it is not.
     """
     none = limit == 0.0
     with np.errstate(over="ignore"):

@@ -84,8 +84,8 @@ class _Course(NamedTuple):
     x0: Any
     first: Any  # the reference at t = 0
     arrival: Any  # and at t_f
-    clearance: Array  # from the law's singularity at t = 0, which others are counted in: at least so far is 1
-    gap: Array  # first time without samples [s]; NaN: they go from t = 0 to t_end
+    clearance_unit: Array  # what the run's clearances from the law's singularity are divided by
+    gap: Array  # first time that the clock has no samples for [s]; NaN: it has them from t = 0 to t_end
 
 
 class _World(NamedTuple):
@@ -108,9 +108,9 @@ def simulate(
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, parts.pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
-    clearance = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
+    unit = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
     arrival = parts.reference(criteria.t_f)
-    course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(clearance), _gap(ticks, parts.t_end))
+    course = _Course(criteria, x0, target, arrival, jax.lax.stop_gradient(unit), _gap(ticks, parts.t_end))
     if parts.clock.sampled:
         return _sampled(parts, ticks, course, seed, trial, record, software)
     return _continuous(parts, ticks, course, record)
@@ -358,7 +358,7 @@ def _watch(
     """Status and first bad time of the state at t; the first thing that goes wrong stays."""
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
     fast = parts.plant.too_fast(state.x, dt)
-    near = ~(parts.controller.clearance(state.x, target) / course.clearance >= SINGULAR_CLEARANCE)
+    near = ~(parts.controller.clearance(state.x, target) / course.clearance_unit >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (state.status == OK) & (code != OK)
     return jnp.where(first, code, state.status), jnp.where(first, t, state.bad_time)

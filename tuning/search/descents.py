@@ -23,11 +23,12 @@ from tuning.search.shares import TIMES
 from tuning.search.starts import CHOOSING, STEEP, SWEPT, charged, promising, spread, starting_points
 from tuning.search.work import ROUND, SLOPED
 
-AGAIN = 3  # starts, from whose best points they go on
-EXPLORED, AVERAGED = 32, 16  # trials on which most starts are left behind, those averaged at least among them
-FOLLOWED = 3  # starts that go on with all trials
-SAME = 1e-4  # change of F that makes no difference
-FINISH = 1e-2  # of `CLOSE`: how near to the optimum the best start is taken in the end
+AGAIN = 3  # starts from whose best points a further round goes on
+# most starts are given up after descents on EXPLORED trials, of which at least AVERAGED count in the objective
+EXPLORED, AVERAGED = 32, 16
+FOLLOWED = 3  # of the explored starts go on with all trials
+SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
+FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
 MANY = 512  # points swept where there are no slopes
 
 SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (

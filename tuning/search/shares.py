@@ -14,7 +14,7 @@ from tuning.search import gains as gain_names
 
 TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may fall behind its sample
 
-HALF = 0.5  # of the widest sign: an interval is never narrower than up from there
+HALF = 0.5  # the lower bound of sign_width is at most this share of its upper one
 
 
 @dataclass(frozen=True)

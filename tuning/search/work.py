@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from tuning.search.evaluate import Evaluator
 from tuning.search.progress import Report
 
-PERCENT = 100  # what all of the work is told as
+PERCENT = 100  # progress is reported in percent
 SLOPED = 5.0  # what a rollout with slopes takes beside one without (benchmarks/gradients.py)
 ROUND = "harder trials"  # how the name of a further round begins
 
