@@ -46,8 +46,8 @@ HOUSE = {
             device_tables gain_bounds own start_checks
             disturbance_bounds
             disturbance_tables law_record observer_tables own_devices reference_tables
-            baseline_tables
-            own_laws
+            baseline_record
+            baseline_tables own_laws
             law_tables
             tables
             spacecraft_scenario state_scenario

@@ -7,65 +7,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import Meta
 
 from ptsmc_jax.scenario import gain_bounds
-from ptsmc_jax.scenario.errors import show, wrong
+from ptsmc_jax.scenario.baseline_record import BaselineTable, over_t_f, until_sampling
+from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, between
-from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.values import NotNegative, Positive
 
 Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
 AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
-
-
-class BaselineTable(LawTable, frozen=True):
-    """What the laws to compare with have besides their gains; they fly in the sampled loop only.
-
-    Attributes:
-        t_f: when the law is judged [s]
-        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
-        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
-        initial_estimate_error: bound on the observer's error at t = 0 [N m]
-    """
-
-    t_f: Positive = 30.0
-    disturbance_rate_bound: NotNegative | None = None
-    disturbance_bound: NotNegative | None = None
-    initial_estimate_error: NotNegative = 0.0
-
-    def law(self) -> Any:
-        """The law of eps'' = a + d, a class of `laws` with a field for each gain."""
-        raise NotImplementedError
-
-    def error_motion(self, motion: str) -> Any:
-        """The error that it drives to zero."""
-        from ptsmc_jax.laws import error_motions
-
-        errors: dict[str, type[error_motions.ErrorMotion]] = {
-            "spacecraft": error_motions.ErrorQuaternion,
-            "chain": error_motions.ErrorOfChain,
-            "system": error_motions.ErrorOfSystem,
-        }
-        return errors[motion]
-
-    def physics(self, motion: str) -> Any:
-        """The law on the error of this kind of plant."""
-        from ptsmc_jax.laws.acceleration import on
-
-        return on(self.error_motion(motion), self.law())
-
-    def check(self, scenario: Any) -> None:
-        """They are laws of second order."""
-        order = scenario.order
-        if order != 2:
-            raise wrong("plant.order", order, f"2 with controller.kind = {show(self.kind)}, a law of second order")  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _over_t_f(low: float, high: float, power: int = 1) -> GainBounds:
-    """Bounds low / t_f^power and high / t_f^power: a law that is judged at t_f needs rates of that order.
-
-    A spring k_p = 2 / t_f^2 turns through about 1 rad of its oscillation until t_f, one of 2000 / t_f^2 through 30; a
-    damping of 0.3 / t_f leaves three quarters of a rate until t_f, one of 100 / t_f takes it away within t_f / 100.
-    """
-    return GainBounds(lambda choice: (low / choice.t_f**power, high / choice.t_f**power))
 
 
 class PDController(BaselineTable, frozen=True):
@@ -80,8 +28,8 @@ class PDController(BaselineTable, frozen=True):
     k_p: Positive = 0.2
     k_d: Positive = 0.6
     gains: ClassVar[Mapping[str, GainBounds]] = {
-        "k_p": _over_t_f(2.0, 2000.0, 2),
-        "k_d": _over_t_f(0.3, 100.0),
+        "k_p": over_t_f(2.0, 2000.0, 2),
+        "k_d": over_t_f(0.3, 100.0),
         "t_f": gain_bounds.T_F,
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
@@ -120,8 +68,8 @@ class TerminalController(BaselineTable, frozen=True):
     sign_width: NotNegative = 1e-3
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
-        "b": _over_t_f(0.01, 100.0),
-        "k": _over_t_f(2.0, 2000.0, 2),
+        "b": over_t_f(0.01, 100.0),
+        "k": over_t_f(2.0, 2000.0, 2),
         "sign_width": gain_bounds.SIGN_WIDTH,
         "t_f": gain_bounds.T_F,
     }
@@ -186,7 +134,7 @@ class FixedTimeController(BaselineTable, frozen=True):
     sign_width: NotNegative = 1e-3
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
-        **dict.fromkeys(("a1", "b1"), _over_t_f(0.01, 100.0)),
+        **dict.fromkeys(("a1", "b1"), over_t_f(0.01, 100.0)),
         **dict.fromkeys(("a2", "b2"), GainBounds(lambda _: (1e-4, 10.0))),
         "gamma": GainBounds(_usual_gamma, _allowed_gamma),
         "m": GainBounds(lambda _: (1.05, 3.0), between(1.0, math.inf)),
@@ -214,14 +162,6 @@ class FixedTimeController(BaselineTable, frozen=True):
             raise wrong("controller.gamma", self.gamma, f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
 
-def _until_sampling(low: float, high: float, power: int = 1) -> GainBounds:
-    """Bounds low / t_f^power and high / h^power, h the period: to where samples come too seldom for a larger gain."""
-    return GainBounds(
-        lambda choice: (low / choice.t_f**power, high / choice.scenario.loop.period**power),
-        above="so large that the sampled loop comes near its border of stability",
-    )
-
-
 class TimeBasePDController(BaselineTable, frozen=True):
     """A profile from the first error to zero at t_f, a quintic about the eigenaxis, under PD (Becerra and others 2018).
 
@@ -234,8 +174,8 @@ class TimeBasePDController(BaselineTable, frozen=True):
     k_p: Positive = 1.0
     k_d: Positive = 2.0
     gains: ClassVar[Mapping[str, GainBounds]] = {
-        "k_p": _until_sampling(2.0, 0.25, 2),
-        "k_d": _until_sampling(0.3, 1.0),
+        "k_p": until_sampling(2.0, 0.25, 2),
+        "k_d": until_sampling(0.3, 1.0),
         "t_f": gain_bounds.T_F,
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
@@ -269,8 +209,8 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
     k: Positive = 1.0
     sign_width: NotNegative = 1e-3
     gains: ClassVar[Mapping[str, GainBounds]] = {
-        "surface_rate": _until_sampling(0.3, 1.0),
-        "k": _until_sampling(0.3, 1.0),
+        "surface_rate": until_sampling(0.3, 1.0),
+        "k": until_sampling(0.3, 1.0),
         "sign_width": gain_bounds.SIGN_WIDTH,
         "t_f": gain_bounds.T_F,
     }
@@ -306,7 +246,7 @@ class ScalingController(BaselineTable, frozen=True):
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "delta": gain_bounds.DELTA,
         "m": GainBounds(lambda _: (1.0, 5.0), lambda _: Allowed(1.0, math.inf, lower_included=True)),
-        "k1": _until_sampling(0.3, 0.5),
+        "k1": until_sampling(0.3, 0.5),
         "k": GainBounds(lambda choice: (1e-5 / choice.t_f, 10.0 / choice.t_f)),
         "t_f": gain_bounds.T_F,
     }
@@ -373,7 +313,7 @@ class SuperTwistingController(BaselineTable, frozen=True):
     lipschitz: Positive = 0.01
     sign_width: NotNegative = 1e-3
     gains: ClassVar[Mapping[str, GainBounds]] = {
-        "surface_rate": _until_sampling(3.0, 0.2),
+        "surface_rate": until_sampling(3.0, 0.2),
         "lipschitz": GainBounds(lambda choice: (0.1 / choice.t_f**3, 1e4 / choice.t_f**3)),
         "sign_width": gain_bounds.SIGN_WIDTH,
         "t_f": gain_bounds.T_F,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from ptsmc_jax.scenario import gain_bounds
-from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.own import Code, Own
 from ptsmc_jax.scenario.values import Positive

@@ -6,7 +6,7 @@ import pytest
 
 from ptsmc_jax.scenario import errors, from_tables, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
 from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.scenario import disturbance_bounds, keys, reading
-from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.layouts import SCENARIOS

@@ -17,7 +17,7 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
 from ptsmc_jax.scenario import cautions, errors, own, parsing, replace, study, systems, tables
-from ptsmc_jax.scenario.baseline_tables import BaselineTable
+from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
