@@ -35,7 +35,7 @@ class Sensor(ABC):
 
     @abstractmethod
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
-        """Memory before the first sample of positive length, which is now."""
+        """Memory before the first sample of positive length [s], which is now."""
 
     @abstractmethod
     def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
@@ -50,7 +50,7 @@ class Sensor(ABC):
         """The same without noise."""
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
-        """What the sensor draws once a trial, by the names of a row's columns."""
+        """Numbers that the sensor draws once a trial, such as a bias [rad/s], by the names of a row's columns."""
         return {}
 
 

@@ -56,13 +56,13 @@ def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
 
 
 def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
-    """The surface s of (37) at t = 0."""
+    """The surface s of (37) for states x (n,) at t = 0, in the states' own units; t_f [s]."""
     c = expansion(eta, x.shape[0])
     return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
 
 
 def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
-    """y, y', .. y^(n) of y = x_1 / r^eta: what the initial state gives, and what s(0) = 1 gives besides."""
+    """y, y', .. y^(n) of y = x_1 / r^eta at t [s]: what the initial state (n,) gives, and what s(0) = 1 adds."""
     n, tau = x0.shape[0], t_f - t
     rising = [jnp.ones_like(eta)]
     for k in range(n):
@@ -90,7 +90,7 @@ def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
 
 
 def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda v: v) -> list[Scalar]:
-    """x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule; size = abs: bounds on them from bounds on y."""
+    """x_1, x_1', .. of x_1 = r^eta y at t [s] by Leibniz's rule; size = abs: bounds on them from bounds on y."""
     r = (t_f - t) / t_f
     falling = [jnp.ones_like(eta)]
     for k in range(len(y)):

@@ -84,8 +84,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
 
 def steps(parts: Parts) -> int:
     """Integration steps of a run."""
-    ticks: Any = parts.clock
-    return ticks.count * parts.substeps
+    return parts.clock.count * parts.substeps
 
 
 def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:

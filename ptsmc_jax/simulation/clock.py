@@ -106,6 +106,11 @@ class Graded:
     sampled: ClassVar[bool] = False
     anchored: ClassVar[bool] = False
 
+    @property
+    def count(self) -> int:
+        """How many steps there are."""
+        return self.before + self.after
+
     def long_enough_for(self, others: Sequence[Any]) -> "Graded":
         """The same: its number of steps follows from its own accuracy."""
         return self
