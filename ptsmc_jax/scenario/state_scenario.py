@@ -51,8 +51,8 @@ class SystemPlant(Table, frozen=True):
     x0: Numbers = (1.0, 0.0)
 
 
-def _tables(plant: type[Table]) -> dict[str, type[Table] | Kinds]:
-    kind = plant().kind  # pyright: ignore[reportAttributeAccessIssue]
+def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
+    """The tables of a scenario of this plant; kind: of the plant whose disturbances, laws and observers it has."""
     return {
         "plant": plant,
         "disturbance": DISTURBANCES[kind],
@@ -110,7 +110,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 class ChainScenario(StateScenario, frozen=True, kw_only=True):
     """A scenario of an integrator chain."""
 
-    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = _tables(ChainPlant)
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_of(ChainPlant, "chain")
     motion: ClassVar[str] = "chain"
 
     @classmethod
@@ -160,7 +160,7 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 class SystemScenario(StateScenario, frozen=True, kw_only=True):
     """A scenario of a system of one's own."""
 
-    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = _tables(SystemPlant)
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_of(SystemPlant, "system")
     motion: ClassVar[str] = "system"
 
     @classmethod
