@@ -104,27 +104,27 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
 
 def wheels(parts: Parts, log: Log) -> Figure:
     """Momentum of the reaction wheels over time, and its limit."""
-    figure, axes = figure_of("Reaction wheels", "momentum [N m s]")
     assert log.wheels is not None
-    assert parts.actuators is not None
-    _components(axes, log.t, log.wheels[0], "h")
-    device = parts.actuators.wheels
-    if device is not None and device.momentum_limit is not None:
-        _limit(axes, float(device.momentum_limit), " N m s")
-    _mark(axes, parts)
-    axes.legend(ncols=2)
-    return figure
+    figure, axes = figure_of("Reaction wheels", "momentum [N m s]")
+    return _of_wheels(figure, axes, parts, log, log.wheels[0], "h", "momentum_limit", " N m s")
 
 
 def wheel_torque(parts: Parts, log: Log) -> Figure:
     """Torque of the reaction wheels over time, and its limit."""
-    figure, axes = figure_of("Torque of the reaction wheels", "torque [N m]")
     assert log.wheels is not None
+    figure, axes = figure_of("Torque of the reaction wheels", "torque [N m]")
+    return _of_wheels(figure, axes, parts, log, log.wheels[1], "v", "torque_limit", " N m")
+
+
+def _of_wheels(
+    figure: Figure, axes: Axes, parts: Parts, log: Log, values: Any, symbol: str, limit: str, unit: str
+) -> Figure:
+    """Numbers of each wheel over time, and their limit, a field of `Wheels`."""
     assert parts.actuators is not None
-    _components(axes, log.t, log.wheels[1], "v")
-    device = parts.actuators.wheels
-    if device is not None and device.torque_limit is not None:
-        _limit(axes, float(device.torque_limit), " N m")
+    _components(axes, log.t, values, symbol)
+    largest = getattr(parts.actuators.wheels, limit, None)
+    if largest is not None:
+        _limit(axes, float(largest), unit)
     _mark(axes, parts)
     axes.legend(ncols=2)
     return figure

@@ -12,12 +12,14 @@ class Numbers(Table, frozen=True):
     """How numbers are drawn, about what the scenario says."""
 
     width: ClassVar[str] = "std"  # the key that says how far
+    degrees: ClassVar[bool] = False  # which is in degrees
     widest: ClassVar[float] = 0.0  # how far a vector of three goes, in times that: all but one in 10 000
     farthest: ClassVar[float] = 3.0  # how far a number goes that bounds are to hold for, in times that: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
-        """The width of so many numbers, of which a single one of the table stands for all."""
-        return np.ones(count) * getattr(self, self.width)
+        """The width of so many numbers, of which a single one of the table stands for all; in rad for degrees."""
+        width = np.ones(count) * getattr(self, self.width)
+        return np.deg2rad(width) if self.degrees else width
 
     def physics(self) -> Any:
         """A class of `dispersions.numbers`."""
@@ -194,10 +196,7 @@ class NormalTurn(Normal, frozen=True):
     width: ClassVar[str] = "std_deg"
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 0.1
-
-    def of(self, count: int = 1) -> np.ndarray:
-        """The width of so many components [rad]."""
-        return np.deg2rad(super().of(count))
+    degrees: ClassVar[bool] = True
 
 
 class UniformTurn(Uniform, frozen=True):
@@ -210,10 +209,7 @@ class UniformTurn(Uniform, frozen=True):
     width: ClassVar[str] = "half_width_deg"
     kind: Literal["uniform"] = "uniform"
     half_width_deg: NotNegative = 0.1
-
-    def of(self, count: int = 1) -> np.ndarray:
-        """The width of so many components [rad]."""
-        return np.deg2rad(super().of(count))
+    degrees: ClassVar[bool] = True
 
 
 class Outage(Table, frozen=True):
