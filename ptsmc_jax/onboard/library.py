@@ -162,16 +162,16 @@ class InTheLoop:
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
         (now, dt_before, _), (sensing, state) = period, computer.sensing
-        read = x
-        if parts.sensors is not None:
-            read, sensing = parts.sensors.sample(sensing, x, now, dt_before)
+        read, sensors = x, parts.sensors
+        if sensors is not None:
+            read, sensing = sensors.sample(sensing, x, now, dt_before)
         known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             known["applied"] = computer.applied[0]
         if self.board.spacecraft:
             known |= {"attitude": read.q, "rate": read.w}
-        if hasattr(parts.sensors, "star_weight"):
-            known["attitude_valid"] = (parts.sensors.star_weight(now) > 0.0).astype(float)
+        if sensors is not None and hasattr(sensors, "star_weight"):
+            known["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         given = jnp.concatenate([now.t[None], *(jnp.ravel(known[name]) for name in self.board.inputs)])
         after, out = self._stepped(state, given)
         after = jnp.where(period.length > 0.0, after, state)

@@ -208,7 +208,7 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
 def test_requirements_and_objective_of_a_scenario_reach_the_problem():
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
-    assert [posing._least(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
+    assert [posing._must_keep(r, 64) for r in (Requirement("effort", 1.0), share, sure)] == [None, 58, 64]
     assert confirm.fresh_trials([share]) == confirm.FRESH
     assert confirm.fresh_trials([share, sure]) == 2 * 852
     assert [confirm.training_trials(some, 64) for some in ([share], [share, sure])] == [64, 2 * 852]
