@@ -47,7 +47,7 @@ class Lane:
         return entries(self._dense, self._dense.ndim - len(self.shape))
 
     def apart(self) -> "Lane":
-        """The same value taken apart now, unless it is too large for that."""
+        """The value taken apart now, unless it is too large for that."""
         whole = self._parts is not None or not small(self.shape)
         return self if whole else Lane(self.shape, self.parts, self._dense, self.differs)
 

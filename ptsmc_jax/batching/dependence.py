@@ -49,7 +49,7 @@ def dependence(jaxpr: core.Jaxpr, inputs: Sequence[int]) -> list[int]:
 
 
 def _dependence_through(eqn: Any, depends: list[int]) -> list[int]:
-    """The same of one equation: of calls, branches and loops output by output, as they are evaluated."""
+    """What the results of one equation differ over; of calls, branches and loops result by result."""
     inner, name, params, every = called(eqn), eqn.primitive.name, eqn.params, either(depends)
     if every and inner is not None:
         return dependence(getattr(inner, "jaxpr", inner), depends)

@@ -114,7 +114,7 @@ def worst(
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Of each margin, arrays over them first; one without a value is behind all others: it is no question of digits."""
+    """`nearness` of each margin, arrays over them first; a loop without a value counts as behind all others."""
     near = np.stack([nearness(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
     return np.where(np.isnan(near), -np.inf, near)
 

@@ -65,7 +65,7 @@ class Plan:
         return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
 
     def without(self, same: Iterable[str]) -> "Plan":
-        """The same without quantities that are what would be drawn anyway."""
+        """The plan without these quantities, which it gives as they would be drawn anyway."""
         return replace(self, given={name: values for name, values in self.given.items() if name not in same})
 
     def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:

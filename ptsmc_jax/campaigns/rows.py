@@ -48,7 +48,7 @@ class Rows:
         return self.put(first, frame.height, encoded(frame))
 
     def put(self, first: int, count: int, content: bytes) -> Part:
-        """The same from a file's content; raises OSError where it does not fit on the disk."""
+        """Write a part from a file's content; raises OSError where it does not fit on the disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
         handle, name = tempfile.mkstemp(prefix=_MAKING, dir=self.folder)

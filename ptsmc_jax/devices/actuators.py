@@ -83,7 +83,7 @@ class Actuators:
 
     @property
     def known(self) -> "Actuators":
-        """The same as the flight software knows them."""
+        """The actuators as the flight software knows them: without their misfits."""
         return replace(self, scale=None, directions=None, fails=None)
 
     def assumed(self, drive: Drive, dt: Scalar) -> Push:

@@ -47,7 +47,7 @@ class Sensor(ABC):
 
     @abstractmethod
     def quiet(self) -> Any:
-        """The same without noise."""
+        """The sensor without noise."""
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Numbers that the sensor draws once a trial, such as a bias [rad/s], by the names of a row's columns."""
@@ -105,7 +105,7 @@ class Sensors(Sensor):
         return attitude.multiply(q, attitude.from_rotation_vector(self.misalignment))
 
     def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
-        """The same with a filter of another bandwidth [rad/s]; period: of control [s]."""
+        """The sensors with a filter of another bandwidth [rad/s]; period: of control [s]."""
         walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
         noises = self.attitude_noise, self.rate_noise, walk
         return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))

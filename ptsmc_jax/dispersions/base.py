@@ -76,7 +76,7 @@ def not_negative(given: np.ndarray) -> np.ndarray:
 
 
 def positive(given: np.ndarray) -> np.ndarray:
-    """The same of positive numbers (rows, n), in any unit [-]."""
+    """The numbers (rows, n), which must all be positive, as `Quantity.checked` takes them in any unit [-]."""
     UnfitError.check((given > 0.0).all(axis=1), lambda k: "a number greater than 0")
     return given
 

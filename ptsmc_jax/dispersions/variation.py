@@ -147,7 +147,7 @@ class Dispersion:
         return {"initial_angle": angle, **quantities.read_columns(parts, names)}
 
     def without(self, names: Iterable[str]) -> "Dispersion":
-        """The same, with nothing drawn from these streams; each of the others draws what it drew."""
+        """The dispersion without these streams; every other stream draws what it drew before."""
         none = {field: None for name, field in FIELDS.items() if name in names}
         kept = {name: level for name, level in self.levels.items() if quantities.level(name) not in names}
         misfits = {name: misfit for name, misfit in self.misfits.items() if name not in names}

@@ -189,7 +189,7 @@ class SecondOrder(Prescribed):
         return found.error, found.s
 
     def exact_motion(self, t: Scalar, target: Any, start: Any, errors: Float[Array, "m 2"]) -> Motion:
-        """By `motion`."""
+        """State and w' by `motion`, for the error and derivatives of the closed form."""
         wanted = exact_error(t, self.t_f, self.eta, errors[:, 0], errors[:, 1])
         return self.motion(target, start, wanted.error, wanted.error_rate, wanted.acceleration)
 

@@ -129,7 +129,7 @@ class ErrorQuaternion(ErrorMotion):
         return attitude.angle(x.q, target.q)
 
     def relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
-        """Of the relative motion q_e [-], w_e, R w_f [rad/s] and (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]."""
+        """The relative motion: q_e [-], w_e and R w_f [rad/s], (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]."""
         q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
         back = attitude.conjugate(q_e)
         carried = attitude.rotate(back, target.w)

@@ -44,7 +44,7 @@ class TimeBase(AccelerationLaw):
     """
 
     def begin(self) -> Start:
-        """Nothing known."""
+        """Before the first sample the profile is not known."""
         none = jnp.zeros(self.model.inputs)
         return Start(jnp.zeros(()), none, none)
 

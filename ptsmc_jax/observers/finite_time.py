@@ -85,7 +85,7 @@ class FiniteTimeObserver(Observer):
         return jnp.concatenate([-1.1 * self.gain * guards.smooth_sign(off, self.sign_width), d_hat - seen - drop])
 
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """Nothing."""
+        """Empty: `update` needs no matrix."""
         return jnp.zeros((0, 0))
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:

@@ -106,7 +106,7 @@ class Plant(ABC):
         """A history of states by the names of its columns: name -> (time, components)."""
 
     def hidden_columns(self, x: Any) -> dict[str, Any]:
-        """The same of what sensors do not see."""
+        """The columns of what sensors do not see, such as flexible modes."""
         return {}
 
 

@@ -93,11 +93,11 @@ class FlexibleSpacecraft(Spacecraft):
         return guards.norm(jnp.concatenate([e, rate / self.frequency]))
 
     def with_inertia(self, inertia: Float[Array, "3 3"], inverse: Float[Array, "3 3"]) -> "FlexibleSpacecraft":
-        """The same with another inertia of the whole body; a run with one that leaves no J - D'D > 0 is marked."""
+        """The body with another J; a run whose J leaves no J - D'D > 0 is marked."""
         return replace(self, inertia=inertia, inertia_inverse=inverse).settled()
 
     def settled(self) -> "FlexibleSpacecraft":
-        """The same with (J - D'D)^-1 of its own J and D; not finite where J - D'D is not positive definite."""
+        """The body with (J - D'D)^-1 made of its J and D; not finite where J - D'D is not positive definite."""
         rest = self.inertia - self.coupling.T @ self.coupling
         minors = (rest[0, 0], rest[0, 0] * rest[1, 1] - rest[0, 1] * rest[1, 0], matrices.determinant(rest))
         there = jnp.all(jnp.stack(minors) > 0.0)

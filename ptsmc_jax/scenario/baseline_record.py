@@ -45,7 +45,7 @@ class BaselineTable(LawTable, frozen=True):
         return on(self.error_motion(motion), self.law())
 
     def check(self, scenario: Any) -> None:
-        """They are laws of second order."""
+        """These laws are of second order, and so must the plant be."""
         order = scenario.order
         if order != 2:
             raise wrong("plant.order", order, f"2 with controller.kind = {show(self.kind)}, a law of second order")  # pyright: ignore[reportAttributeAccessIssue]

@@ -33,7 +33,7 @@ class CommandFilter(Table, frozen=True):
         raise NotImplementedError
 
     def build(self) -> Any:
-        """That part."""
+        """The filter, with the keys as its numbers."""
         from ptsmc_jax.numerics.pytrees import vector
 
         return self.physics()(*(vector(getattr(self, key)) for key in self.__struct_fields__ if key != "kind"))

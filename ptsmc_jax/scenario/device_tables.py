@@ -169,7 +169,7 @@ class StateHardware(Actuators, frozen=True):
             raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")
 
     def noise_of_s(self, scenario: Any) -> float:
-        """By the weights of the surface; of a system that of its noisiest surface."""
+        """The weights of the surface times the noises; for a system, that of its noisiest component."""
         law = scenario.controller
         a, rate = getattr(law, "a", (1.0,)), getattr(law, "surface_rate", 1.0)
         weights = [one * rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
@@ -274,7 +274,7 @@ class WheelLimits(Table, frozen=True):
     momentum: Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None = None
 
     def spin_axes(self) -> Any:
-        """Of each wheel in body axes, (wheels, 3)."""
+        """The spin axis of each wheel in body axes, (wheels, 3)."""
         raise NotImplementedError
 
     def refused(self, error: ValueError) -> ScenarioError:
@@ -336,7 +336,7 @@ class AxesWheels(WheelLimits, frozen=True):
     )
 
     def spin_axes(self) -> Any:
-        """Those of the table."""
+        """The rows of `axes`."""
         return np.asarray(self.axes)
 
     def refused(self, error: ValueError) -> ScenarioError:

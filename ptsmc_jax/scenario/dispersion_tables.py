@@ -26,7 +26,7 @@ class Numbers(Table, frozen=True):
         raise NotImplementedError
 
     def build(self, count: int = 1) -> Any:
-        """That part, of so many numbers."""
+        """The class above, for so many numbers."""
         from ptsmc_jax.numerics.pytrees import vector
 
         return self.physics()(vector(self.of(count)))

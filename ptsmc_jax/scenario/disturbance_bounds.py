@@ -34,7 +34,7 @@ def of(scenario: Any, inputs: int) -> tuple[float, float] | None:
 
 
 def drawn_factor(scenario: Any) -> float:
-    """By how much a drawn amplitude is larger than the scenario's, at most."""
+    """The largest factor on the scenario's amplitude that is drawn."""
     drawn = getattr(scenario.dispersion, "disturbance_amplitude", None)
     return 1.0 if drawn is None else 1.0 + drawn.farthest * getattr(drawn, drawn.width)
 
@@ -90,7 +90,7 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
 
 
 def along_the_run(scenario: Any, signal: Any, inputs: int) -> Bounds:
-    """Of a disturbance of one's own d(t, x): its largest size and rate on the way from the start to the target.
+    """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
     The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
     """

@@ -76,7 +76,7 @@ class ConstantDisturbance(DisturbanceTable, frozen=True):
     amplitude: Three = (0.01, 0.01, 0.01)
 
     def impulse(self, end: float) -> float:
-        """All of it."""
+        """It acts all the time."""
         return float(np.linalg.norm(np.abs(self.amplitude) * end))
 
     def bounds(self, scenario: Any, inputs: int) -> Bounds:
@@ -207,11 +207,11 @@ class SumDisturbance(Kind, frozen=True):
 
     @property
     def together(self) -> tuple[Any, ...]:
-        """All of them."""
+        """The terms of the sum."""
         return self.terms
 
     def filled(self, scenario: Any, inputs: int) -> Any:
-        """Each with its lists where they are absent."""
+        """The sum, each term of it with its lists where they are absent."""
         each = tuple(term.filled(scenario, inputs) for term in self.terms)
         return msgspec.structs.replace(self, terms=each)
 
@@ -270,7 +270,7 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
         return Disturbance
 
     def quickest(self) -> float:
-        """As it says itself; nothing is known before its code is run."""
+        """What its method `fastest` says; 0 before its code is run."""
         return 0.0 if self.waits else float(build(self).fastest())
 
     def bounds(self, scenario: Any, inputs: int) -> Bounds | None:

@@ -103,7 +103,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
     initial_estimate_error: NotNegative = 0.0
 
     def physics(self, motion: str) -> Any:
-        """By its error."""
+        """The paper's law on the error that the key `error` names."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeMultiplicative
 
         return PrescribedTimeMultiplicative if self.error == "multiplicative" else PrescribedTime

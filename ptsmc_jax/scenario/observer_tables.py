@@ -70,7 +70,7 @@ class NonlinearObserver(ObserverTable, frozen=True):
     gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
 
     def scale(self, scenario: Any) -> float:
-        """By the body's inertia, or the period."""
+        """The default gain: in proportion to the body's inertia, and limited by the period."""
         return disturbance_bounds.observer_gain(scenario)
 
     def build(self, scenario: Any, model: Any) -> Any:
@@ -109,7 +109,7 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
     gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
 
     def scale(self, scenario: Any) -> float:
-        """By the body's inertia, or the period."""
+        """The default gain: in proportion to the body's inertia, and limited by the period."""
         return disturbance_bounds.observer_gain(scenario)
 
     def times(self, scenario: Any) -> tuple[float, float]:
@@ -125,7 +125,7 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
         return msgspec.structs.replace(self, t_o=t_o, delta_o=delta_o)
 
     def check(self, scenario: Any) -> None:
-        """It has converged before t_f."""
+        """The observer must have converged before t_f."""
         t_o, delta_o = self.times(scenario)
         if t_o > scenario.controller.t_f:
             raise wrong("observer.t_o", t_o, f"at most controller.t_f, {scenario.controller.t_f}")
@@ -224,7 +224,7 @@ class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
         return SampledObserver
 
     def check(self, scenario: Any) -> None:
-        """It is written for samples."""
+        """An observer of one's own is written for samples, and needs the sampled loop."""
         mode = scenario.loop.mode
         if mode != "sampled":
             raise ScenarioError(f'observer.kind = "own" needs the sampled loop, but loop.mode is "{mode}"')

@@ -86,7 +86,7 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
 
 
 def digest_name(key: str) -> str:
-    """By what `versions.json` knows the digest of what a key names.
+    """The name in `versions.json` for the digest of what a key names.
 
     >>> digest_name("plant.system"), digest_name("controller.code"), digest_name("disturbance.terms[0].code")
     ('system_sha256', 'controller_sha256', 'disturbance_terms_0_sha256')
@@ -108,7 +108,7 @@ def waits(scenario: Table) -> bool:
 
 @functools.cache
 def waiting(table: Any) -> Any:
-    """The same table before its code is run."""
+    """The table as it is before its code is run."""
     rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
     space = {"__doc__": table.__doc__, "__module__": table.__module__, "waits": True}
     return msgspec.defstruct(table.__name__, [rest], bases=(table,), frozen=True, kw_only=True, namespace=space)

@@ -43,7 +43,7 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
         return made
 
     def turning(self, t_f: float) -> tuple[str, float]:
-        """Nothing is known: twice as fast as half a turn takes on average."""
+        """Twice the mean rate of half a turn: nothing is known of a law of one's own."""
         return "controller.t_f", 2.0 * math.pi / t_f
 
 
@@ -57,7 +57,7 @@ class OwnAttitudeLaw(OwnLaw, frozen=True):
     error: Literal["multiplicative", "additive"] = "multiplicative"
 
     def error_motion(self, motion: str) -> Any:
-        """As it asks for."""
+        """The error that the key `error` names."""
         from ptsmc_jax.laws.error_motions import ErrorVector
 
         return ErrorVector if self.error == "additive" else super().error_motion(motion)

@@ -136,7 +136,7 @@ class SlewReference(ReferenceTable, frozen=True):
         return {"reference.duration": (turning + 2.0 * np.pi) / self.duration}
 
     def check(self) -> None:
-        """Both attitudes."""
+        """Both attitudes must be given as unit quaternions can be."""
         super().check()
         attitude_keys.unit("reference.to_quat_xyzw", self.to_quat_xyzw)
 
@@ -163,7 +163,7 @@ class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
         return Reference
 
     def frequencies(self) -> dict[str, float]:
-        """As it says itself."""
+        """What its method `fastest` says."""
         return {"reference.code": float(self.build().fastest())}
 
     def build(self) -> Any:

@@ -229,7 +229,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return float(np.linalg.norm(self.initial.rate)) + drawn
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
-        """Of the start, the reference, the law and the wheels."""
+        """How fast start, reference, law, wheels and flexible modes move the body [rad/s], by key."""
         found = {"initial.rate": self.turning, **self.reference.frequencies()}
         key, rate = self.controller.turning(t_f)
         if not self.controller.prescribed:

@@ -129,7 +129,7 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 
     @property
     def inputs(self) -> int:
-        """One."""
+        """A chain has one input."""
         return 1
 
     @property
@@ -195,7 +195,7 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
         return self._loaded("system")
 
     def truth(self, model: Any) -> Any:
-        """The one that flies. Raises ScenarioError where there is none."""
+        """The system that flies. Raises ScenarioError where there is none."""
         return model if self.plant.truth is None else self._loaded("truth")
 
     def _loaded(self, key: str) -> Any:

@@ -136,7 +136,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def order(self) -> int:
-        """Of the motion that a law drives to zero."""
+        """The order of the motion that a law drives to zero."""
         return 2
 
     @property
@@ -173,7 +173,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def end(self) -> float:
-        """Of the run, `loop.t_end` [s]."""
+        """The end of the run, `loop.t_end` [s]."""
         assert self.loop.t_end is not None, "a scenario that is not resolved"
         return self.loop.t_end
 
@@ -224,6 +224,6 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         raise NotImplementedError
 
     def __eq__(self, other: object) -> bool:
-        """The same values, said or not."""
+        """Two scenarios are equal where their values are, whether a file says them or not."""
         names = [name for name in self.__struct_fields__ if name != "defaulted"]
         return isinstance(other, Scenario) and all(getattr(self, name) == getattr(other, name) for name in names)

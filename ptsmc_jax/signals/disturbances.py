@@ -29,7 +29,7 @@ class Disturbance:
         return 0.0
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """The same as it acts on a body of this inertia [kg m^2]."""
+        """The disturbance as it acts on a body of this inertia [kg m^2]."""
         return self
 
 
@@ -92,7 +92,7 @@ class GravityGradient(Disturbance):
         return 3.0 * self.rate**2 * jnp.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """The same on another body."""
+        """The gravity gradient on another body [kg m^2]."""
         return replace(self, inertia=inertia)
 
 
@@ -111,7 +111,7 @@ class Sum(Disturbance):
         return total
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """Each of them."""
+        """Each term on that body [kg m^2]."""
         return Sum(tuple(on_body(term, inertia) for term in self.terms))
 
 

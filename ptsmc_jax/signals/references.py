@@ -131,7 +131,7 @@ class Origin:
     """The reference of an integrator chain: the origin, which needs no numbers."""
 
     def __call__(self, t: Time) -> None:
-        """Nothing, at any time."""
+        """None: a chain's target needs no numbers."""
 
 
 @pytree

@@ -42,7 +42,7 @@ class Setup:
                 object.__setattr__(self, name, Function(value))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
-        """The same with another prescribed time [s]; the time after it is kept."""
+        """The parts with another prescribed time [s]; the time after it is kept."""
         t_end = t_f + (self.t_end - self.controller.t_f)
         return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
 
@@ -60,6 +60,6 @@ class Parts(Setup):
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
 
     def with_t_f(self, t_f: Leaf) -> "Parts":
-        """The same with another prescribed time [s]; the time after it is kept."""
+        """The parts with another prescribed time [s]; the time after it is kept."""
         moved = super().with_t_f(t_f)
         return replace(moved, clock=replace(self.clock, t_end=moved.t_end))

@@ -58,7 +58,7 @@ class Period(NamedTuple):
 
     @property
     def length(self) -> Scalar:
-        """Of the control period [s]."""
+        """Length of the control period [s]."""
         return self.now.t_next - self.now.t
 
 

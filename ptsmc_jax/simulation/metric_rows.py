@@ -74,7 +74,7 @@ def _hold_error(largest: Array, interval: Interval, errors: Errors, criteria: Cr
 
 
 def _variation(variation: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
-    """Of the delivered torque from t_f on, (m,) [N m]: the jump at the start of the interval, then what is inside."""
+    """Total variation of the torque delivered from t_f on, (m,) [N m]: the jump at its start, then inside."""
     delivered = interval.delivered
     jump = jnp.where(interval.t > criteria.t_f, jnp.abs(delivered[0] - interval.last_torque), 0.0)
     inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))

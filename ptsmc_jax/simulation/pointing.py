@@ -212,7 +212,7 @@ def _sizes(error: Array) -> Array:
 
 
 def _sizes_of(projected: Array) -> Array:
-    """The same from what it is at most in each direction: of the half-cone never less, see `DIRECTIONS`."""
+    """Sizes about each axis and of the half-cone, (4,), from the largest in each direction, see `DIRECTIONS`."""
     return jnp.append(projected[:3], jnp.max(projected[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 

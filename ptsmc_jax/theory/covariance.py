@@ -85,7 +85,7 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
         one, dt = row.loop, float(ticks.t_next[index] - ticks.t[index])
 
         def wide(by_z: np.ndarray, by_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """By the whole state, and by this sample's noise."""
+            """Rows by the whole state, and by this sample's noise."""
             return np.pad(by_z, [(0, 0), (0, size - n)]) + by_seen @ reads, by_seen @ noisy
 
         (sends, sent), (slides, slid), (moved, entered) = (

@@ -68,7 +68,7 @@ class Triangles(NamedTuple):
 
 
 def in_triangles(opening: Opening) -> Triangles:
-    """The same L [-]."""
+    """The loop L [-] in coordinates in which its matrix A is triangular (Schur)."""
     fixed = jax.lax.stop_gradient(opening)
     a, axes = jax.scipy.linalg.schur(fixed.a, output="complex")
     return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)

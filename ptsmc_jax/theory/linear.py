@@ -275,7 +275,7 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
 
 
 def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
-    """The same `loops_in`, h in [s], of indices (periods,), for any transformation."""
+    """As `loops_in`, h in [s], for indices (periods,) that may be traced: it composes with every transformation."""
     several = _interval(parts, indices)
     loops = jax.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
     return _means(loops, several.shape)

@@ -29,7 +29,7 @@ TIMES, SHARE = 4, 0.25  # to go at which margins are judged, and the longest as 
 
 
 class Margins(NamedTuple):
-    """Of each axis, (m,) arrays; those of an unstable loop are negative, the distance to the border from beyond it."""
+    """The margins of each axis, (m,); of an unstable loop they are negative: how far the border is, from beyond it."""
 
     gain_up: Array  # [dB]; infinite: stable with any gain
     gain_down: Array  # [dB]

@@ -67,7 +67,7 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
 
 
 def _shown(found: Mapping[str, Any]) -> str:
-    """Those that are limited, in words."""
+    """The margins that are limited, in words."""
     known = {name: found[name] for name in MARGINS if found[name] is not None}
     return ", ".join(f"{_short(name)} {value:.3g} {MARGINS[name][0]}" for name, value in known.items())
 

@@ -80,7 +80,7 @@ class Result:
 
     @property
     def kind(self) -> str:
-        """Of the plant."""
+        """The kind of the plant."""
         return self.scenario.get("plant", {}).get("kind", "spacecraft")
 
     def chart(self, name: str, made: page_charts.Chart, caption: str, shape: str = "") -> Block:

@@ -42,7 +42,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Sloped(Measured):
-    """The same with derivatives by the shares of the bounds' intervals."""
+    """What `Measured` has, with derivatives by the shares of the bounds' intervals."""
 
     f_slope: np.ndarray  # (points, gains)
     c_slope: np.ndarray  # (points, rows, trials, gains)
@@ -148,7 +148,7 @@ def _judged(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Arra
 def _judged_slopes(
     rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array
 ) -> dict[str, jax.Array]:
-    """The same with slopes, from those of the gains and of the metrics along each share."""
+    """F, constraints and goal with slopes, from those of the gains and of the metrics along each share."""
 
     def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array) -> dict:
         def of(gains: jax.Array, metrics: jax.Array) -> tuple:

@@ -176,7 +176,7 @@ def _sloped(
     metrics: tuple[str, ...],
     devices: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """The same of metrics, with the status as the last of them, and of their slopes."""
+    """Metrics of (devices, rows, trials), with the status as the last of them, and their slopes."""
 
     def one(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))

@@ -45,7 +45,7 @@ def units(plant: str) -> dict[str, str]:
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
-    """The same of a scenario, with those of a law of one's own."""
+    """The unit of each gain of a scenario, those of a law or an observer of one's own among them."""
     found = units(scenario.plant.kind)
     for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_")):
         named = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}

@@ -30,7 +30,7 @@ DRAWN = 128  # trials whose coordinates are drawn in one call
 @pytree
 @dataclass(frozen=True)
 class Rules:
-    """By what metrics are judged, see `Problem`."""
+    """The part of a `Problem` that metrics are judged by."""
 
     limits: Leaf
     counted: Leaf
@@ -71,7 +71,7 @@ class Problem:
 
     @property
     def rules(self) -> Rules:
-        """By what it is judged, without what flies."""
+        """What its metrics are judged by, without what flies."""
         return Rules(**{one.name: getattr(self, one.name) for one in fields(Rules)})
 
     @property
@@ -81,7 +81,7 @@ class Problem:
         return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates)
 
     def others(self, trials: np.ndarray) -> Fleet:
-        """The same with other trials, of its seed."""
+        """What is flown with other trials of its seed."""
         coordinates = jax.tree.map(np.asarray, coordinates_of(self.dispersion, int(self.seed), trials))
         return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 

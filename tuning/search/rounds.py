@@ -147,6 +147,6 @@ def _add(problem: Problem, joined: int, more: Joining) -> Problem:
 
 
 def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Of screened trials those nearest to a limit that are not in the problem yet."""
+    """The screened trials that come nearest to a limit and are not in the problem yet."""
     known = set(np.asarray(problem.trials).tolist())
     return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)

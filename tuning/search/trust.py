@@ -111,7 +111,7 @@ def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
 
 
 def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[float, float] | None:
-    """The same of the ratio of two RMS over the same trials, which are resampled together."""
+    """Bootstrap interval of the ratio of two RMS over the same trials, which are resampled together."""
     return _bootstrap((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
 
 

@@ -67,7 +67,7 @@ class Folder:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """By what a campaign is known again: the digests of programs as the folder has them, or as they are now."""
+        """What `versions.json` knows a campaign by; digests of programs as the folder has them, or as they are now."""
         names = {own.digest_name(key): where for key, where in self.programs.items()}
         digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
         if self.table is not None:

@@ -121,7 +121,7 @@ class Rivals:
         return found
 
     def identity(self) -> dict[str, Any]:
-        """By what a comparison with them is known again; nothing where they are all the kinds that there are."""
+        """What `versions.json` knows these rivals by; nothing where they are all the kinds that there are."""
         digests = {where: systems.digest(where) for where in self.own}
         return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
 
@@ -348,5 +348,5 @@ def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
 
 
 def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
-    """By what a finished or interrupted comparison is known again."""
+    """What `versions.json` knows a finished or interrupted comparison by."""
     return {"command": "compare", "seed": seed, **own.digests(scenario), **against.identity()}

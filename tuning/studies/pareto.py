@@ -258,7 +258,7 @@ def knee_of(points: np.ndarray) -> int:
 
 
 def identity(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
-    """By what a finished or interrupted front is known again."""
+    """What `versions.json` knows a finished or interrupted front by."""
     source = own.digests(scenario)
     return {"command": "pareto", "seed": seed, "points": points, **source}
 

@@ -54,7 +54,7 @@ def _number(value: Any) -> float | None:
 
 
 def names(ready: Study) -> tuple[list[str], list[str]]:
-    """Of the inputs, and of what the sensors see."""
+    """The names of the inputs, and of what the sensors see."""
     plant = ready.parts.plant
     if plant.attitude:
         return list("xyz"), [f"{what} {axis}" for what in ("attitude", "rate") for axis in "xyz"]

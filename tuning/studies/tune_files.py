@@ -176,7 +176,7 @@ def _paths(history: Sequence[Step]) -> list[list[Step]]:
 
 
 def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
-    """By what a finished or interrupted run is known again."""
+    """What `versions.json` knows a finished or interrupted tuning by."""
     source = own.digests(scenario)
     return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
 

@@ -185,7 +185,7 @@ def tune(
 def _beyond(
     tuned: Scenario, at_bound: dict[str, str], named: dict[str, float], judged: Trials, fresh_seed: int
 ) -> dict[str, Beyond]:
-    """Each gain on a bound that nothing is known of, a step beyond it on the fresh trials, where it may go there.
+    """What the fresh trials say of each gain that ended on a bound, a step beyond that bound, where it may go there.
 
     Of the sampled loop, where what is minimised is an error.
     """
