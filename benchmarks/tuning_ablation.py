@@ -4,7 +4,7 @@
 
 A line a search, kept in out/tuning_ablation.jsonl: what is there already is not searched again. In the end a table: for
 each problem and variant the largest and the median distance from the best goal that any of them found, the seeds within
-1 % of it, and the flights spent. `evolution.py`'s differential evolution is one of the variants, on the first seed.
+1 % of it, and the flights spent. `global_check.py`'s differential evolution is one of the variants, on the first seed.
 """
 
 import json
@@ -46,7 +46,7 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 def variants() -> dict[str, Callable]:
     """What is left out or changed, by name: a context to search in."""
-    from tuning.search import descents, optimise, refine, starts
+    from tuning.search import cma_es, descents, optimise, starts
 
     everything = descents.Descents
 
@@ -68,7 +68,7 @@ def variants() -> dict[str, Callable]:
 
         def descend(self, problem, starts):
             super().descend(problem, starts)
-            self.evolve(problem, self.share, refine.NEARBY)
+            self.evolve(problem, self.share, cma_es.NEARBY)
 
     def searching(kind: type) -> Callable:
         return lambda: changed(optimise, Descents=kind)
@@ -91,7 +91,7 @@ def main() -> None:
     """Print a line a search, and the table."""
     configure()
     from ptsmc_jax import scenario
-    from tuning.search import evolution, optimise
+    from tuning.search import global_check, optimise
     from tuning.studies import posing
 
     seeds, wanted = int(sys.argv[1]) if len(sys.argv) > 1 else 20, sys.argv[2:] or [*FILES, "chain"]
@@ -124,7 +124,7 @@ def main() -> None:
                      seconds=round(time.monotonic() - started, 1), gains=found.gains.tolist())  # fmt: skip
                 if seed == 0 and variant == "as it is" and (name, "differential evolution", 0) not in done:
                     started = time.monotonic()
-                    check = evolution.check(evaluate, found, 1)
+                    check = global_check.check(evaluate, found, 1)
                     keep(name, "differential evolution", 0, goal=check.value, kept=check.kept,
                          rollouts=check.rollouts, gradients=0, seconds=round(time.monotonic() - started, 1),
                          gains=list(check.gains.values()))  # fmt: skip

@@ -42,7 +42,7 @@ def main() -> None:
     """Print a line a seed."""
     configure()
     from ptsmc_jax import scenario
-    from tuning.search import evolution, gains, optimise
+    from tuning.search import gains, global_check, optimise
     from tuning.studies import judging, posing
 
     path, (first, end) = sys.argv[1], (0, 20)
@@ -73,7 +73,7 @@ def main() -> None:
     started = time.monotonic()
     if len(sys.argv) > 3:
         return
-    check = evolution.check(evaluate, best, 1, sloped=posed.sloped)
+    check = global_check.check(evaluate, best, 1, sloped=posed.sloped)
     print(f"differential evolution: goal {check.value:.5e}, {check.rollouts} rollouts, "
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
     references = {"differential evolution's": check.value, "the better of both": min(check.value, best.value)}

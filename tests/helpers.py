@@ -193,7 +193,7 @@ def tree(folder):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials."""
-    from tuning.search import confirm, descents, refine, starts, worst
+    from tuning.search import cma_es, confirm, descents, starts, worst
 
     for module, name, value in (
         (worst, "SCREENED", 48),
@@ -201,7 +201,7 @@ def small_search(monkeypatch, fresh=40):
         (confirm, "FEWEST", 64),
         (starts, "SWEPT", 16),
         (descents, "MANY", 16),
-        (refine, "GENERATIONS", 3),
+        (cma_es, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)
 

@@ -80,10 +80,10 @@ HOUSE = {
             objective
             confirm evaluate worst
             descent starts trust
-            refine rounds work
+            cma_es rounds work
             descents
             optimise
-            evolution
+            global_check
         """,
         "studies": """
             campaign_folder judging mapping reproduction single stability table

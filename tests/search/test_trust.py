@@ -12,7 +12,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, vector
-from tuning.search import evolution, objective, optimise, trust
+from tuning.search import global_check, objective, optimise, trust
 from tuning.search.evaluate import Evaluator
 from tuning.search.shares import Bounds
 
@@ -131,17 +131,17 @@ def test_what_cannot_be_resampled_has_no_interval():
 
 @pytest.mark.long
 def test_differential_evolution_finds_the_same_optimum(monkeypatch):
-    monkeypatch.setattr(evolution, "GENERATIONS", 30)
+    monkeypatch.setattr(global_check, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
     nothing = variation.Dispersion()
     some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
     found = optimise.search(evaluate, some, [Requirement("peak_torque", 0.6)], np.array([3.0, 0.5]), 4, 40, 1)
-    checked = evolution.check(evaluate, found, 0)
+    checked = global_check.check(evaluate, found, 0)
     assert abs(checked.distance) < 1e-3
     np.testing.assert_allclose(np.log(found.value / checked.value), checked.distance, atol=1e-12)
     assert checked.rollouts >= 30 * 4
     # and where the search is stopped at its start, the distance says so
     lost = replace(found, share=evaluate.bounds.share(np.array([2.3, 3.0])))
-    assert evolution.check(evaluate, lost, 0).distance > 0.5
+    assert global_check.check(evaluate, lost, 0).distance > 0.5

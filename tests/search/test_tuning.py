@@ -18,7 +18,7 @@ from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, chain_parts, parts, vector
 from tuning.output import search_sentences
-from tuning.search import confirm, descent, descents, gains, objective, optimise, refine, rounds, shares, starts, worst
+from tuning.search import cma_es, confirm, descent, descents, gains, objective, optimise, rounds, shares, starts, worst
 from tuning.search.evaluate import Evaluator, Sloped
 from tuning.studies import judging, posing, tune_files
 
@@ -370,7 +370,7 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     """The goal of a search with them, for a law that has both: what differs is how it is found."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(descents, "MANY", 64)
-    monkeypatch.setattr(refine, "GENERATIONS", 25)
+    monkeypatch.setattr(cma_es, "GENERATIONS", 25)
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
     for sloped, evaluate in evaluates.items():

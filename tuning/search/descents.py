@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.lockstep import Ask, in_step
 from tuning.search.objective import FAILED, Problem, failures, fewer_trials
 from tuning.search.progress import Report
-from tuning.search.refine import GENERATIONS, WIDELY, refine
 from tuning.search.shares import TIMES
 from tuning.search.starts import CHOOSING, STEEP, SWEPT, charged, promising, spread, starting_points
 from tuning.search.work import ROUND, SLOPED
@@ -256,7 +256,7 @@ class Descents:
         best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
         best.offer(share[None], self._evaluate.fly(tightened, share[None]))
         try:
-            refine(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
+            evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
                    lambda done, steps: self._report(EVOLVING, done, steps, best.value, best.over),
                    partial(self._keep, 0), size)  # fmt: skip
         finally:  # interrupted too

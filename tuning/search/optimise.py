@@ -11,12 +11,12 @@ import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm
+from tuning.search.cma_es import NEARBY
 from tuning.search.descent import BROKEN
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
-from tuning.search.refine import NEARBY
 from tuning.search.rounds import MARGIN, Rounds
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest

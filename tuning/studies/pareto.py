@@ -23,13 +23,13 @@ from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains, trust
+from tuning.search.cma_es import NEARBY
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
 from tuning.search.optimise import Search, search
 from tuning.search.progress import Report
-from tuning.search.refine import NEARBY
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing, tuner
 

@@ -14,9 +14,9 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory import margins
-from tuning.search import evolution, flights, gains, trust
+from tuning.search import flights, gains, global_check, trust
 from tuning.search.design import ShortestTime, shortest_time
-from tuning.search.evolution import Check
+from tuning.search.global_check import Check
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.optimise import Search, search
@@ -125,7 +125,7 @@ def tune(
     seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
     check = None
     if globally and not found.interrupted:
-        check = evolution.check(evaluate, found, seed, report, sloped=posed.sloped)
+        check = global_check.check(evaluate, found, seed, report, sloped=posed.sloped)
 
     report("judging on fresh trials", 0, 0, found.value, 0.0)
     named = evaluate.bounds.rounded(found.gains, DIGITS)

@@ -17,7 +17,7 @@ PATIENCE, GAINED = 12, 1e-4  # generations without this much less F end it
 WORST = 1e9  # merit of a point that failed
 
 
-def refine(
+def evolve(
     evaluate: Evaluator,
     problem: Problem,
     best: Best,

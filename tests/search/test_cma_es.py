@@ -6,7 +6,7 @@ import pytest
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.search.test_trust import SPREAD
-from tuning.search import objective, refine
+from tuning.search import cma_es, objective
 from tuning.search.descent import Best
 from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.shares import Bounds
@@ -36,7 +36,7 @@ def refined(valley, start, seed=3):
     best, told = Best(share, 1, 0.0), []
     best.offer(share[None], valley.fly(some, share[None]))
     path = []
-    refine.refine(valley, some, best, share, seed, lambda *at: told.append(at), path.append)
+    cma_es.evolve(valley, some, best, share, seed, lambda *at: told.append(at), path.append)
     assert len(path) == len(told)
     return best, told
 
@@ -51,7 +51,7 @@ def narrow(count):
 def test_the_bottom_of_a_narrow_turned_valley_with_a_wall_is_found(seed):
     best, told = refined(Valley(narrow(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
     # it ends where twelve generations have gained less than GAINED: some times that is left
-    assert best.f < 5.0 * refine.GAINED
+    assert best.f < 5.0 * cma_es.GAINED
     assert np.isfinite(best.f)
     assert [done for done, _ in told] == list(range(len(told)))
 
@@ -64,7 +64,7 @@ def test_a_limit_is_followed_to_the_optimum_on_it(seed):
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
     assert best.over == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # SLACK beyond the limit is allowed
-    assert best.f <= optimum + 5.0 * refine.GAINED
+    assert best.f <= optimum + 5.0 * cma_es.GAINED
 
 
 def test_a_single_gain_is_refined_too():
@@ -74,21 +74,21 @@ def test_a_single_gain_is_refined_too():
 
 def test_it_ends_early_where_nothing_is_gained():
     _, told = refined(Valley(np.zeros((2, 2))), [0.1, 0.1])
-    assert len(told) == refine.PATIENCE + 1
+    assert len(told) == cma_es.PATIENCE + 1
 
 
 def test_it_looks_around_the_start():
     valley = Valley(np.eye(2))
     refined(valley, [0.1, -0.2])
     first = valley.seen[1]  # after the start itself; the bounds, 1.5 spreads and more away, hold back one in twelve
-    assert first.shape == (refine.WIDELY[0], 2)
-    np.testing.assert_allclose(first.mean(axis=0), [0.1, -0.2], atol=5.0 * refine.WIDELY[1] / np.sqrt(len(first)))
-    assert np.all(np.abs(first.std(axis=0) / refine.WIDELY[1] - 0.9) < 0.3)
+    assert first.shape == (cma_es.WIDELY[0], 2)
+    np.testing.assert_allclose(first.mean(axis=0), [0.1, -0.2], atol=5.0 * cma_es.WIDELY[1] / np.sqrt(len(first)))
+    assert np.all(np.abs(first.std(axis=0) / cma_es.WIDELY[1] - 0.9) < 0.3)
 
 
 def test_where_nothing_keeps_the_limit_it_goes_on_toward_it():
     best, told = refined(Valley(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
-    assert len(told) == refine.GENERATIONS
+    assert len(told) == cma_es.GENERATIONS
     assert best.over < 2.01  # x is 0.5 at most
 
 
