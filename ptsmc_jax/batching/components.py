@@ -323,6 +323,7 @@ _RULES: dict[str, Callable[[Any, Sequence], list[Lane] | None]] = {
     **dict.fromkeys(_CUMULATIVE, _cumulative),
     **dict.fromkeys(_INDEXING, lambda eqn, values: None),
     "optimization_barrier": lambda eqn, values: None,
+    "reshard": lambda eqn, values: [Lane(eqn.outvars[0].aval.shape, parts_of(values[0]))],  # on one device: itself
     "bitcast_convert_type": _bitcast,
     "dot_general": _contraction,
 }

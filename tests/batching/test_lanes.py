@@ -57,6 +57,8 @@ TABLE = jnp.linspace(-1, 1, 12).reshape(3, 4)
 FIXED = jnp.asarray([0.3, -0.7, 1.1])
 X, Y, S, POSITIVE = draw(3), draw(3, seed=1), draw(), draw(3, low=0.1, high=0.9)
 M, N = draw(3, 3), draw(3, 2)
+MESH = jax.sharding.Mesh(np.asarray(jax.devices()[:1]), ("device",), axis_types=(jax.sharding.AxisType.Explicit,))
+ALONE = jax.NamedSharding(MESH, jax.P())
 K, J = whole(3), whole(3, low=1, seed=1)
 U = whole(3, low=0, high=2**32, dtype=jnp.uint32)
 F = X.astype(jnp.float32)
@@ -97,6 +99,7 @@ ELEMENTWISE: dict[str, tuple] = {
     "single precision": (lambda f: (f * 2.0 + 1, f @ f, jnp.sin(f), f / 3, jnp.where(f > 0, f, 0.0)), F),
     "complex": (lambda x, y: (lax.complex(x, y), abs(x + 1j * y), jnp.exp(1j * x).real, jnp.conj(1j * x)), X, Y),
     "scalars alone": (lambda s: (s, s * s, jnp.sin(s) + 1, s.astype(jnp.float32)), S),
+    "reshard": (lambda x: 2.0 * jax.sharding.reshard(x, ALONE), X),
     "optimization_barrier": (lambda x, s: lax.optimization_barrier((x, s)), X, S),
 }  # fmt: skip
 
