@@ -37,7 +37,7 @@ STATUS = {
     UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples for these"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
-SINGULAR_CLEARANCE = 1e-3
+SINGULAR_CLEARANCE = 1e-3  # there the law's gain, which grows like 1 / clearance, is a thousand times as large
 LEFT = 0.05  # share of the initial angle, and SETTLED settling angles, beyond which a run has missed t_f
 SETTLED = 10.0
 DISTURBANCE_WALK = "disturbance_walk"

@@ -10,7 +10,7 @@ from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.objective import Problem
 from tuning.search.starts import STEEP, merit
 
-GENERATIONS = 40
+GENERATIONS = 40  # at most: `PATIENCE` ends it earlier
 WIDELY = 128, 0.2  # points of a generation; spread of the first ones, in shares of the bounds' intervals
 NEARBY = 32, 0.05  # the same from a point that is nearly the best
 PATIENCE, GAINED = 12, 1e-4  # generations without this much less F end it

@@ -88,7 +88,7 @@ class Descents:
         margin: float,
         steps: int,
         rng: np.random.Generator,
-        report: Report = lambda *told: None,
+        report: Report = lambda *_: None,
     ):
         self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
         self._own: np.ndarray | None = None  # (gains,) shares to come back to where a gain makes no difference

@@ -12,7 +12,7 @@ from tuning.search.optimise import Search
 from tuning.search.progress import Report
 
 POPULATION = 40  # points for each gain
-GENERATIONS = 80
+GENERATIONS = 80  # at most: `SPREAD` ends it earlier
 STEPS = 100  # of the descent from what it found
 SPREAD = 1e-4  # of F in the population, at which it ends
 FORBIDDEN = 100.0  # beside F, for a point that breaks a limit: beyond every F
@@ -30,7 +30,7 @@ class Check:
 
 
 def check(
-    evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *told: None, *, sloped: bool = True
+    evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *_: None, *, sloped: bool = True
 ) -> Check:
     """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
 

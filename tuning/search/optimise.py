@@ -53,7 +53,7 @@ def search(
     sloped: bool = True,
     robust: bool = False,
     judged: bool = True,
-    report: Report = lambda *told: None,
+    report: Report = lambda *_: None,
     prepare: Callable[[], None] = lambda: None,
 ) -> Search:
     """Minimise F with every requirement met on the training trials.

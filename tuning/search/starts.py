@@ -14,7 +14,7 @@ from tuning.search.progress import Report
 
 SWEPT = 64  # points flown, among which starts are chosen
 CALL = 16  # of them between two reports
-CHARGE = 3.0
+CHARGE = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 APART = (0.5, 0.35, 0.2, 0.0)  # in the unit cube, along the gain in which two points differ most
 STEEP = 10.0  # times the charge, where many points are close to a limit
 CHOOSING = "choosing starts"

@@ -25,7 +25,7 @@ from tuning.studies.campaign_folder import Folder, floor_of, margins_of
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
-SHOWN = 0.9973  # of the runs, by which a pointing budget is told
+SHOWN = 0.9973  # share of the runs that a pointing budget holds for: three sigma of a normal number
 SEARCHED = 100_000  # trials by which it is judged what drives a metric
 DRAWN = 1000  # trials whose histories are drawn
 POINTS = 5000  # trials in a figure of points
@@ -53,7 +53,7 @@ def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], lis
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
     verdicts = flying.verdicts(wanted, frame)
     ok = flying.finished(frame)
-    return verdicts, [_told(v, r, _beyond(frame, r, ok)) for v, r in zip(verdicts, wanted, strict=True)]
+    return verdicts, [_in_summary(v, r, _beyond(frame, r, ok)) for v, r in zip(verdicts, wanted, strict=True)]
 
 
 def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndarray:
@@ -63,28 +63,28 @@ def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndar
     return np.where(ok, 1.0 - frame[wanted.timed].fill_null(0.0).to_numpy(), 1.0)
 
 
-def _told(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
+def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
     within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
-    told = {**msgspec.to_builtins(verdict), "met": verdict.met}
+    entry = {**msgspec.to_builtins(verdict), "met": verdict.met}
     if beyond.size:  # a share of the time, of which runs are what is independent
         each = (1.0 + CONFIDENCE) / 2.0
-        told["share"] = 1.0 - beyond.mean()
-        told["share_interval"] = 1.0 - statistics.mean_bound(beyond, each), statistics.mean_bound(1.0 - beyond, each)
-        told["share_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
+        entry["share"] = 1.0 - beyond.mean()
+        entry["share_interval"] = 1.0 - statistics.mean_bound(beyond, each), statistics.mean_bound(1.0 - beyond, each)
+        entry["share_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
     else:
-        told["share"] = within / verdict.trials
-        told["share_interval"] = statistics.share_interval(within, verdict.trials, CONFIDENCE)
-        told["share_bound"] = statistics.share_bound(within, verdict.trials, confidence)
+        entry["share"] = within / verdict.trials
+        entry["share_interval"] = statistics.share_interval(within, verdict.trials, CONFIDENCE)
+        entry["share_bound"] = statistics.share_bound(within, verdict.trials, confidence)
     if wanted.quantile is not None and wanted.confidence is not None:
         failures = verdict.failures if wanted.timed is None else 0
-        told["fewest_trials"] = statistics.fewest_for(failures, wanted.quantile, wanted.confidence)
-    return told
+        entry["fewest_trials"] = statistics.fewest_for(failures, wanted.quantile, wanted.confidence)
+    return entry
 
 
 def summarise(folder: Folder) -> dict[str, Any]:
     """What `summary.json` says."""
     parts = folder.whole_parts()
-    told = [*judged(folder)[1], *margins_of(folder)]
+    verdicts = [*judged(folder)[1], *margins_of(folder)]
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
     finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
@@ -106,7 +106,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         known = ranked.setdefault(driven.tobytes(), {})  # by the trials
         drivers[name] = statistics.drivers(of, values[:SEARCHED][driven], known) if driven.sum() > 1 else {}
     done = int(head.height)
-    met = all(v["met"] for v in told) if told else counts["ok"] == done
+    met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
         "status": "unfinished" if done < folder.trials else "met" if met else "not met",
         "plant": folder.scenario.plant.kind,
@@ -118,7 +118,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "reasons": reasons,
         "interval_confidence": CONFIDENCE,
         "floor": floor_of(folder),
-        "verdicts": told,
+        "verdicts": verdicts,
         **_pointing(folder, parts, finished),
         "quantiles": found,
         "drivers": drivers,
@@ -141,8 +141,8 @@ def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> d
             least = must_keep(ordered.size, SHOWN, CONFIDENCE)
             bound = None if least is None or not np.isfinite(ordered[least - 1]) else float(ordered[least - 1])
             budget.setdefault(index, {})[axis] = bound
-    told = {"boresight": table.boresight, "window": table.window, "after": table.after}
-    return {"pointing": {**told, "probability": SHOWN, "confidence": CONFIDENCE, "budget": budget}}
+    observed = {"boresight": table.boresight, "window": table.window, "after": table.after}
+    return {"pointing": {**observed, "probability": SHOWN, "confidence": CONFIDENCE, "budget": budget}}
 
 
 def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
@@ -152,13 +152,13 @@ def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     """
     has = finished & np.isfinite(values)
     known, ordered = values[has], np.sort(np.where(has, values, np.inf))
-    told: dict[str, Any] = {"without_value": int(values.size - known.size)}
+    entry: dict[str, Any] = {"without_value": int(values.size - known.size)}
     if known.size:
-        told |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
+        entry |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
     for quantile in QUANTILES:
         low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
-        told[str(quantile)] = {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
-    return told
+        entry[str(quantile)] = {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
+    return entry
 
 
 def write_summary(folder: Folder, found: dict[str, Any], figures: bool) -> None:

@@ -88,7 +88,7 @@ def trace(
     scenario: Scenario,
     seed: int,
     points: int,
-    tell: Report = lambda *told: None,
+    tell: Report = lambda *_: None,
     journal: Journal | None = None,
 ) -> Front:
     """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""

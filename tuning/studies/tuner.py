@@ -91,7 +91,7 @@ class Tuning:
 def tune(
     scenario: Scenario,
     seed: int,
-    report: Report = lambda *told: None,
+    report: Report = lambda *_: None,
     journal: Journal | None = None,
     *,
     globally: bool = False,
