@@ -57,6 +57,13 @@ steps = 4
 """
 
 
+def roomy(timing: Any) -> Any:
+    """The clock with more steps, or periods of length zero, so that runs of other times are the same program."""
+    counts = {name: getattr(timing, name) for name in ("before", "after")}
+    more = {name: count if count > 1000 else 2 ** math.ceil(math.log2(count)) for name, count in counts.items()}
+    return dataclasses.replace(timing, **more)
+
+
 def vector(*values: Any) -> Any:
     """A float64 array."""
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float))
@@ -89,12 +96,14 @@ def parts(
     body = rigid_body.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
-        timing: Any = clock.graded(t_f, delta, t_end, 1.0, max(k1 / 2, surface_rate), 0.1, (0.2 * t_f, 0.2), saves)
+        pace = max(k1 / 2, surface_rate)
+        timing: Any = clock.graded(t_f, delta, t_end, 1.0, pace, 0.1, (0.2 * t_f, 0.2), saves)
+        timing = timing if len(saves) else roomy(timing)
     elif flight:
         timing = clock.flight(period, t_end)
     else:
         longest = reach or (t_f, delta)
-        timing = clock.anchored(period, t_end, longest[0], t_end - t_f + longest[1])
+        timing = roomy(clock.anchored(period, t_end, longest[0], t_end - t_f + longest[1]))
     return Parts(
         plant=body,
         disturbance=disturbance
@@ -138,12 +147,12 @@ def chain_parts(
     gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
     law = prescribed_time.PrescribedTimeChain(model, *gains, a=vector(a))
     if period is not None:
-        timing: Any = clock.anchored(period, t_end, t_f, 2.0 + delta)
+        timing: Any = roomy(clock.anchored(period, t_end, t_f, 2.0 + delta))
     elif steps is not None:
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
     else:
-        timing = clock.graded(t_f, delta, t_end, 1.0, max(law.hold_rates().values()), 0.0, (0.0, 0.0), (), n)
+        timing = roomy(clock.graded(t_f, delta, t_end, 1.0, max(law.hold_rates().values()), 0.0, (0.0, 0.0), (), n))
     return Parts(
         plant=model,
         disturbance=disturbance or disturbances.Constant(jnp.zeros(1)),

@@ -108,7 +108,7 @@ def test_in_single_precision_it_is_the_scan_of_single_precision():
 LOWERED = [(32, primal), (32, derivative), (64, primal), (64, derivative)]
 
 
-@pytest.mark.parametrize(("bits", "make"), short(LOWERED, (LOWERED[0], LOWERED[3])))
+@pytest.mark.parametrize(("bits", "make"), short(LOWERED, LOWERED[3:4]))
 def test_it_is_lowered_for_cuda_on_a_machine_without(bits, make):
     with jax.enable_x64(bits == 64):
         mapped = jax.jit(kernel.vmap(make(FLIGHT)))

@@ -47,7 +47,7 @@ def test_rows_do_not_depend_on_the_parts(flown, first, count):
 BLOCKS = [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)]
 
 
-@pytest.mark.parametrize(("block", "capacity", "devices"), short(BLOCKS, BLOCKS[2:]))
+@pytest.mark.parametrize(("block", "capacity", "devices"), short(BLOCKS, BLOCKS[3:]))
 def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, capacity, devices):
     made, frame = flown
     monkeypatch.setattr(montecarlo, "CAPACITY", capacity)

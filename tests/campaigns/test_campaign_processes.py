@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.helpers import ROOT, SHORT, same
+from tests.helpers import QUICKLY, ROOT, SHORT, same
 
 PTSMC = [sys.executable, "-c", "from tuning.cli.main import main; main()"]
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
@@ -26,7 +26,7 @@ SLOW = (
 
 
 def environment():
-    return dict(os.environ, PYTHONPATH=str(ROOT))
+    return dict(os.environ, PYTHONPATH=str(ROOT), XLA_FLAGS=f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}")
 
 
 def started(folder, *options, **others):

@@ -12,6 +12,7 @@ from tests.helpers import same, short
 from tests.output.pages import checked
 
 FOLDER = "out/montecarlo-s"
+MANY = 70  # trials, so many that the program of hundreds flies them
 OVERSHOOT = """
 import jax.numpy as jnp
 
@@ -320,9 +321,9 @@ def test_failures_are_counted_with_reason_and_time(command, tmp_path):
 def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_path):
     text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", "")
     (tmp_path / "s.toml").write_text(text)
-    assert command("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet")[0] == 0
+    assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")[0] == 0
     (tmp_path / "s.toml").write_text(wild(text))
-    assert command("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet", "--out", "b")[0] == 1
+    assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet", "--out", "b")[0] == 1
 
 
 @pytest.mark.parametrize("plant", short(["chain", "continuous"], ["chain"]))
@@ -347,7 +348,7 @@ def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(com
     """Where 32 bits are asked for, they are set; tests set them by hand, since JAX is set up already."""
     asked = []
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **told: asked.append(told))
-    run = ("montecarlo", "s.toml", "--trials", 50, "--no-figures", "--quiet")
+    run = ("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")
     assert command(*run, "--out", "whole")[0] == 0
     with jax.enable_x64(False):
         assert command(*run, "--out", "half", "--precision", 32)[0] == 0

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.devices import actuators
-from ptsmc_jax.dispersions import misfits, variation
+from ptsmc_jax.dispersions import misfits
 from ptsmc_jax.plants import flexible_body
 from ptsmc_jax.simulation import rollout
 from tests.helpers import vector
@@ -63,11 +63,10 @@ def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
             rate_scale=numbers(flown, trial, "gyro_scale", 3),
         )
         by_hand = replace(ready.parts, plant=plant.settled(), actuators=device, sensors=sensors)
-        found = montecarlo.run(by_hand, variation.Dispersion(), 5, np.asarray([trial])).metrics
+        found = rollout.simulate_jit(by_hand, np.uint32(5), np.uint32(trial)).metrics
         for name in ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered"):
-            np.testing.assert_allclose(
-                getattr(flown.metrics, name)[trial], getattr(found, name)[0], rtol=1e-12, err_msg=name
-            )
+            value = getattr(found, name)  # by another program: roundings differ
+            np.testing.assert_allclose(getattr(flown.metrics, name)[trial], value, rtol=1e-11, err_msg=name)
     assert np.ptp(flown.metrics.window_error) > 1e-5
 
 
@@ -84,6 +83,7 @@ def test_the_body_gets_what_scaled_and_turned_actuators_give_and_flight_software
     assert device.known == actuators.Actuators()
 
 
+@pytest.mark.long
 def test_a_misfit_of_nothing_changes_no_digit():
     none = {key: {"kind": v["kind"], **{k: 0.0 for k in v if k != "kind"}} for key, v in DRAWN.items()}
     plain = scenario.study(scenario.from_tables(FLIGHT))

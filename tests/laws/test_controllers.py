@@ -163,12 +163,12 @@ def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_ad
     assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # it does cross
     target = run.reference(vector(0.0))
     start = run.controller.errors(run.controller.align(run.initial, target), target)
-    exact = jax.vmap(lambda t: solutions.exact_error(t, vector(20.0), vector(3.5), *start))(
+    exact = jax.jit(jax.vmap(lambda t: solutions.exact_error(t, vector(20.0), vector(3.5), *start)))(
         vector(result.log.t[before])
     )
     np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-10)
     # the torque of the exact motion, from the inverse map of `theory`, is the one that was flown
-    u = jax.vmap(lambda t: solutions.exact_input(run, t)[0])(vector(result.log.t[before]))
+    u = jax.jit(jax.vmap(lambda t: solutions.exact_input(run, t)[0]))(vector(result.log.t[before]))
     feedback = 2 * 14 * 3.5**2 / (20.0 - result.log.t[before]) ** 2  # what an error of 1e-10 costs in torque
     assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
 
@@ -196,7 +196,7 @@ def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12, err_msg=name)
     early = one.log.t < 19.0  # nearer to t_f the feedback gain multiplies rounding by 2 J eta^2 / tau^2, over 300
     np.testing.assert_allclose(one.log.u[early], other.log.u[early], rtol=0, atol=1e-12)
-    expected = np.asarray(jax.vmap(lambda q: attitude.multiply(turn, q))(jnp.asarray(one.log.x.q)))
+    expected = np.asarray(jax.jit(jax.vmap(lambda q: attitude.multiply(turn, q)))(jnp.asarray(one.log.x.q)))
     signs = np.sign(np.sum(expected * other.log.x.q, axis=1, keepdims=True))
     np.testing.assert_allclose(other.log.x.q * signs, expected, rtol=0, atol=1e-12)
     # the additive law's motion does depend on it
@@ -234,9 +234,9 @@ def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
     x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
     assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
-    # too fast a start away from the reference: |v| passes 1
+    # too fast a start away from the reference: |v| passes 1, at a node of the grid or between two of them
     run = flown(LAWS[1], references.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
-    assert fly(run).status == rollout.SINGULAR
+    assert fly(run).status in (rollout.SINGULAR, rollout.TOO_FAST)
     # |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough
     calm = flown(LAWS[1], references.Fixed(vector(0.0, 0.0, 0.0, 1.0)), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
     error, error_rate = calm.controller.errors(calm.initial, calm.reference(vector(0.0)))

@@ -120,7 +120,9 @@ def test_frozen_gains_are_those_of_the_law_and_have_no_border(eta):
     law = parts.controller
     for tau in (2.0, 3.5, 20.0):
         now = Sample(vector(T_F - tau * H), jnp.asarray(False), vector(H))
-        by = jax.jacfwd(lambda x, now=now: law.command(None, now, x, None, jnp.zeros(1), vector(0.0))[0])(jnp.zeros(2))
+        by = jax.jit(jax.jacfwd(lambda x, now=now: law.command(None, now, x, None, jnp.zeros(1), vector(0.0))[0]))(
+            jnp.zeros(2)
+        )
         kp, kd = borders.implicit_gains(eta, tau)
         np.testing.assert_allclose(by, [[-kp / H**2, -kd / H]], rtol=1e-12)
         assert borders.radius(kp, kd, 1.0) < 1.0

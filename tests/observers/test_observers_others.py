@@ -61,7 +61,7 @@ def test_updates_of_length_zero_change_nothing_and_have_finite_slopes():
             memory = found.begin() + 0.1
             return found.update(found.update_matrix(dt), memory, vector([0.02]) * dt, vector(1.0), dt)
 
-        slope = jax.jacfwd(moved)(vector(0.0))
+        slope = jax.jit(jax.jacfwd(moved))(vector(0.0))
         assert np.all(np.isfinite(slope))
         if isinstance(found, prescribed_time.PrescribedTimeObserver):
             np.testing.assert_allclose(moved(vector(0.0)), 0.1)

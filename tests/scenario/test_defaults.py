@@ -37,7 +37,7 @@ def reached(disturbance, dispersion=None, count=400, spacecraft=None):
     size = rate = 0.0
     for k in range(count):
         drawn = ready.dispersion.apply(ready.parts, np.uint32(0), np.uint32(k))
-        d = np.asarray(jax.vmap(lambda time, part=drawn: part.disturbance(time, part.initial))(jnp.asarray(t)))
+        d = np.asarray(jax.jit(jax.vmap(lambda time, part=drawn: part.disturbance(time, part.initial)))(jnp.asarray(t)))
         size, rate = max(size, np.abs(d).max()), max(rate, np.abs(np.gradient(d, t, axis=0)).max())
     return size, rate
 

@@ -91,7 +91,7 @@ def test_noise_of_s_is_that_of_drawn_samples(rate):
         seen = AttitudeState(q, 1e-5 * n[3:])
         return law.torque(vector(25.0), jnp.asarray(True), seen, rest, jnp.zeros(3), vector(0.0))[1]
 
-    found = np.std(np.asarray(jax.vmap(s)(vector(normals))), axis=0)
+    found = np.std(np.asarray(jax.jit(jax.vmap(s))(vector(normals))), axis=0)
     np.testing.assert_allclose(found, noise_of_s(table), rtol=0.015)
 
 

@@ -100,12 +100,14 @@ def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
         return jnp.log(jnp.abs(jnp.append(spread, jnp.stack([found.attitude_gain, found.bias_gain]))))
 
     at = vector(0.4)
-    exact, step = jax.jacfwd(sizes)(at), 1e-4
+    exact, step = jax.jit(jax.jacfwd(sizes))(at), 1e-4
     numeric = (sizes(at + step) - sizes(at - step)) / (2 * step)
     np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # step^2 times a third derivative of some 10
     for star, gyro in ((2e-5, 0.0), (0.0, 1e-6), (0.0, 0.0)):
-        spread = jax.jacfwd(
-            lambda b, star=star, gyro=gyro: attitude_filter.attitude_filter(b, star, gyro, 0.0, 0.1, 2).spread
+        spread = jax.jit(
+            jax.jacfwd(
+                lambda b, star=star, gyro=gyro: attitude_filter.attitude_filter(b, star, gyro, 0.0, 0.1, 2).spread
+            )
         )
         assert np.all(np.isfinite(spread(at)))
 

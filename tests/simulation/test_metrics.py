@@ -26,7 +26,7 @@ def run(request):
 
 def test_window_error_is_the_integral_of_the_squared_error(run):
     parts, found, log = run
-    rates = jax.vmap(lambda t, x: parts.controller.errors(x, parts.reference(t))[1])
+    rates = jax.jit(jax.vmap(lambda t, x: parts.controller.errors(x, parts.reference(t))[1]))
     slope = rates(jnp.asarray(log.t), jax.tree.map(jnp.asarray, log.x))
     spline = CubicHermiteSpline(log.t, log.error, slope)
     t = np.linspace(20.0, 21.0, 20001)

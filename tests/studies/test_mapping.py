@@ -51,8 +51,13 @@ def test_bad_axes_are_refused_in_a_sentence(text):
         mapping.axis(text, "--y")
 
 
-def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives():
-    loaded, x, y, cells = flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:3")
+@pytest.fixture(scope="module")
+def mapped():
+    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:3")
+
+
+def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped):
+    loaded, x, y, cells = mapped
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
     refused = [c for c in cells if c.status != "flown"]
     assert [(c.x, c.y) for c in refused] == [(0.2, 0.1)]  # below one period
@@ -136,9 +141,8 @@ def test_borders_are_drawn_over_period_and_delta_only():
     assert not mapping.lines(third, x, y)  # another law, another border
 
 
-def test_folder_holds_the_map(tmp_path):
-    # the numbers of periods of the map before: its programs
-    loaded, x, y, cells = flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:2", trials=2)
+def test_folder_holds_the_map(mapped, tmp_path):
+    loaded, x, y, cells = mapped
     mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
     with (tmp_path / "map.csv").open() as file:
         rows = list(csv.DictReader(file))

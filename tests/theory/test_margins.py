@@ -103,7 +103,7 @@ def test_slopes_of_margins_are_those_of_central_differences():
         return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.modulus[0]])
 
     at = jnp.asarray([3.0, 2e-2, 1.5])
-    exact = jax.jacfwd(values)(at)
+    exact = jax.jit(jax.jacfwd(values))(at)
     for k in range(3):
         step = 1e-4 * float(at[k]) * jnp.eye(3)[k]
         numeric = (8 * (values(at + step) - values(at - step)) - values(at + 2 * step) + values(at - 2 * step)) / (
@@ -179,22 +179,22 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", short(KINDS, ["filter, delay and lag", "wheels and lag"]))
+@pytest.mark.parametrize("kind", short(KINDS, ["filter, delay and lag"]))
 def test_the_nominal_run_is_the_one_that_flies(kind):
     """The flight computer with a model of its own of the actuators flies as the one that is told what they did."""
     law = {"controller": {"t_f": 10.0, "delta": 0.5}}
     parts = linear.quiet(scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts)
     log = rollout.simulate_jit(parts, record=True).log
     run = linear.nominal_jit(parts)
-    sizes = jax.vmap(parts.plant.apart)(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
+    sizes = jax.jit(jax.vmap(parts.plant.apart))(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
     np.testing.assert_allclose(sizes, 0.0, atol=1e-11)  # rounding, in rad and rad/s of order 1
 
 
 @pytest.mark.parametrize("kind", short(KINDS, ["filter, delay and lag", "a system of one's own"]))
 def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
-    """Five scenarios of each kind: 1 % on either side of a margin in gain, up and down, and in delay, one axis."""
+    """Two scenarios of each kind: 1 % on either side of a margin in gain, up and down, and in delay, one axis."""
     checked = 0
-    for _ in range(5):
+    for _ in range(2):
         law = {"t_f": 10.0, "delta": 0.5, "k1": float(RNG.uniform(1.0, 8.0)), "sign_width": 0.05}
         table = {**KINDS[kind], "controller": {**KINDS[kind].get("controller", {}), **law}}
         if kind != "a system of one's own":
@@ -225,7 +225,7 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
             growth = flown(parts, run, index, np.ones(m), late)
             assert (growth > 0.0) == (share > 1), ("delay", share, growth)
             checked += 1
-    assert checked >= 10
+    assert checked >= 4
 
 
 @pytest.mark.parametrize("delay", short([0, 1], [1]))

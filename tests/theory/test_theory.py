@@ -163,7 +163,7 @@ def stays_inside_the_corrected_bounds(case):
     assert np.all(error <= hold.error_bound(run, t) * (1 + 1e-4) + 1e-9)
 
 
-test_spacecraft_stays_inside = drawn(stays_inside_the_corrected_bounds, 40, case=SPACECRAFT)
+test_spacecraft_stays_inside = drawn(stays_inside_the_corrected_bounds, 20, case=SPACECRAFT)
 test_many_spacecraft_stay_inside = pytest.mark.long(drawn(stays_inside_the_corrected_bounds, 320, case=SPACECRAFT))
 
 
@@ -204,7 +204,7 @@ def test_input_along_the_exact_motion_is_the_flown_one():
         flown = rollout.simulate_jit(run, record=True)
         assert flown.log is not None
         before = np.asarray(flown.log.t) < 24.49
-        u = jax.vmap(lambda time, run=run: solutions.exact_input(run, time)[0])(flown.log.t[before])
+        u = jax.jit(jax.vmap(lambda time, run=run: solutions.exact_input(run, time)[0]))(flown.log.t[before])
         # gains of 2 J eta^2 / tau^2 < 3000 on states within 1e-9
         np.testing.assert_allclose(flown.log.u[before], u, rtol=0, atol=3e-6)
         _, u, _ = solutions.exact_path(run, 400)
