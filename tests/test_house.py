@@ -29,12 +29,17 @@ HOUSE = {
             fixed_time pd predefined_time scaling super_twisting terminal time_base
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
-        "devices": "attitude_filter command_filter reaction_wheels ticks | actuators sensors | own_sensors",
+        "devices": """
+            attitude_filter command_filter reaction_wheels ticks
+            star_times
+            actuators sensors
+            own_sensors
+        """,
         "simulation": """
             catalogues clock pointing
             interval
             assembly metric_rows requirements
-            computer metrics
+            computer gains metrics
             rollout
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",

@@ -63,6 +63,25 @@ class AttitudeFilter:
         q = attitude.normalise(attitude.multiply(old.q, attitude.from_rotation_vector(turn)))
         return Estimate(q, old.bias - self.bias_gain * weight * residual)
 
+    def correct_between(
+        self,
+        old: Estimate,
+        w: Float[Array, "3"],
+        w_next: Float[Array, "3"],
+        dt: Scalar,
+        measured: Float[Array, "4"],
+        age: Scalar,
+        weight: Scalar,
+    ) -> Estimate:
+        """The estimate dt [s] later, corrected on the way: by a star tracker sample taken age [s] before the end.
+
+        w, w_next: rates measured at both ends [rad/s], linear in time between; measured [-] counts with this weight.
+        """
+        share = 1.0 - age / jnp.where(dt > 0.0, dt, 1.0)
+        there = w + share * (w_next - w)
+        corrected = self.correct(self.propagate(old, w, there, dt - age), measured, weight)
+        return self.propagate(corrected, there, w_next, age)
+
 
 def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
     """Gains (attitude [-], bias [1/s]) that put both poles of the estimation error at e^(-bandwidth interval).
@@ -106,12 +125,12 @@ def attitude_filter(
     first = matrices.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4)).reshape(2, 2)
 
     def spread(step: Array, since: Array) -> Array:
-        return _cholesky(step @ first @ step.T + since + square(gyro, rate_noise))
+        return cholesky(step @ first @ step.T + since + square(gyro, rate_noise))
 
     return AttitudeFilter(k1, k2, jax.vmap(spread)(steps, added))
 
 
-def _cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+def cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
     """Lower factor of a covariance; without derivatives that are not finite where there is no noise."""
     (a, b), (_, d) = covariance
     first = guards.sqrt(jnp.maximum(a, 0.0))

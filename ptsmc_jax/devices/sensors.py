@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
+from ptsmc_jax.devices.star_times import StarTimes, filter_between
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
@@ -49,6 +50,10 @@ class Sensor(ABC):
     def quiet(self) -> Any:
         """The sensor without noise."""
 
+    def in_step(self) -> Any:
+        """The sensor as if all its samples were taken at control samples, for linear theory; see `Sensors`."""
+        return self
+
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Numbers that the sensor draws once a trial, such as a bias [rad/s], by the names of a row's columns."""
         return {}
@@ -62,10 +67,29 @@ class Reading(NamedTuple):
 
     rows: np.ndarray  # (m, n + own) what is read of them
     noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
-    every: np.ndarray  # (m,) control periods from one reading to the next
+    every: np.ndarray  # (m,) control periods from one reading to the next; 0: it is read at `own_times`
     own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
     own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
     start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
+    own_times: StarTimes | None = None
+    slopes: np.ndarray | None = None  # (m, n + own) rates of what is read, where it is read at own times
+
+    def there(self, sample: np.ndarray) -> np.ndarray:
+        """Whether control samples (N,), by their numbers, have each of the readings, (N, m)."""
+        found = sample[:, None] % np.maximum(self.every, 1) == 0
+        if self.own_times is None:
+            return found
+        return np.where(self.every == 0, np.asarray(self.own_times.due(sample))[:, None], found)
+
+    def rows_at(self, sample: np.ndarray, dt: np.ndarray) -> np.ndarray:
+        """What is read at control samples (N,), (N, m, n + own), to first order in how old it is.
+
+        dt: lengths of the periods before them, (N,) [s].
+        """
+        if self.own_times is None or self.slopes is None:
+            return np.broadcast_to(self.rows, (len(sample), *self.rows.shape))
+        age = np.minimum(np.asarray(self.own_times.age(sample)), dt)
+        return self.rows - (age[:, None] * (self.every == 0))[:, :, None] * self.slopes
 
 
 class Memory(NamedTuple):
@@ -97,6 +121,7 @@ class Sensors(Sensor):
     misalignment: Leaf | None = None  # (3,) rotation vector of the star tracker in the body [rad]
     rate_scale: Leaf | None = None  # (3,) what the gyro reads of the rate [-]
     outage: Leaf | None = None  # (2,) from when to when the star tracker has no samples [s]; with a filter
+    own_times: StarTimes | None = None  # of the star tracker where `every` is no whole number, with a filter
 
     def turned(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
         """The attitude (4,) of the star tracker, a unit quaternion, for that of the body."""
@@ -108,12 +133,16 @@ class Sensors(Sensor):
         """The sensors with a filter of another bandwidth [rad/s]; period: of control [s]."""
         walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
         noises = self.attitude_noise, self.rate_noise, walk
-        return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
+        if self.own_times is None:
+            return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
+        times = self.own_times
+        return replace(self, filter=filter_between(bandwidth, *noises, period, times.interval, times.pattern))
 
     def bandwidth(self, period: Any) -> Any:
         """Bandwidth of the filter [rad/s]."""
         assert self.filter is not None
-        return -0.5 * jnp.log1p(-self.filter.attitude_gain) / (period * self.every)
+        interval = period * self.every if self.own_times is None else self.own_times.interval
+        return -0.5 * jnp.log1p(-self.filter.attitude_gain) / interval
 
     def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key]:
         """Streams of a trial's noise: attitude, rate, change of the bias."""
@@ -149,8 +178,10 @@ class Sensors(Sensor):
             estimate = self.filter.begin(self.turned(x0.q), none, normals, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
-    def sample(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
-        """Attitude and rate as star tracker and gyro say them, and the memory; dt: see `measure`."""
+    def sample(
+        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, within: AttitudeState | None = None
+    ) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as star tracker and gyro say them, and the memory; dt, within: see `measure`."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
         bias = memory.bias
@@ -159,23 +190,43 @@ class Sensors(Sensor):
         w = jnp.add(x.w if self.rate_scale is None else self.rate_scale * x.w, shift)
         if bias is not None:
             w = w + bias
-        q = attitude.multiply(self.turned(x.q), attitude.from_rotation_vector(turn))
+        q = self.turned(x.q if within is None else within.q)
+        q = attitude.multiply(q, attitude.from_rotation_vector(turn))
         return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
 
     def star_weight(self, now: Ticks) -> Scalar:
         """How much a star tracker sample counts at this sample; 0: there is none."""
-        weight = jnp.where(now.sample % self.every == 0, now.noise_weight, 0.0)
+        there, t = now.sample % self.every == 0, now.t
+        if self.own_times is not None:
+            there, t = self.own_times.due(now.sample), now.t - self.own_times.age(now.sample)
+        weight = jnp.where(there, now.noise_weight, 0.0)
         if self.outage is not None:
-            weight = jnp.where((now.t >= self.outage[0]) & (now.t < self.outage[1]), 0.0, weight)
+            weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
         return weight
 
-    def measure(self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar) -> tuple[AttitudeState, Memory]:
-        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s]."""
-        read, kept = self.sample(memory, x, now, dt)
+    def star_age(self, sample: Int[Array, ""], dt: Scalar) -> Scalar:
+        """How long before a sample the star tracker took what it says there [s]; dt: of the period between [s].
+
+        Whatever is older, a sample of before t = 0 or one that is known already, is as old as the period.
+        """
+        return jnp.zeros_like(dt) if self.own_times is None else jnp.minimum(self.own_times.age(sample), dt)
+
+    def measure(
+        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, within: AttitudeState | None = None
+    ) -> tuple[AttitudeState, Memory]:
+        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s].
+
+        within: the true state at the star tracker's own time in that period, where it has its own.
+        """
+        read, kept = self.sample(memory, x, now, dt, within)
         if self.filter is None:
             return read, kept
-        ahead = self.filter.propagate(memory.estimate, memory.rate, read.w, dt)
-        estimate = self.filter.correct(ahead, read.q, self.star_weight(now))
+        old, rate, weight = memory.estimate, memory.rate, self.star_weight(now)
+        if self.own_times is None:
+            estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
+        else:
+            age = self.star_age(now.sample, dt)
+            estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), kept._replace(estimate=estimate, rate=read.w)
 
     def quiet(self) -> "Sensors":
@@ -212,13 +263,26 @@ class Sensors(Sensor):
         one, none = np.eye(3), np.zeros((3, 3))
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
-        start, every = None, 1
+        start, every, times = None, 1, self.own_times
         if self.filter is not None:
             root, every = np.asarray(self.filter.spread[-1]), self.every
             start = np.block([[one, none, none], [none, none, one]]), np.kron(root @ root.T, one)
         rows = np.block([[one, none, none], [none, one, one]])
-        kept = np.repeat([every, 1], 3)
-        return Reading(rows, np.repeat([star, gyro], 3), kept, np.full(3, bias), np.full(3, drift), start)
+        kept, slopes = np.repeat([every if times is None else 0, 1], 3), np.block([[none, one, none], [none] * 3])
+        noises = np.repeat([star, gyro], 3)
+        return Reading(rows, noises, kept, np.full(3, bias), np.full(3, drift), start, times, slopes)
+
+    def in_step(self) -> "Sensors":
+        """The same with a star tracker that counts a little at every control sample, where it has its own times.
+
+        As much in the mean, and as noisy: by the share of a sample a period, of white noise in proportion.
+        """
+        if self.own_times is None or self.filter is None:
+            return self
+        share = self.own_times.period / self.own_times.interval
+        known = self.filter
+        known = replace(known, attitude_gain=share * known.attitude_gain, bias_gain=share * known.bias_gain)
+        return replace(self, attitude_noise=self.attitude_noise / jnp.sqrt(share), filter=known, own_times=None)
 
 
 @pytree

@@ -105,7 +105,7 @@ def board(parts: Parts) -> Board:
     elif parameters["filter"] is None:
         _tracking(made)
     else:
-        _filtering(made, parameters["filter"])
+        _filtering(made, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
     _observing(made, observer, device)
     _commanding(made, law, observer)
     made.stages.append(Stage("begin", "What is remembered before the first sample.", (), _begin))
@@ -157,33 +157,42 @@ def _tracking(made: Board) -> None:
     made.stages.append(Stage("sense", "Attitude and rate as the law sees them: as measured.", reads, sense))
 
 
-def _filtering(made: Board, filter_: Any) -> None:
-    """Star tracker and gyro through the attitude filter."""
-    made.inputs |= {"attitude": real(4), "attitude_valid": integer(), "rate": real(3)}
+def _filtering(made: Board, filter_: Any, *, aged: bool) -> None:
+    """Star tracker and gyro through the attitude filter; aged: the star tracker has times of its own."""
+    age = {"attitude_age": real()} if aged else {}
+    made.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     made.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
     made.about |= _MEASURED | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
+        "attitude_age": "how long before this sample that attitude was taken, from 0 to the time since the last [s]",
         "bias": "of the gyro, estimated [rad/s]",
         "gyro": "rate as the gyro measured it last [rad/s]",
     }
 
     def sense(
         given: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any, tracking: Any,
-        t: Any,
+        t: Any, *aged: Any,
     ) -> dict[str, Any]:  # fmt: skip
-        measured = _unit(star)
+        known, measured, one = given["filter"], _unit(star), jnp.ones_like(dt)
         start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
-        ahead = given["filter"].propagate(Estimate(start, bias), gyro_before, gyro, dt)
-        found = jax.lax.cond(
-            valid != 0, lambda: given["filter"].correct(ahead, measured, jnp.ones_like(dt)), lambda: ahead
-        )
+        old = Estimate(start, bias)
+        if aged:
+            age = jnp.clip(aged[0], 0.0, dt)
+            found = jax.lax.cond(
+                valid != 0,
+                lambda: known.correct_between(old, gyro_before, gyro, dt, measured, age, one),
+                lambda: known.propagate(old, gyro_before, gyro, dt),
+            )
+        else:
+            ahead = known.propagate(old, gyro_before, gyro, dt)
+            found = jax.lax.cond(valid != 0, lambda: known.correct(ahead, measured, one), lambda: ahead)
         rate = gyro - found.bias
         attitude = _signed(given["law"], given["reference"](t), found.q, rate, start, tracking)
         return {"now.attitude": attitude, "now.rate": rate, "now.bias": found.bias, "now.gyro": gyro}
 
     about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
-             "tracking", "t")  # fmt: skip
+             "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
     made.stages.append(Stage("sense", about, reads, sense, (filter_,)))
 
 

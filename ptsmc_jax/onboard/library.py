@@ -161,16 +161,17 @@ class InTheLoop:
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
-        (now, dt_before, _), (sensing, state) = period, computer.sensing
+        (now, dt_before, *_), (sensing, state) = period, computer.sensing
         read, sensors = x, parts.sensors
         if sensors is not None:
-            read, sensing = sensors.sample(sensing, x, now, dt_before)
+            read, sensing = sensors.sample(sensing, x, now, dt_before, *(() if period.within is None else (period.within,)))
         known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             known["applied"] = computer.applied[0]
         if self.board.spacecraft:
             known |= {"attitude": read.q, "rate": read.w}
         if sensors is not None and hasattr(sensors, "star_weight"):
+            known["attitude_age"] = sensors.star_age(now.sample, dt_before)
             known["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         given = jnp.concatenate([now.t[None], *(jnp.ravel(known[name]) for name in self.board.inputs)])
         after, out = self._stepped(state, given)

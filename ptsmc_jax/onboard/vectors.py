@@ -1,5 +1,6 @@
 """What a flight computer is given and gives, sample by sample, as the simulator flies it: what C is checked by."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,12 +9,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
-from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.devices.actuators import Actuators, Drive
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import boot, brought_about, decide, schedule
+from ptsmc_jax.simulation.computer import boot, brought_about, decide, schedule, seen_within
 from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, over_period, walk_stream
 
 
@@ -24,6 +26,7 @@ class Samples(NamedTuple):
     flown: Array  # bool: its period has a length
     measured: Any  # state as the sensors say it
     valid: Array | None  # bool: the star tracker has an attitude
+    age: Array | None  # how old it is, of a star tracker with times of its own [s]
     before: Any  # Estimate of the attitude filter before the sample
     estimate: Any  # and after it
     gyro: Array | None  # rate as measured [rad/s]
@@ -56,26 +59,29 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     walk = walk_stream(seed, trial)
     sensors, wheels = parts.sensors, actuators.wheels
 
-    def period(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
-        (now, dt_before, *_), (x, computer, acting, pushed, unit) = tick, carry
+    def flown(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
+        (now, dt_before, *_), (x, computer, acting, pushed, unit, within) = tick, carry
         dt = now.t_next - now.t
         there, sensing = parts.plant.seen(x), computer.sensing
         measured = there
         if sensors is not None:
-            measured, _ = sensors.sample(sensing, there, now, dt_before)
+            measured, _ = sensors.sample(sensing, there, now, dt_before, *(() if within is None else (within,)))
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
-        (target, d_hat, u, s, w, _), computer = decide(parts, k2, about(tick), computer, there)
+        period = about(tick)._replace(within=within)
+        (target, d_hat, u, s, w, _), computer = decide(parts, k2, period, computer, there)
         drive, queue = actuators.command(acting, u, w, now.t, dt, now.noise_weight)
         if pushed is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
-        x_next = over_period(parts, now.t, x, drive, pushed, dt)
+        until = partial(_until, parts, now, x, drive, pushed)
+        x_next, after = until(now.t_next), seen_within(parts, now, until)
         known = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=dt > 0.0, measured=measured,
             valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
+            age=None if within is None or sensors is None else sensors.star_age(now.sample, dt_before),
             before=before, estimate=getattr(computer.sensing, "estimate", None),
             gyro=getattr(computer.sensing, "rate", None),
             applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.memory,
@@ -84,14 +90,20 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
         )  # fmt: skip
-        return (x_next, computer._replace(applied=known), actuators.end(acting, drive, queue, dt), pushed, unit), row
+        computer, acting = computer._replace(applied=known), actuators.end(acting, drive, queue, dt)
+        return (x_next, computer, acting, pushed, unit, after), row
 
     computer = boot(parts, seed, trial, parts.plant.seen(x0), started)
     if actuators.holds:
         computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    start = x0, computer, actuators.begin(parts.plant.inputs), pushed, jnp.full_like(parts.t_end, jnp.nan)
-    return jax.lax.scan(period, start, listed)[1]
+    unknown, within = jnp.full_like(parts.t_end, jnp.nan), seen_within(parts, started, lambda t: x0)
+    start = x0, computer, actuators.begin(parts.plant.inputs), pushed, unknown, within
+    return jax.lax.scan(flown, start, listed)[1]
+
+
+def _until(parts: Parts, now: Ticks, x: Any, drive: Drive, pushed: Array | None, t: Array) -> Any:
+    return over_period(parts, now.t, x, drive, pushed, t - now.t)
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -121,7 +133,7 @@ def one(samples: Samples, trial: int) -> Samples:
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
     given = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
-             "acting": samples.acting, "attitude_valid": samples.valid}  # fmt: skip
+             "acting": samples.acting, "attitude_valid": samples.valid, "attitude_age": samples.age}  # fmt: skip
     kept = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
             "wheel_momentum": samples.momentum, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip

@@ -34,7 +34,7 @@ def setup(scenario: Scenario) -> Setup:
         sensors=scenario.devices.sensors(scenario) if scenario.sensors is None else scenario.sensors.build(model),
         initial=plant.at_rest(scenario.start()),
         t_end=vector(scenario.end),
-        window=vector(scenario.loop.window),
+        window=vector(scenario.window),
         settling_angle=vector(scenario.loop.settling_angle),
         actuators=devices,
         walk_rate=walk,

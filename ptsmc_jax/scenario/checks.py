@@ -11,6 +11,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
+USUAL_WINDOW = 1.0  # [s]
 SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
 
 
@@ -21,8 +22,11 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     scenario.check_body()
     loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
-    if loop.t_end is None:
-        loop = msgspec.structs.replace(loop, t_end=t_f + max(10.0, loop.window))
+    window = loop.window
+    if window is None:
+        window = max(USUAL_WINDOW, loop.period) if loop.mode == "sampled" else USUAL_WINDOW
+    t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
+    loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
     scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)
     scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario, m))
     return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario, m)).resolved()
@@ -95,7 +99,7 @@ def _check_sensors(scenario: Scenario) -> None:
     if scenario.loop.mode != "sampled":
         raise ScenarioError(f'[sensors] needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     said = ("attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk", "star_tracker_every",
-            "state_noise")  # fmt: skip
+            "star_tracker_period", "state_noise")  # fmt: skip
     for key in said:
         value = getattr(scenario.hardware, key, None)
         if value is not None:
@@ -106,7 +110,7 @@ def _check_sensors(scenario: Scenario) -> None:
 
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
-    t_f, delta, sampled = controller.t_f, hand_over(scenario), loop.mode == "sampled"
+    t_f, delta, window, sampled = controller.t_f, hand_over(scenario), scenario.window, loop.mode == "sampled"
     if not controller.prescribed and not sampled:
         kind = errors.show(scenario.controller.kind)
         raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
@@ -114,18 +118,18 @@ def _check_loop(scenario: Scenario) -> None:
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     if scenario.end < t_f:
-        raise wrong("loop.t_end", loop.t_end, f"at least controller.t_f + loop.window, {t_f + loop.window}")
-    if scenario.end < t_f + loop.window - 1e-9:
-        raise wrong("loop.window", loop.window, f"at most loop.t_end - controller.t_f, {scenario.end - t_f}")
+        raise wrong("loop.t_end", loop.t_end, f"at least controller.t_f + loop.window, {t_f + window}")
+    if scenario.end < t_f + window - 1e-9:
+        raise wrong("loop.window", window, f"at most loop.t_end - controller.t_f, {scenario.end - t_f}")
     if sampled and delta < loop.period * (1 - 1e-9):
         raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
     if sampled and scenario.end / loop.period > MOST_STEPS:
         raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
     if sampled:
         _check_periods(scenario)
-    elif loop.window < SHORTEST_WINDOW * t_f:
+    elif window < SHORTEST_WINDOW * t_f:
         raise wrong(
-            "loop.window", loop.window, f"at least {SHORTEST_WINDOW * t_f:.6g}, controller.t_f times {SHORTEST_WINDOW}"
+            "loop.window", window, f"at least {SHORTEST_WINDOW * t_f:.6g}, controller.t_f times {SHORTEST_WINDOW}"
         )
     if not sampled:
         for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
@@ -141,17 +145,20 @@ def _check_loop(scenario: Scenario) -> None:
 
 def _check_periods(scenario: Scenario) -> None:
     """What is counted in periods, or holds some, against the period and the run."""
-    loop, filtering = scenario.loop, scenario.devices.command_filter
+    loop, window, filtering = scenario.loop, scenario.window, scenario.devices.command_filter
     if filtering is not None and filtering.corner >= math.pi / loop.period:
         highest = f"below pi / loop.period = {math.pi / loop.period:.6g}, the Nyquist frequency"
         raise wrong("hardware.command_filter.corner", filtering.corner, highest)
-    if loop.window < loop.period * (1 - 1e-9):
-        raise wrong("loop.window", loop.window, f"at least one control period, loop.period = {loop.period}")
+    if window < loop.period * (1 - 1e-9):
+        raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")
     samples = math.ceil(scenario.end / loop.period * (1 - 1e-9))
     for key in ("delay", "star_tracker_every"):
         periods = getattr(scenario.hardware, key, None) or 0
         if periods > samples:
             raise wrong(f"hardware.{key}", periods, f"at most the {samples} control periods until loop.t_end")
+    star = getattr(scenario.hardware, "star_tracker_period", None) or 0.0
+    if star > scenario.end:
+        raise wrong("hardware.star_tracker_period", star, f"at most loop.t_end, {scenario.end}")
 
 
 def _check_dispersion(scenario: Scenario) -> None:

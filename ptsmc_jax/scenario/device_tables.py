@@ -18,6 +18,8 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice, GainBounds
 from ptsmc_jax.scenario.values import Count, Kind, Kinds, NotNegative, NotNegatives, Positive, Table, Three
 
+SAME = 1e-9  # of a number of periods, which is whole then
+
 
 class Actuators(Table, frozen=True):
     """Between the command and the plant; each device is off where it is absent.
@@ -87,6 +89,7 @@ class Hardware(Actuators, frozen=True):
         rate_bias: of the gyro, 1 sigma per axis, constant over a run [rad/s]
         rate_bias_walk: random walk of that bias [rad/s/sqrt(s)]
         star_tracker_every: control periods between star tracker samples, with a filter
+        star_tracker_period: instead of it, time between them, at least loop.period and not only whole periods [s]
     """
 
     attitude_noise: NotNegative | None = None
@@ -95,6 +98,7 @@ class Hardware(Actuators, frozen=True):
     rate_bias: NotNegative | None = None
     rate_bias_walk: NotNegative | None = None
     star_tracker_every: Count | None = None
+    star_tracker_period: Positive | None = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "attitude_noise": ("attitude_noise",),
         "rate_noise": ("rate_noise", "rate_noise_density"),
@@ -107,16 +111,27 @@ class Hardware(Actuators, frozen=True):
 
     def interval(self, period: float) -> float:
         """Between two samples of the star tracker [s]."""
-        return period * (self.star_tracker_every or 1)
+        return period * (self.star_tracker_every or 1) if self.star_tracker_period is None else self.star_tracker_period
+
+    def periods_apart(self, period: float) -> int | None:
+        """Control periods [s] between two of its samples; None where that is no whole number."""
+        ratio = self.interval(period) / period
+        return round(ratio) if abs(ratio - round(ratio)) < SAME * ratio else None
 
     def check(self, scenario: Any) -> None:
         """One noise of the gyro; a star tracker that pauses needs a filter."""
         if self.rate_noise is not None and self.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
-        if self.star_tracker_every not in (None, 1) and not scenario.estimator.on:
+        own, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
+        if own is not None and every is not None:
+            raise wrong("hardware.star_tracker_period", own, "absent where star_tracker_every is given")
+        if own is not None and own < period * (1.0 - SAME):
+            raise wrong("hardware.star_tracker_period", own, f"at least loop.period, {period}")
+        if self.periods_apart(period) != 1 and not scenario.estimator.on:
+            key, value, one = ("every", every, 1) if own is None else ("period", own, period)
             raise ScenarioError(
-                f"hardware.star_tracker_every is {self.star_tracker_every}, but without a filter the law needs a "
-                'sample every period; allowed is 1, or [filter] with kind = "steady_state"'
+                f"hardware.star_tracker_{key} is {value}, but without a filter the law needs a "
+                f'sample every period; allowed is {one}, or [filter] with kind = "steady_state"'
             )
 
     def noise_of_s(self, scenario: Any) -> float:
@@ -142,8 +157,15 @@ class Hardware(Actuators, frozen=True):
             None if self.rate_bias is None else vector(self.rate_bias),
             None if walk is None else vector(formulas.per_sample(walk, period)),
             scenario.estimator.build(scenario),
-            self.star_tracker_every or 1,
+            self.periods_apart(period) or 1,
+            own_times=self.star_times(period),
         )
+
+    def star_times(self, period: float) -> Any:
+        """`devices.star_times`; None where the star tracker goes with the control periods [s]."""
+        from ptsmc_jax.devices.star_times import star_times
+
+        return star_times(self.interval(period), period) if self.periods_apart(period) is None else None
 
 
 class StateHardware(Actuators, frozen=True):
@@ -251,12 +273,16 @@ class SteadyStateFilter(FilterTable, frozen=True):
     def build(self, scenario: Any) -> Any:
         """`devices.attitude_filter`."""
         from ptsmc_jax.devices.attitude_filter import attitude_filter
+        from ptsmc_jax.devices.star_times import filter_between
         from ptsmc_jax.numerics.pytrees import vector
 
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
-        every = table.star_tracker_every or 1
-        return attitude_filter(*(vector(v) for v in (self.width(scenario), star, gyro, walk, period)), every)
+        known = tuple(vector(v) for v in (self.width(scenario), star, gyro, walk, period))
+        every, times = table.periods_apart(period), table.star_times(period)
+        if times is None:
+            return attitude_filter(*known, every)
+        return filter_between(*known, times.interval, times.pattern)
 
 
 class WheelLimits(Table, frozen=True):

@@ -24,7 +24,7 @@ class Loop(Table, frozen=True):
         period: control period, sampled loop only [s]
         clock: a sample at t_f - delta, for tuning, or at whole periods, as a flight computer has them
         t_end: end of the run; default: t_f + 10, or + window if that is longer [s]
-        window: time after t_f over which window_error is taken [s]
+        window: time after t_f over which window_error is taken; default: 1, or a control period if that is longer [s]
         settling_angle: angle to the reference that counts as settled; of other plants |x_1| [rad]
     """
 
@@ -32,7 +32,7 @@ class Loop(Table, frozen=True):
     period: Positive = 0.05
     clock: Literal["anchored", "flight"] = "anchored"
     t_end: Positive | None = None
-    window: Positive = 1.0
+    window: Positive | None = None
     settling_angle: Positive = 1e-3
 
 
@@ -176,6 +176,12 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """The end of the run, `loop.t_end` [s]."""
         assert self.loop.t_end is not None, "a scenario that is not resolved"
         return self.loop.t_end
+
+    @property
+    def window(self) -> float:
+        """After t_f, `loop.window` [s]."""
+        assert self.loop.window is not None, "a scenario that is not resolved"
+        return self.loop.window
 
     def observation(self) -> Any:
         """What pointing error indices are taken of, a part of `simulation.pointing`; None: nothing."""

@@ -230,5 +230,5 @@ def _grid(
         if worst == "controller.sign_width":
             raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
         raise _lower(scenario, worst, asks)
-    grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, loop.window, rate, frequency, layer, saves, order)
+    grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, scenario.window, rate, frequency, layer, saves, order)
     return dataclasses.replace(grid, t_end=vector(loop.t_end))

@@ -55,6 +55,7 @@ class Period(NamedTuple):
     now: Ticks
     dt_before: Scalar  # length of the one before [s]
     matrix: Array  # `Observer.update_matrix` of that length
+    within: Any = None  # see `seen_within`, of the one before
 
     @property
     def length(self) -> Scalar:
@@ -94,7 +95,18 @@ def measure(parts: Parts, period: Period, computer: Computer, x: Any) -> tuple[A
     """The state as the sensors see it at the start of a period, and their memory; x: as in `decide`."""
     if parts.sensors is None:
         return x, None
-    return parts.sensors.measure(computer.sensing, x, period.now, period.dt_before)
+    more = () if period.within is None else (period.within,)
+    return parts.sensors.measure(computer.sensing, x, period.now, period.dt_before, *more)
+
+
+def seen_within(parts: Parts, now: Ticks, until: Callable[[Scalar], Any]) -> Any:
+    """What sensors without noise see at a time of their own in a period, and say at the next sample; None: nothing.
+
+    until: time [s] in the period -> the plant's state then.
+    """
+    if getattr(parts.sensors, "own_times", None) is None:
+        return None
+    return parts.plant.seen(until(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
 
 
 def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:

@@ -19,7 +19,7 @@ from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule
+from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule, seen_within
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
 
@@ -94,6 +94,7 @@ class _World(NamedTuple):
     computer: Computer
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
+    within: Any  # what sensors saw in the period before, see `computer.seen_within`
 
 
 def simulate(
@@ -144,7 +145,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
         dt, pushed = now.t_next - now.t, world.pushed
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w, channels), computer = software.decide(
-            parts, k2, about(tick), computer, parts.plant.seen(state.x), world.acting
+            parts, k2, about(tick)._replace(within=world.within), computer, parts.plant.seen(state.x), world.acting
         )
         drive, queue = actuators.command(world.acting, u, w, now.t, dt, now.noise_weight)
         drive = drive if channels is None else drive._replace(c=channels)
@@ -164,7 +165,8 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
         sight, flown = None if parts.sensors is None else computer.seen, until(now.t_next)
         state = _advance(parts, course, state, now, target, flown, torques, until, dt / parts.substeps, sight)
         computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, dt))
-        return (state, _World(computer, actuators.end(world.acting, drive, queue, dt), pushed)), row
+        acting, within = actuators.end(world.acting, drive, queue, dt), seen_within(parts, now, until)
+        return (state, _World(computer, acting, pushed, within)), row
 
     acting = actuators.begin(parts.plant.inputs)
     state = _begin(parts, course, acting.h)
@@ -173,7 +175,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     computer = software.boot(parts, seed, trial, parts.plant.seen(course.x0), started)
     if actuators.holds:  # the state has it
         computer = computer._replace(applied=None)
-    world = _World(computer, acting, pushed)
+    world = _World(computer, acting, pushed, seen_within(parts, started, lambda t: course.x0))
     (state, world), rows = jax.lax.scan(period, (state, world), listed)
     return _finish(parts, course, first, state, world.computer.memory, k2, rows, world)
 

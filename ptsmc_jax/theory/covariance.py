@@ -61,7 +61,8 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     loops = rows.loop
     n, m, k, whole = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2], rows.error.shape[2]
     none = Reading(np.eye(k), np.zeros(k), np.ones(k, int), np.zeros(0), np.zeros(0))
-    said: Reading = none if parts.sensors is None else parts.sensors.reading(h)
+    sensors = None if parts.sensors is None else parts.sensors.in_step()
+    said: Reading = none if sensors is None else sensors.reading(h)
     waiting, own = loops.delay * m, said.own.size
     size = n + waiting + own + m
     mine, walk = slice(n + waiting, n + waiting + own), slice(size - m, size)

@@ -52,7 +52,7 @@ class Model(NamedTuple):
     """
 
     start: np.ndarray  # (n, k) factor of the covariance before the first sample: S S'
-    rows: np.ndarray  # (m, n) H
+    rows: np.ndarray  # (m, n) H, or (periods, m, n)
     noise: np.ndarray  # (periods, m) 1 sigma of each reading; infinite: there is none
     kick: np.ndarray  # (periods, n, v) B, times 1 sigma
     move: np.ndarray  # (periods, n, n) F
@@ -104,14 +104,15 @@ def deviations(model: Model, delay: int = 0) -> np.ndarray:
     nothing is subtracted or inverted, so that noises of any sizes go together.
     """
     found = np.zeros(model.output.shape[:2])
-    factor, largest = model.start, np.zeros(len(model.rows))
+    rows = np.broadcast_to(model.rows, (len(model.move), *model.rows.shape[-2:]))
+    factor, largest = model.start, np.zeros(rows.shape[1])
     known = deque([(0, factor)], maxlen=delay + 1)  # period, and what the samples up to it say
 
     def moved(k: int, factor: np.ndarray) -> np.ndarray:
         return _triangular(model.move[k] @ np.hstack([factor, model.kick[k]]))
 
     for k in range(len(model.move)):
-        read, there = model.rows @ factor, np.isfinite(model.noise[k])
+        read, there = rows[k] @ factor, np.isfinite(model.noise[k])
         largest = np.maximum(largest, _sizes(read))
         noise = np.maximum(model.noise[k], EXACT * largest)[there]
         factor = _corrected(factor, read[there], np.diag(noise))
@@ -153,9 +154,9 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     torque = slice(size - m, size)
 
     def wide(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[1] - said.own.size  # what no sensor reads, the modes of a flexible body, comes after it
-        rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=1)
-        return np.pad(rows, [(0, 0), (0, size - rows.shape[1])])
+        seen = rows.shape[-1] - said.own.size  # what no sensor reads, the modes of a flexible body, comes after it
+        rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
+        return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
     # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
     read = wide(said.rows)
@@ -165,6 +166,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     if said.start is not None:
         rows, covariance = said.start
         start = _corrected(start, wide(rows) @ start, root(covariance))
+    lengths = np.asarray(ticks.t_next - ticks.t)
     walk = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
     drift = np.diag(np.concatenate([np.zeros(n), said.own_drift, walk]))[:, n:]
     move = np.tile(np.eye(size), (periods, 1, 1))
@@ -173,9 +175,9 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
     return Model(
         start=start,
-        rows=read,
-        noise=np.where(ticks.sample[:, None] % said.every == 0, said.noise, np.inf),
-        kick=np.asarray(ticks.t_next - ticks.t)[:, None, None] * drift,
+        rows=wide(said.rows_at(ticks.sample, np.append(0.0, lengths[:-1]))),
+        noise=np.where(said.there(ticks.sample), said.noise, np.inf),
+        kick=lengths[:, None, None] * drift,
         move=move,
         output=output,
     )

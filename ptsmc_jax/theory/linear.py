@@ -10,7 +10,7 @@ with x_seen the part of x that sensors see; u_new the command of `delay` periods
 of the period on, and u_old the one before it, which acts until then; d a torque on the plant. The flight computer is
 told what its own model of the actuators makes of u: it knows nothing of a gain or a delay at the plant's input. All is
 linearised about the nominal run, without noise and disturbance; of a star tracker that is slower than the loop the mean
-over its interval is taken.
+over its interval is taken, see `Sensors.in_step` too.
 """
 
 from collections.abc import Sequence
@@ -80,7 +80,7 @@ class Nominal(NamedTuple):
 
 def quiet(parts: Parts) -> Parts:
     """The parts without noise and disturbance."""
-    sensors = None if parts.sensors is None else parts.sensors.quiet()
+    sensors = None if parts.sensors is None else parts.sensors.in_step().quiet()
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
     return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
 

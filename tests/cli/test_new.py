@@ -96,7 +96,11 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
     found = blocks(text)
     written = tomllib.loads(text)
     hardware = values(found["hardware"])
-    for key in ("rate_noise_density", "star_tracker_every"):  # beside rate_noise; without a filter
+    for key in (
+        "rate_noise_density",
+        "star_tracker_every",
+        "star_tracker_period",
+    ):  # beside rate_noise; without a filter
         hardware.pop(key, None)
     base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
     attitude = {key: value for key, value in written.get("initial", {}).items() if key in ATTITUDE_KEYS}

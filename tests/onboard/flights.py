@@ -50,6 +50,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
         **FILTER, hardware={"torque_lag": 0.1, "torque_rate_limit": 20.0, "torque_limit": 4.0}),
     "slow star tracker": flight(
         **FILTER, hardware={"star_tracker_every": 5, "rate_bias": 1e-5, "rate_bias_walk": 1e-7}),
+    "star tracker out of step": flight(**FILTER, hardware={"star_tracker_period": 0.25, "rate_bias": 1e-5}),
     "wheels with lag, limits, delay": flight(
         hardware={"torque_lag": 0.05, "delay": 1}, controller={"delta": 1.0},
         wheels={"torque_limit": 1.5, "momentum_limit": 4.0, "momentum": [0.5, -0.2, 0.1, 0.3]}),

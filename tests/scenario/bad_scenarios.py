@@ -215,6 +215,27 @@ BAD = [
         '[filter] with kind = "steady_state"',
     ),
     (
+        SAMPLED + "hardware.star_tracker_period = 0.125",
+        "hardware.star_tracker_period is 0.125",
+        'allowed is 0.05, or [filter] with kind = "steady_state"',
+    ),
+    (
+        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware = { star_tracker_period = 0.125, star_tracker_every = 2 }",
+        "hardware.star_tracker_period is 0.125",
+        "absent where star_tracker_every is given",
+    ),
+    (
+        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware.star_tracker_period = 0.04",
+        "hardware.star_tracker_period is 0.04",
+        "at least loop.period, 0.05",
+    ),
+    (
+        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware.star_tracker_period = 1e9",
+        "hardware.star_tracker_period is 1000000000.0",
+        "at most loop.t_end, 40.0",
+    ),
+    (SAMPLED + "hardware.star_tracker_period = 0", "hardware.star_tracker_period is 0", "greater than 0"),
+    (
         SAMPLED + "hardware = { rate_noise = 1e-6, rate_noise_density = 1e-7 }",
         "hardware.rate_noise_density is 1e-07",
         "absent where rate_noise is given",

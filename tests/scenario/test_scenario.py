@@ -108,6 +108,15 @@ def test_t_end_is_ten_seconds_after_t_f_unless_said(text, t_end):
     assert from_tables(tomllib.loads(text)).loop.t_end == t_end
 
 
+@pytest.mark.parametrize(("period", "window", "t_end"), [(0.5, 1.0, 40.0), (2.5, 2.5, 40.0), (12.0, 12.0, 42.0)])
+def test_the_window_is_a_second_or_a_longer_period_unless_said(period, window, t_end):
+    slow = from_tables({"loop": {"mode": "sampled", "period": period}})
+    assert (slow.loop.window, slow.controller.delta, slow.loop.t_end) == (window, max(0.05, period), t_end)
+    again = replace(slow, loop__period=0.5)  # a default stays one
+    assert (again.loop.window, again.loop.t_end) == (1.0, 40.0)
+    assert from_tables({"loop": {"period": period}}).loop.window == 1.0  # a period of no meaning
+
+
 # Attitudes. Hand computed: "ZYX" turns by 90 degrees about z, then about the new x: q = q_z q_x; "zyx" about the fixed
 # axes, so q = q_x q_z; x -> y -> z -> x is 120 degrees about (1, 1, 1), mrp tan(30 degrees) / sqrt(3); its matrix
 # holds the body axes as columns.

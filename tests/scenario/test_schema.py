@@ -150,6 +150,7 @@ COMPLETE = [
         }
     },
     {"hardware": {"rate_noise_density": 1e-7}},
+    {"hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": 0.25}, "filter": {}},
     {"hardware": {"command_filter": {"kind": "first_order", "corner": 2.0}}},
     {"hardware": {"command_filter": {"kind": "notch", "corner": 2.0, "damping": 0.3}}},
     {"spacecraft": {"true_inertia": [10.0, 12.0, 14.0]}},

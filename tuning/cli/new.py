@@ -49,6 +49,7 @@ EXAMPLES: dict[str, Any] = {
     "hardware.rate_bias": 1e-6,
     "hardware.rate_bias_walk": 1e-8,
     "hardware.star_tracker_every": 4,
+    "hardware.star_tracker_period": 0.25,
     "hardware.state_noise": 1e-4,
     "wheels.torque_limit": 0.2,
     "wheels.momentum_limit": 4.0,

@@ -137,7 +137,7 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
         loop, t_f = scenario.loop, values.get("controller.t_f", scenario.controller.t_f)
         assert loop.t_end is not None
-        after = max(loop.t_end - scenario.controller.t_f, values.get("loop.window", loop.window))
+        after = max(loop.t_end - scenario.controller.t_f, values.get("loop.window", scenario.window))
         changes["loop__t_end"] = t_f + after
     return changed(scenario, **changes)
 

@@ -1,0 +1,210 @@
+"""A star tracker that samples by a clock of its own, beside what is computed by hand, sample for sample."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import scenario
+from ptsmc_jax.devices import attitude_filter, sensors, star_times
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.onboard import vectors
+from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import error_floor
+from tests.helpers import vector
+from tests.onboard.flights import FILTER, flight
+
+SIGMAS = 6.0
+
+
+def of(**hardware):
+    """The study of a short flight behind a filter, on the flight clock."""
+    tables = flight(**FILTER, hardware=hardware, loop={"clock": "flight"})
+    return scenario.study(scenario.from_tables({**tables, "dispersion": {}}))
+
+
+@pytest.mark.parametrize(
+    ("interval", "period", "times"),
+    [
+        (0.25, 0.1, [0.0, 0.25, 0.5, 0.75, 1.0]),
+        (0.1, 0.1, [k / 10 for k in range(11)]),
+        (0.3, 0.1, [0.0, 0.3, 0.6, 0.9]),
+        (1 / 3, 0.1, [0.0, 1 / 3, 2 / 3, 1.0]),
+        (0.1 * math.pi, 0.1, [0.0, 0.1 * math.pi, 0.2 * math.pi, 0.3 * math.pi]),
+    ],
+)
+def test_every_sample_is_told_once_at_the_control_sample_that_follows(interval, period, times):
+    found = star_times.star_times(interval, period)
+    samples = jnp.arange(0, 11)
+    due, age = np.asarray(found.due(samples)), np.asarray(found.age(samples))
+    told = samples[due]
+    np.testing.assert_allclose(told * period - age[due], times, rtol=0, atol=1e-12)
+    assert np.all(age[due] < period)
+    before = np.asarray(found.due(jnp.arange(-40, 0)))  # before the hand-over: as often
+    assert abs(before.sum() - 40 * period / interval) <= 1.0
+
+
+def by_hand(parts, flown):
+    """What the filter says at each sample (attitude as a rotation, bias), in plain NumPy and SciPy."""
+    known = parts.sensors.filter
+    k1, k2 = float(known.attitude_gain), float(known.bias_gain)
+    said = [(Rotation.from_quat(flown.before.q[0]), flown.before.bias[0])]
+    rates = np.concatenate([flown.gyro[:1], flown.gyro])  # of the sample before, at the first its own
+    moments = np.concatenate([flown.t[:1], flown.t])
+    for k in range(len(flown.t)):
+        q, bias = said[-1]
+        t0, t1, w0, w1 = moments[k], moments[k + 1], rates[k], rates[k + 1]
+        taken = 0.25 * math.floor(t1 / 0.25 + 1e-6)
+        stops = [(t1, False)] if taken <= t0 and k > 0 else [(taken, True), (t1, False)]
+        at, w = t0, w0
+        for stop, star in stops:
+            there = w0 if t1 == t0 else w0 + (stop - t0) / (t1 - t0) * (w1 - w0)
+            a, b, h = w - bias, there - bias, stop - at
+            q = q * Rotation.from_rotvec(h / 2 * (a + b) + h * h / 12 * np.cross(a, b))
+            at, w = stop, there
+            if star:
+                residual = 2 * (q.inv() * Rotation.from_quat(flown.measured.q[k])).as_quat()
+                residual = residual[:3] * np.sign(residual[3])
+                q, bias = q * Rotation.from_rotvec(k1 * residual), bias - k2 * residual
+        said.append((q, bias))
+    return said[1:]
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Parts of a flight at 10 Hz with a star tracker of 4 Hz, and its samples."""
+    ready = of(star_tracker_period=0.25, rate_bias=1e-4)
+    parts = dataclasses.replace(ready.parts, walk_rate=None)
+    flown = vectors.fly_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
+    return parts, vectors.one(flown, 0)
+
+
+def test_the_filter_says_what_is_computed_by_hand(run):
+    parts, flown = run
+    assert np.flatnonzero(flown.valid[:12]).tolist() == [0, 3, 5, 8, 10]
+    np.testing.assert_allclose(flown.age[flown.valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
+    said = by_hand(parts, flown)
+    for k, (q, bias) in enumerate(said):
+        off = (q.inv() * Rotation.from_quat(flown.estimate.q[k])).magnitude()
+        assert off < 1e-12, k
+        np.testing.assert_allclose(flown.estimate.bias[k], bias, rtol=0, atol=1e-12)
+
+
+def test_it_sees_the_body_at_its_own_time(run):
+    """Its noise taken off: RK4 by hand from t = 0, under the torque held and the disturbance, to 0.25, 0.5, .. s."""
+    parts, flown = run
+    inertia, steps = np.array([10.0, 12.0, 14.0]), parts.substeps
+
+    def rate(t, x, u):
+        q, w = x[:4], x[4:]
+        turn = 0.5 * np.append(q[3] * w + np.cross(q[:3], w), -q[:3] @ w)
+        d = 0.01 * np.sin(0.1 * t)  # Case I's
+        return np.concatenate([turn, (u + d - np.cross(w, inertia * w)) / inertia])
+
+    def moved(t, x, u, length):
+        h = length / steps
+        for _ in range(steps):
+            a = rate(t, x, u)
+            b = rate(t + h / 2, x + h / 2 * a, u)
+            c = rate(t + h / 2, x + h / 2 * b, u)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rate(t + h, x + h * c, u))
+            t += h
+        return np.concatenate([x[:4] / np.linalg.norm(x[:4]), x[4:]])
+
+    keys = parts.sensors.keys(jnp.uint32(3), jnp.uint32(0))
+    x, looked_at = np.concatenate([parts.initial.q, parts.initial.w]), 0
+    for k in range(30):
+        if k > 0:
+            t, u, h = flown.t[k - 1], flown.torque[k - 1], flown.t[k] - flown.t[k - 1]
+            there = moved(t, x, u, h - flown.age[k])
+            x = moved(t, x, u, h)
+            if flown.valid[k]:
+                noise, _ = parts.sensors.noise(keys, jnp.asarray(k))
+                off = Rotation.from_quat(there[:4]) * Rotation.from_rotvec(np.array(noise))
+                off = off.inv() * Rotation.from_quat(flown.measured.q[k])
+                assert off.magnitude() < 1e-12, k
+                looked_at += 1
+    assert looked_at == 11  # 0.25 to 2.75 s
+
+
+def test_where_the_ratio_is_whole_nothing_changes():
+    one, other = of(star_tracker_period=0.5).parts, of(star_tracker_every=5).parts
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_walk": 1e-7, "period": 0.25}
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_the_filter_of_a_whole_ratio_is_the_one_that_goes_with_the_loop(every):
+    found = star_times.filter_between(*NOISES.values(), interval=0.25 * every, repeating=(every, 1))
+    known = attitude_filter.attitude_filter(*NOISES.values(), every)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-20)
+
+
+def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sample_on():
+    """Of 4 000 trials of a body at rest, per axis, five periods and two of its samples long; and later on."""
+    times = star_times.star_times(0.625, 0.25)
+    found = star_times.filter_between(*NOISES.values(), times.interval, times.pattern)
+    walk = NOISES["bias_walk"] / np.sqrt(NOISES["period"])
+    sensor = sensors.Sensors(vector(NOISES["attitude_noise"]), vector(NOISES["rate_noise"]), vector(1e-4),
+                             vector(walk), found, own_times=times)  # fmt: skip
+    rest = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0] * 3))
+
+    def tick(k):
+        return Ticks(0.25 * k, 0.25 * (k + 1), jnp.asarray(True), k, jnp.asarray(1.0))
+
+    @jax.jit
+    @jax.vmap
+    def errors(trial):
+        def one(memory, k):
+            dt = jnp.where(k > 0, 0.25, 0.0)
+            ahead = sensor.filter.propagate(
+                memory.estimate, memory.rate, sensor.sample(memory, rest, tick(k), dt)[0].w, dt
+            )
+            _, after = sensor.measure(memory, rest, tick(k), dt, rest)
+            return after, jnp.stack([2 * ahead.q[:3], ahead.bias - after.bias])
+
+        return jax.lax.scan(one, sensor.begin(7, trial, rest, tick(jnp.asarray(0))), jnp.arange(40))[1]
+
+    got = np.asarray(errors(jnp.arange(4000, dtype=jnp.uint32))).transpose(1, 2, 0, 3).reshape(40, 2, -1)
+    spread = np.asarray(found.spread)
+    covariance = spread @ spread.swapaxes(1, 2)  # of what is propagated to a sample, the star tracker's left out
+    for k, sample in enumerate(got):
+        wanted = covariance[(k - 1) % 5]
+        size = np.sqrt(np.diag(wanted))
+        np.testing.assert_allclose(
+            sample.std(axis=1) / size, 1.0, rtol=0, atol=SIGMAS / np.sqrt(24_000), err_msg=str(k)
+        )
+        assert abs(np.corrcoef(sample)[0, 1] - wanted[0, 1] / size.prod()) < SIGMAS / np.sqrt(12_000)
+
+
+def test_the_floor_lies_between_those_of_the_whole_ratios(run):
+    parts, _ = run
+    log = rollout.simulate_jit(parts, jnp.uint32(3), jnp.uint32(0), record=True).log
+    floors = [error_floor.along(parts, log).window_error]
+    bandwidth = parts.sensors.bandwidth(0.1)
+    for every in (2, 3):
+        seen = dataclasses.replace(parts.sensors, every=every, own_times=None).with_bandwidth(bandwidth, 0.1)
+        floors.append(error_floor.along(dataclasses.replace(parts, sensors=seen), log).window_error)
+    assert floors[1] < floors[0] < floors[2]
+
+
+def test_a_run_does_not_jump_where_the_partial_first_period_vanishes():
+    """On the anchored clock, with a hand-over a little before and after a whole number of periods from t = 0."""
+    tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
+    anchored = scenario.study(scenario.from_tables(tables)).parts
+    found = []
+    for off in (1e-7, 0.0, -1e-7):
+        law = dataclasses.replace(anchored.controller, delta=vector(0.5 + off))
+        result = rollout.simulate_jit(dataclasses.replace(anchored, controller=law), jnp.uint32(3), jnp.uint32(0))
+        found.append([float(v) for v in (result.metrics.window_error, result.metrics.peak_torque)])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
+    np.testing.assert_allclose(found[2], found[1], rtol=1e-4)
