@@ -60,6 +60,8 @@ _EXPORTS = {
     "study": "scenario",
     "Reach": "scenario.timing",
     "reach_of": "scenario.timing",
+    "gains_of": "simulation.gains",
+    "with_gains": "simulation.gains",
     "one": "campaigns.montecarlo",
     "run": "campaigns.montecarlo",
 }
@@ -111,6 +113,8 @@ if TYPE_CHECKING:
     from ptsmc_jax.signals.references import Spin as Spin
     from ptsmc_jax.signals.references import Swing as Swing
     from ptsmc_jax.signals.references import Target as Target
+    from ptsmc_jax.simulation.gains import gains_of as gains_of
+    from ptsmc_jax.simulation.gains import with_gains as with_gains
     from ptsmc_jax.simulation.metrics import Metrics as Metrics
     from ptsmc_jax.simulation.requirements import Requirement as Requirement
     from ptsmc_jax.simulation.rollout import STATUS as STATUS

@@ -1,0 +1,125 @@
+"""The gains of parts by name: read, and set in parts, under any transformation.
+
+A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import core
+from jaxtyping import Array
+
+from ptsmc_jax.simulation.assembly import Parts
+
+AXIS = "observer_gain_"
+_OF_FILTERS = ("filter_bandwidth", "command_corner")
+
+
+def base(name: str) -> str:
+    """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
+    return "observer_gain" if name.startswith(AXIS) else name
+
+
+def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
+    """Gains of an observer of one's own, by its fields."""
+    found = {name.removeprefix("observer_"): v for name, v in gains.items() if name.startswith("observer_")}
+    return {name: v for name, v in found.items() if base(f"observer_{name}") != "observer_gain"}
+
+
+def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
+    """Gains of the law."""
+    return {k: v for k, v in gains.items() if not k.startswith("observer_") and k not in _OF_FILTERS}
+
+
+def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
+    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
+
+    Raises ValueError where there is no such gain, and where the parts' anchored clock has too few samples for them, as
+    far as they are known: under a transformation such a run comes back as `unfinished`.
+    """
+    _check_names(parts, gains)
+    gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    if "t_f" in gains:
+        parts = parts.with_t_f(gains["t_f"])
+    law = {name: value for name, value in of_law(gains).items() if name != "t_f"}
+    parts = replace(parts, controller=replace(parts.controller, **law))
+    if of_observer(gains):
+        parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
+    each = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
+    if each is not None:
+        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
+    if "filter_bandwidth" in gains:
+        known: Any = parts
+        sensors = known.sensors.with_bandwidth(gains["filter_bandwidth"], known.clock.period)
+        parts = replace(parts, sensors=sensors)
+    if "command_corner" in gains:
+        parts = replace(parts, command_filter=replace(parts.command_filter, corner=gains["command_corner"]))
+    _check_clock(parts)
+    return parts
+
+
+def _check_names(parts: Parts, names: Iterable[str]) -> None:
+    each = len(getattr(parts.observer, "gain", ()))
+    allowed = {"t_f", *parts.controller.tunable, *(f"observer_{name}" for name in parts.observer.tunable)}
+    if each:
+        allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(each))}
+    if getattr(parts.sensors, "filter", None) is not None:
+        allowed.add("filter_bandwidth")
+    if parts.command_filter is not None:
+        allowed.add("command_corner")
+    for name in names:
+        if name not in allowed and not hasattr(parts.controller, name):
+            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(allowed))}")
+
+
+def _check_clock(parts: Parts) -> None:
+    clock: Any = parts.clock
+    law = parts.controller
+    if not clock.anchored:
+        return
+    times = [law.t_f, law.delta, parts.t_end, clock.period]
+    if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
+        return
+    t_f, delta, t_end, period = map(float, times)
+    hand_over = t_f - delta
+    for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
+        if needed > samples * period * (1.0 + 1e-9):
+            raise ValueError(
+                f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
+                f"the parts' clock has {samples * period:g}; make the parts for them, with ptsmc_jax.replace or with "
+                "the reach of scenario.study"
+            )
+
+
+def gains_of(parts: Parts) -> dict[str, float]:
+    """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
+    controller = parts.controller
+    law = [name for name in controller.tunable if name not in ("k1", "sign_width", "surface_rate", "t_f")]
+    gains = {name: float(getattr(controller, name)) for name in law}
+    each = [float(v) for v in getattr(parts.observer, "gain", ())]
+    if each:
+        gains["observer_gain"] = sum(each) / len(each)
+    gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
+    gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
+    if getattr(parts.sensors, "filter", None) is not None:
+        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    if parts.command_filter is not None:
+        gains["command_corner"] = float(parts.command_filter.corner)
+    return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
+
+
+def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
+    """The parts' own values of these gains."""
+    gains, each = gains_of(parts), getattr(parts.observer, "gain", ())
+    return [float(each[int(name.removeprefix(AXIS)) - 1]) if name != base(name) else gains[name] for name in names]
+
+
+def on_every_axis(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
+    """The observer's gain on every axis, where these gains name one."""
+    if not any(base(name) == "observer_gain" for name in gains):
+        return None
+    common = [gains.get("observer_gain", value) for value in own]
+    return [gains.get(f"{AXIS}{k + 1}", value) for k, value in enumerate(common)]
