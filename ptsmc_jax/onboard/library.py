@@ -164,7 +164,9 @@ class InTheLoop:
         (now, dt_before, *_), (sensing, state) = period, computer.sensing
         read, sensors = x, parts.sensors
         if sensors is not None:
-            read, sensing = sensors.sample(sensing, x, now, dt_before, *(() if period.within is None else (period.within,)))
+            read, sensing = sensors.sample(
+                sensing, x, now, dt_before, *(() if period.within is None else (period.within,))
+            )
         known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             known["applied"] = computer.applied[0]
