@@ -95,6 +95,8 @@ HOUSE = {
             campaign_summary posing
             tuner
             compare pareto tune_files
+            slew_times
+            fronts
         """,
         "output": """
             cells page_captions page_charts progress_lines

@@ -403,7 +403,8 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     ratio = summary["search"]["largest_over_limit"]["peak_torque"]
     assert ratio > 1.0
     assert (
-        f"no gains found within the bounds keep every limit: with these peak_torque reaches {ratio:.3g} times" in told
+        "no gains found within the bounds keep every limit: with the best ones, "
+        f"peak_torque reaches {ratio:.3g} times its limit on the training trials" in told
     )
     assert "peak_torque at most 0.01 N m: worst" in told
     # the best compromise: the smallest torque within the bounds is that of the smallest eta

@@ -15,13 +15,17 @@ from tuning.cli.options import (
     Device,
     Figures,
     Force,
+    FrontAgainst,
     Laws,
     Out,
+    Points,
     Quiet,
     SampledFile,
     ScenarioFile,
     Seed,
+    Times,
     Trust,
+    against_of,
     prepare,
     whole_number,
 )
@@ -219,9 +223,9 @@ def pareto(
     scenario: ScenarioFile = None,
     /,
     *,
-    points: Annotated[
-        int, whole_number("--points", "Limits on the torque to tune for, a whole number from 3 to 100.", 3, 100)
-    ] = 20,
+    against: FrontAgainst = "torque",
+    points: Points = None,
+    times: Times = None,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -230,24 +234,23 @@ def pareto(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Find the front of accuracy against peak torque, every point of it judged on fresh trials.
+    """Find the front of accuracy against peak torque, or what a faster slew costs, each point judged on fresh trials.
 
     Interrupted or killed, the same command goes on from there.
 
     Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
     interrupted.
     """
+    chosen = against_of(against, times, points)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
-    from tuning.studies import pareto as fronts
+    from tuning.studies import fronts
 
     loaded = _with_tune(loaded)
-    fronts.check(loaded)
-    known_by = fronts.identity(loaded, seed, points)
+    front = fronts.KINDS[against](loaded, seed, points or 20, chosen)
     return _search(
-        loaded, folder, known_by, force, quiet, "window error",
-        work=lambda report, journal: fronts.trace(loaded, seed, points, report, journal),
-        write=lambda making, found: fronts.write(making, loaded, found, figures, known_by),
-        summary=lambda found: fronts.summary(found, loaded),
+        loaded, folder, front.known_by, force, quiet, "window error", work=front.trace,
+        write=lambda making, found: front.write(making, found, figures),
+        summary=front.summary,
         shown=terminal.front,
     )  # fmt: skip
 

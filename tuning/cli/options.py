@@ -74,7 +74,40 @@ Trust = Annotated[
     ),
 ]
 
+FrontAgainst = Annotated[str, Parameter(help="What the accuracy is set against: torque or t_f.")]
+Points = Annotated[
+    int | None, whole_number("--points", "Limits on the torque to tune for, from 3 to 100; none: 20.", 3, 100)
+]
+Times = Annotated[
+    str | None,
+    Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; none: half to twice t_f."),
+]
+
 INTERRUPTED = 130  # exit status
+
+
+def times_of(option: str, value: str) -> tuple[float, ...]:
+    """Two times or more, between commas [s]."""
+    try:
+        found = tuple(sorted(float(part) for part in value.split(",")))
+    except ValueError:
+        found = ()
+    if len(set(found)) < 2 or len(set(found)) != len(found) or not (found[0] > 0.0 and found[-1] < float("inf")):
+        raise UsageError(f"{option} is {value}, but must be two times or more in s, all different, such as 20,30,45")
+    return found
+
+
+def against_of(against: str, times: str | None, points: int | None) -> tuple[float, ...]:
+    """The times that are asked for, none where there are none [s]."""
+    if against not in ("torque", "t_f"):
+        raise UsageError(f"--against is {against}, but must be torque or t_f")
+    if against == "t_f" and points is not None:
+        raise UsageError(f"--points is {points}, but must be absent with --against t_f, which takes --times")
+    if times is None:
+        return ()
+    if against != "t_f":
+        raise UsageError(f"--times is {times}, but must be absent without --against t_f")
+    return times_of("--times", times)
 
 
 def prepare(

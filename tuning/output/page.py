@@ -270,6 +270,10 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     from ptsmc_jax.simulation.catalogues import CATALOGUES
 
     summary, units = result.summary, {name: entry.unit for name, entry in CATALOGUES[result.kind].items()}
+    if "slews" in summary:
+        blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
+        lines, wanted = [sentences.slew_times_heading(summary)], bool(summary["requirements"])
+        return _verdict(summary, lines, wanted), [Section("What a faster slew costs", blocks)]
     known = result.scenario.get("requirements", {}).get("peak_torque")
     limit = known.get("limit") if isinstance(known, dict) else known
     caption = "Smaller is better in both. Point at one for its gains; bars are 95 % intervals, dashed is the limit."
@@ -277,14 +281,11 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
         Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
         Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
     ]
-    met = {
-        "met": "Gains on the front meet every requirement",
-        "not met": "No gains on the front meet every requirement",
-    }
     wanted = bool(summary["requirements"])
     heading = _verdict(summary, [sentences.front_heading(summary)], wanted)
-    headline = met.get(summary["status"], heading.headline) if wanted else heading.headline
-    return Heading(heading.mood, headline, heading.lines), sections
+    some = {"met": "Gains", "not met": "No gains"}.get(summary["status"]) if wanted else None
+    said = heading.headline if some is None else f"{some} on the front meet every requirement"
+    return Heading(heading.mood, said, heading.lines), sections
 
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
@@ -307,7 +308,7 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
 
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    note = "Quantiles between order statistics, with 95 % intervals; a failed trial stands beyond every quantile."
+    note = "Quantiles between order statistics, 95 % intervals; a failed trial stands beyond every quantile."
     sections = [
         *_limits(summary["verdicts"]),
         Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),
@@ -323,17 +324,15 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
 def _map(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
-    lines = [f"{len(rows) - 1} pairs"]
     table = sentences.Table(tuple(rows[0]), [tuple(_short(cell) for cell in row) for row in rows[1:]])
-    return Heading("calm", "Accuracy and peak torque over two keys", lines), [Section("Pairs", [_table(table)])]
+    heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs"])
+    return heading, [Section("Pairs", [_table(table)])]
 
 
 def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    mood, headline = (
-        ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
-    )
-    return Heading(mood, headline, list(margin_sentences.lines(summary))), [
+    said = ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
+    return Heading(*said, list(margin_sentences.lines(summary))), [
         Section("Margins", [_table(margin_sentences.table(summary))])
     ]
 
@@ -367,7 +366,7 @@ SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
 }
 
 # kept in `versions.json`
-OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "metrics", "seed", "global_check")
+OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "against", "times", "metrics", "seed", "global_check")
 
 
 def _pictures(result: Result) -> Iterator[Section]:

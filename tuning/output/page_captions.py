@@ -6,6 +6,7 @@ CAPTIONS = {
     "sensitivities": "Percent by which each metric moves for a percent of each gain.",
     "profiles": "The goal along each gain between its bounds, the others as found; what breaks a limit is marked.",
     "front": "The same front as a picture.",
+    "slew_times": "The error and what it costs over the prescribed time; open points break a requirement.",
     "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
     "nichols": "The loop opened at each axis of the plant's input, the others closed.",
     "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",

@@ -16,7 +16,7 @@ def search(summary: Summary) -> Iterator[str]:
         if ratio is None or ratio > 1.0:
             lost = ratio is None or math.isinf(ratio)
             far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
-            yield f"no gains found within the bounds keep every limit: with these {far} in training"
+            yield f"no gains found within the bounds keep every limit: with the best ones, {far} on the training trials"
     if found.get("averaged", 0) > found.get("asked", math.inf):
         yield (
             f"tuned on {found['averaged']} trials, not tune.trials = {found['asked']}: on so few every single trial "
@@ -34,13 +34,13 @@ def search(summary: Summary) -> Iterator[str]:
         moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
         reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
         yield (
-            f"worst case: {hardest['metric']} has none over {moved}, which {reach}; "
-            f"ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
+            f"the worst case of {hardest['metric']} inside the dispersions has no bound: over {moved} some trial "
+            f"{reach}; ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
     elif hardest is not None:
-        far = "has no value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+        far = "without a value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
         advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
-        yield f"worst case inside the dispersions: {hardest['metric']} {far}{advice}"
+        yield f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
     if "rollouts" in found:
         yield (
             f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
@@ -53,12 +53,13 @@ def search(summary: Summary) -> Iterator[str]:
     if checked is not None:
         kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
         beside = {
-            (True, True): f"the search is {100 * checked['distance']:+.2f} % from it",
-            (True, False): "breaks a limit, which the search keeps",
-            (False, True): "keeps every limit, unlike the search",
-            (False, False): "keeps not every limit either",
+            (True, True): f"from which the gains of this search are {100 * checked['distance']:+.2f} %",
+            (True, False): "whose gains break a limit, which those of this search keep",
+            (False, True): "whose gains keep every limit, unlike those of this search",
+            (False, False): "whose gains do not keep every limit either",
         }[kept, checked["kept"]]
-        yield f"differential evolution: {checked['value']:.4e}, {beside} ({checked['rollouts']} rollouts)"
+        found = f"{checked['value']:.4e}, {beside}"
+        yield f"differential evolution, a global search with {checked['rollouts']} rollouts, found {found}"
 
 
 def advice(summary: Summary) -> Iterator[str]:
@@ -95,7 +96,10 @@ def trust(summary: Summary) -> Iterator[str]:
         return
     yield from margin_sentences.tuned(believed.get("margins"))
     if believed["slopes_off_central_differences"] is None:
-        yield "flown with the exact sign, which has no slopes: found by evolution; a width of the sign is a gain too"
+        yield (
+            "the gains were found by evolution, since the exact sign has no slopes to go by; with sign_width free, its "
+            "width is a gain too"
+        )
         return
     off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
     shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())

@@ -113,16 +113,18 @@ def accuracy(summary: Summary) -> Iterator[str]:
     """How accurate the tuned gains are."""
     times = summary["accuracy_gain_over_paper"]
     if times is not None:
-        yield f"accuracy: {times:.3g} times the paper's gains'" + _between(summary.get("accuracy_gain_interval"), ".3g")
+        within = _between(summary.get("accuracy_gain_interval"), ".3g")
+        yield f"the tuned gains are {times:.3g} times as accurate as the paper's{within}"
     yield from paper_refused(summary)
     trained, fresh = summary["training"]["window_error"], summary["fresh"]["window_error"]
     before = summary.get("before")
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
         yield "the scenario's own gains are more accurate than these: see tune.bounds and the requirements"
     if trained and fresh:
-        both = [f"{where} {one['rms']:.3e}" + _between(one.get("rms_interval"), ".3e")
+        both = [f"{one['rms']:.3e} on the {where} trials" + _between(one.get("rms_interval"), ".3e")
                 for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
-        yield f"RMS window error: {', '.join(both)}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
+        said = ", ".join(both)
+        yield f"the tuned gains' RMS window error is {said}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
 
 
 def cautions(summary: Summary) -> Iterator[str]:
@@ -199,6 +201,51 @@ def front_heading(summary: Summary) -> str:
     """How many points, and on what they were judged."""
     kept = sum(not point["dominated"] for point in summary["points"])
     return f"{kept} points, each judged on {summary['trials']} fresh trials"
+
+
+def slew_times(summary: Summary) -> Table:
+    """Each prescribed time: the error, what it costs, its gains."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
+    costs, names = (list(slews[0][key]) if slews else [] for key in ("costs", "gains"))
+    rows = []
+    for slew in slews:
+        low, high = slew["interval"] or (None, None)
+        within = "-" if low is None or high is None else f"{50 * (high - low) / slew['rms']:.1f} %"
+        marks = ["meets"] if slew["meets"] else []
+        marks += [f"{slew['failures']} failed or missed"] if slew["failures"] else []
+        numbers = (f"{slew['t_f']:g}", _digits(slew["rms"], ".3e"), within)
+        numbers += tuple(_digits(slew["costs"][name], ".4g") for name in costs)
+        rows.append((*numbers, *(f"{slew['gains'][name]:.4g}" for name in names), ", ".join(marks)))
+    head = (f"{name.replace('_', ' ')} {units[name][0]}" for name in costs)
+    return Table(("t_f s", f"error {units['window_error'][0]}", "+-", *head, *names, ""), rows)
+
+
+def slew_times_lines(summary: Summary) -> Iterator[str]:
+    """What the fastest slew costs beside the slowest, and which times have no gains."""
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
+    if len(slews) > 1:
+        fast, slow = slews[0], slews[-1]
+        for name in fast["costs"]:
+            one, other = fast["costs"][name], slow["costs"][name]
+            if one and other:
+                yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name][0]} at t_f = {fast['t_f']:g} s, "
+                       f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
+        if fast["rms"] and slow["rms"]:
+            yield (f"RMS window error: {fast['rms']:.3e} at t_f = {fast['t_f']:g} s, {fast['rms'] / slow['rms']:.3g} "
+                   f"times that at {slow['t_f']:g} s")  # fmt: skip
+    for t_f in summary["without"]:
+        yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"
+    if summary["requirements"] and not any(slew["meets"] for slew in slews):
+        yield "at none of these times do gains meet every requirement on the fresh trials"
+
+
+def slew_times_heading(summary: Summary) -> str:
+    """How many times, and on what they were judged."""
+    return f"gains tuned for {len(summary['slews'])} prescribed times, each judged on {summary['trials']} fresh trials"
 
 
 def campaign(summary: Summary) -> Table:

@@ -122,10 +122,19 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """A front of accuracy against torque, as its `summary.json` says."""
+    """A front of accuracy against torque, or against t_f, as its `summary.json` says."""
+    if "slews" in summary:
+        return slew_times(summary, folder, how)
     say(f"front {how}: {sentences.front_heading(summary)}")
     table(sentences.front(summary))
     say(*sentences.front_lines(summary), *sentences.cautions(summary), f"results in {folder}")
+
+
+def slew_times(summary: dict[str, Any], folder: Path, how: str) -> None:
+    """What a faster slew costs, as its `summary.json` says."""
+    say(f"{how}: {sentences.slew_times_heading(summary)}")
+    table(sentences.slew_times(summary))
+    say(*sentences.slew_times_lines(summary), *sentences.cautions(summary), f"results in {folder}")
 
 
 def say(*lines: str) -> None:

@@ -119,10 +119,10 @@ def trace(
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
-    climbed = _climb([under(limit) for limit in ladder], [free.share, least.share], posed, tell)
-    climbed = {float(ladder[k]): found for k, found in climbed.items()}
+    best = _apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
+    found = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
-    judged = _judge(limited, evaluate, climbed, fresh_seed, ready.requirements, tell)
+    judged = _judge(limited, evaluate, found, fresh_seed, ready.requirements, tell)
     fixed = {}
     for name, other in others.items():
         trials, values = judging.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
@@ -158,10 +158,10 @@ def _unless_interrupted(found: Search) -> None:
         raise KeyboardInterrupt
 
 
-def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
+def climbed(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
     """What is found on each rung, down the ladder and up again, each from what is known by then.
 
-    One rung of those that a limit does not hold back, and whose gains are the same.
+    known: shares of gains, (gains,) each. A rung on which no gains keep the limits is left out.
     """
     best: dict[int, Best] = {}
     rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
@@ -171,6 +171,11 @@ def _climb(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Pos
         if found is not None and (k not in best or found.f < best[k].f):
             best[k] = found
             known.append(found.share)
+    return best
+
+
+def _apart(best: dict[int, Best]) -> dict[int, Best]:
+    """One rung of those that a limit does not hold back, and whose gains are the same."""
     apart: dict[int, Best] = {}
     for k in sorted(best):
         if all(np.abs(best[k].share - other.share).max() >= APART for other in apart.values()):

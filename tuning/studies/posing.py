@@ -1,5 +1,6 @@
 """The tuning problem of a scenario over its training trials, and what evaluates it."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +29,11 @@ class Posed:
     asked: list[Requirement]  # what the search keeps
 
 
-def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed:
-    """The tuning problem of a scenario."""
+def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
+    """The tuning problem of a scenario; farther: see `reach`."""
     table = scenario.tune
     assert table is not None
-    ready = study(scenario, reach=_reach(scenario, table))
+    ready = study(scenario, reach=reach(scenario, table, **farther))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
     asked = [r.implied_by for r in ready.requirements]
     trained = judging.trials_of(ready, confirm.training_trials(asked, table.trials))
@@ -54,7 +55,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None) -> Posed
     return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact, asked=asked)
 
 
-def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
+def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
+    """How far the free gains may move; farther: fields of `Reach` that are to be others."""
     own = reach_of(scenario)
 
     def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
@@ -64,7 +66,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
     smallest_delta, delta = interval("delta", own.delta)
     smallest_t_f, t_f = interval("t_f", own.t_f)
     gain, largest_gain = interval("observer_gain", own.gain, own.largest_gain)
-    return Reach(
+    found = Reach(
         smallest_t_f=smallest_t_f,
         t_f=t_f,
         delta=delta,
@@ -75,6 +77,7 @@ def _reach(scenario: Scenario, table: tables.Tune) -> Reach:
         sign_width=interval("sign_width", own.sign_width)[0],
         surface_rate=interval("surface_rate", own.surface_rate)[1],
     )
+    return dataclasses.replace(found, **farther)
 
 
 def _must_keep(requirement: Requirement, trials: int) -> int | None:

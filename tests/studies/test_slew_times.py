@@ -1,0 +1,115 @@
+"""What a faster slew costs: gains for each prescribed time, their costs, figure, page and refusals."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import catalogues
+from tests.helpers import small_search
+from tests.output.pages import checked
+from tuning.output import sentences
+from tuning.studies import slew_times
+
+
+def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
+    """Two times, few steps: the peak torque of a slew goes with 1 / t_f^2, the rate with 1 / t_f."""
+    small_search(monkeypatch, 60)
+    status, out, err = command("pareto", "s.toml", "--against", "t_f", "--times", "4,8", "--out", "cost")
+    assert (status, err) == (0, ""), err
+    assert "gains tuned for 2 prescribed times, each judged on 60 fresh trials" in out
+    with (tmp_path / "cost" / "slew_times.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    fast, slow = ({key: float(value) for key, value in row.items()} for row in rows)
+    assert (fast["t_f"], slow["t_f"]) == (4.0, 8.0)
+    assert fast["peak_rate"] / slow["peak_rate"] == pytest.approx(2.0, rel=0.3)
+    assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
+    # the same trials, flown by the scenario with that time and those gains
+    told = json.loads((tmp_path / "cost" / "summary.json").read_text())
+    assert [slew["t_f"] for slew in told["slews"]] == [4.0, 8.0]
+    assert told["slews"][0]["rms"] == fast["rms_window_error"]
+    assert "times that at 8 s" in out
+    page = checked(tmp_path / "cost")
+    assert "What a faster slew costs" in page.text
+    assert "--against t_f --times 4,8" in page.text
+    assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
+    assert "already done" in command("pareto", "s.toml", "--against", "t_f", "--times", "8,4", "--out", "cost")[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--against", "speed"), "--against is speed, but must be torque or t_f"),
+        (("--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
+        (("--against", "t_f", "--points", "4"), "--points is 4, but must be absent with --against t_f"),
+        *(
+            (("--against", "t_f", "--times", times), f"--times is {times}, but must be two times or more in s")
+            for times in ("4", "4,x", "4,4", "0,3", "3,inf", "")
+        ),
+        (
+            ("--against", "t_f", "--times", "0.2,5"),
+            "controller.delta is 0.5, but must be less than controller.t_f, 0.2",
+        ),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_one_sentence(command, tmp_path, options, said):
+    status, out, err = command("pareto", "s.toml", *options)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"controller": {"kind": "pd", "t_f": 5.0}, "tune": {}},
+            'controller.kind is "pd", but must be prescribed_time',
+        ),
+        ({"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f to ask what a faster slew costs"),
+        (
+            {"tune": {"objective": "t_f", "free": ["t_f"]}, "requirements": {"window_error": 1e-3}},
+            'tune.objective is "t_f"',
+        ),
+        ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
+        ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
+    ],
+)
+def test_what_has_no_answer_is_refused(changes, said):
+    known = scenario.from_tables({"loop": {"mode": "sampled"}, "controller": {"t_f": 20.0}, **changes})
+    with pytest.raises(ScenarioError, match=said.replace("(", r"\(")):
+        slew_times.check(known, (20.0, 30.0))
+
+
+def test_usual_times_go_from_half_to_twice_the_scenarios():
+    assert slew_times.usual_times(scenario.from_tables({})) == (15.0, 21.0, 30.0, 42.0, 60.0)
+
+
+def test_costs_are_those_that_the_scenario_has():
+    def costs(**tables):
+        return slew_times._costs(scenario.from_tables(tables))
+
+    assert costs() == ["peak_torque", "peak_momentum", "peak_rate", "effort"]
+    assert set(slew_times.COSTS) == set(costs(loop={"mode": "sampled"}, wheels={}))
+    assert costs(plant={"kind": "chain"}) == ["peak_torque", "peak_rate", "effort"]
+    assert set(slew_times.COSTS) <= set(catalogues.CATALOGUES["spacecraft"])
+
+
+def test_times_without_gains_are_told():
+    slew = {"t_f": 8.0, "gains": {"eta": 3.0}, "rms": 1e-5, "interval": [0.9e-5, 1.1e-5], "costs": {"peak_torque": 0.2},
+            "failures": 2, "meets": False}  # fmt: skip
+    told = {"plant": "spacecraft", "slews": [slew], "without": [4.0], "requirements": ["peak_torque"], "trials": 1000}
+    assert list(sentences.slew_times_lines(told)) == [
+        "no gains keep the limits on the training trials at t_f = 4 s",
+        "at none of these times do gains meet every requirement on the fresh trials",
+    ]
+    assert sentences.slew_times(told).rows == [
+        ("8", "1.000e-05", "10.0 %", "0.2", "3", "2 failed or missed"),
+    ]
+    nothing = {**told, "slews": [], "requirements": []}
+    assert sentences.slew_times(nothing).rows == []
+    assert np.isfinite(len(list(sentences.slew_times_lines(nothing))))

@@ -1,0 +1,209 @@
+"""What a faster slew costs: the best gains for each of some prescribed times, judged on fresh trials.
+
+One program flies every time: the shortest and the longest are searched from scratch, and each other one starts from
+what its neighbours found, down the ladder of times and up again, as the front against the torque does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.campaigns import montecarlo, store
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.figures import study_plots, style
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.scenario import cautions, own, parsing, study
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.simulation import catalogues
+from tuning.search import confirm, gains, trust
+from tuning.search.journal import Journal
+from tuning.search.objective import T_F
+from tuning.search.optimise import search
+from tuning.search.progress import Report
+from tuning.studies import judging, pareto, posing, tuner
+
+# what a faster slew may cost: of those metrics that a scenario has, the largest of the fresh trials
+COSTS = ("peak_torque", "peak_momentum", "peak_wheel_torque", "peak_wheel_momentum", "peak_rate", "effort")
+SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # of the scenario's t_f, where no times are given
+
+
+@dataclass(frozen=True)
+class Slew:
+    """The best gains for a prescribed time."""
+
+    t_f: float  # [s]
+    gains: dict[str, float]
+    rms: float  # window error over the fresh trials
+    interval: tuple[float, float] | None  # of it
+    costs: dict[str, float]  # each metric of `COSTS`: what the share of trials asked for stays below, or all of them
+    failures: int  # fresh trials that failed or missed t_f
+    meets: bool  # every requirement, on the fresh trials
+
+
+@dataclass(frozen=True)
+class Slews:
+    """What was found for each time, the shortest first."""
+
+    slews: list[Slew]
+    without: list[float]  # times for which no gains keep the limits [s]
+    fresh_seed: int
+    trials: int
+    rollouts: int
+    gradients: int
+
+    @property
+    def status(self) -> str:
+        """Whether the gains for some time meet every requirement on the fresh trials."""
+        return "met" if any(slew.meets for slew in self.slews) else "not met"
+
+
+def usual_times(scenario: Scenario) -> tuple[float, ...]:
+    """From half to twice the scenario's own [s]."""
+    return tuple(float(f"{share * scenario.controller.t_f:.3g}") for share in SPAN)
+
+
+def check(scenario: Scenario, times: Sequence[float]) -> None:
+    """Raise ScenarioError where there is nothing to ask, or a time that cannot be flown [s]."""
+    assert scenario.tune is not None
+    against = "to ask what a faster slew costs"
+    if not scenario.controller.prescribed:
+        raise wrong("controller.kind", scenario.controller.kind, f"prescribed_time {against}")
+    if scenario.tune.objective == T_F:
+        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
+    if T_F in (scenario.tune.free or ()):
+        raise wrong("tune.free", list(scenario.tune.free or ()), f"without t_f {against}")
+    if scenario.tune.worst_case:
+        raise wrong("tune.worst_case", True, f"false {against}")
+    for key in scenario.requirements:
+        if key in catalogues.MARGINS:
+            raise ScenarioError(
+                f"requirements.{key} is asked of one loop, not of several times; allowed is none {against}"
+            )
+    for t_f in times:
+        _at(scenario, t_f)
+
+
+def _at(scenario: Scenario, t_f: float) -> Scenario:
+    """The scenario with another prescribed time [s]."""
+    return gains.in_scenario(scenario, {"t_f": t_f})
+
+
+def trace(
+    scenario: Scenario,
+    seed: int,
+    times: Sequence[float],
+    tell: Report = lambda *told: None,
+    journal: Journal | None = None,
+) -> Slews:
+    """The best gains for each of these times [s]. Raises KeyboardInterrupt on Ctrl-C."""
+    times = sorted(times)
+    base = _at(scenario, times[0])
+    table = base.tune
+    assert table is not None
+    posed = posing.pose(base, seed, journal, t_f=times[-1])
+    ladder = [replace(posed.problem, parts=gains.with_gains(posed.problem.parts, {"t_f": t_f})) for t_f in times]
+    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
+    known = []
+    for k, what, starts in ((-1, "longest", table.starts), (0, "shortest", pareto.FEWER)):
+
+        def told(doing: str, *numbers: Any, what: str = what) -> None:
+            tell(f"{what} time: {doing}", *numbers)
+
+        found = search(posed.evaluate, ladder[k], posed.asked, posed.own, starts, report=told, **common)
+        if found.interrupted:
+            raise KeyboardInterrupt
+        known.append(found.share)
+        # the hardest trials that joined are asked for at every time
+        ladder = [replace(found.problem, parts=one.parts) for one in ladder]
+    best = pareto.climbed(ladder, known, posed, tell)
+    fresh_seed, slews, count = judging.seed_of_judge(seed), [], 0
+    ready = study(judging.as_flown(base), reach=posing.reach(base, table, t_f=times[-1]))
+    for done, k in enumerate(sorted(best)):
+        tell("judging on fresh trials", done, len(best), np.nan, 0.0)
+        share = jnp.asarray(best[k].share)
+        named = posed.evaluate.bounds.rounded(np.asarray(posed.evaluate.bounds.gains(share)), tuner.DIGITS)
+        parts = gains.with_gains(ready.parts, {**named, "t_f": times[k]})
+        count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements))
+        trials = montecarlo.run(parts, ready.dispersion, fresh_seed, np.arange(count))
+        chosen = {**named, "t_f": times[k]}
+        slews.append(_slew(times[k], named, trials, gains.in_scenario(scenario, chosen), fresh_seed))
+    without = [t_f for k, t_f in enumerate(times) if k not in best]
+    return Slews(slews, without, fresh_seed, count, posed.evaluate.rollouts, posed.evaluate.gradients)
+
+
+def _slew(t_f: float, named: dict[str, float], trials: Trials, scenario: Scenario, fresh_seed: int) -> Slew:
+    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+    verdicts = judging.verdicts_of(scenario, trials, fresh_seed)
+    return Slew(
+        t_f=t_f,
+        gains=dict(named),
+        rms=float(trust.rms(errors)) if errors.size else np.nan,
+        interval=trust.interval(errors, trust.rms),
+        costs={name: _largest(name, trials, scenario) for name in _costs(scenario)},
+        failures=int(np.sum(~trials.ok)),
+        meets=all(v.met for v in verdicts) and bool(np.all(trials.ok)),
+    )
+
+
+def _costs(scenario: Scenario) -> list[str]:
+    """Those of `COSTS` that the scenario's runs have."""
+    known = scenario.metrics
+    tables = {name: known[name].table for name in COSTS if name in known}
+    return [name for name, table in tables.items() if table is None or getattr(scenario, table, None) is not None]
+
+
+def _largest(name: str, trials: Trials, scenario: Scenario) -> float:
+    values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
+    asked = scenario.requirements.get(name)
+    quantile = (asked.share if isinstance(asked, Limit) else None) or 1.0
+    return statistics.value_at(values, quantile) if values.size else np.nan
+
+
+def identity(scenario: Scenario, seed: int, times: Sequence[float]) -> dict[str, Any]:
+    """What `versions.json` knows a finished or interrupted study by; times in [s]."""
+    listed = ",".join(f"{t_f:g}" for t_f in sorted(times))
+    return {"command": "pareto", "seed": seed, "against": T_F, "times": listed, **own.digests(scenario)}
+
+
+def summary(found: Slews, scenario: Scenario) -> dict[str, Any]:
+    """What `summary.json` says."""
+    return {
+        "status": found.status,
+        "against": T_F,
+        "plant": scenario.plant.kind,
+        "requirements": list(scenario.requirements),
+        "trials": found.trials,
+        "seed": found.fresh_seed,
+        "interval_confidence": trust.CONFIDENCE,
+        "rollouts": found.rollouts,
+        "gradients": found.gradients,
+        "slews": [{name: getattr(slew, name) for name in slew.__dataclass_fields__} for slew in found.slews],
+        "without": found.without,
+        "cautions": cautions.of(scenario),
+    }
+
+
+def write(folder: Path, scenario: Scenario, found: Slews, figures: bool, known_by: dict[str, Any]) -> None:
+    """Fill a result folder."""
+    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
+    store.write_json(folder / "versions.json", store.versions(**known_by))
+    store.write_json(folder / "summary.json", summary(found, scenario))
+    names, costs = gains.named(scenario), _costs(scenario)
+    header = ["t_f", *names, "rms_window_error", "rms_low", "rms_high", *costs, "failures", "meets"]
+    rows = [
+        [slew.t_f, *(slew.gains[name] for name in names), slew.rms, *(slew.interval or ("", "")),
+         *(slew.costs[name] for name in costs), slew.failures, int(slew.meets)]
+        for slew in found.slews
+    ]  # fmt: skip
+    store.write_csv(folder / "slew_times.csv", header, rows)
+    if figures and found.slews:
+        entries = catalogues.CATALOGUES[scenario.plant.kind]
+        limits = {name: value.limit if isinstance(value, Limit) else float(value)
+                  for name, value in scenario.requirements.items() if name in (*costs, "window_error")}  # fmt: skip
+        units = {name: entries[name].unit for name in ("window_error", *costs)}
+        style.save({"slew_times": study_plots.slew_times(found.slews, units, limits)}, folder / "figures")
