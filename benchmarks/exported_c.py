@@ -1,12 +1,16 @@
-"""The exported C beside the simulator: commands of many trials, one by one, and what a step takes.
+"""The exported C beside the simulator: commands of many trials, one by one, what a step takes, single precision.
 
 `python benchmarks/exported_c.py [TRIALS] [FLIGHT ..]`; flights are those of tests/onboard/flights.py, by default six.
+In single precision the compiled C flies in the loop, whose body, sensors and noise stay those of the simulator: RMS
+window error and mean peak torque of the trials beside those that the simulator's own code flies.
 """
 
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +33,7 @@ def compared(name: str, count: int) -> None:
     with tempfile.TemporaryDirectory() as place:
         store.write(Path(place) / "c", lambda making: folder.write_program(making, made))
         generated = time.perf_counter() - begin
-        library = Library(Path(place) / "c")
+        library, single = (Library(Path(place) / "c", real) for real in ("double", "float"))
     dispersion = vectors.known_alike(made.ready.dispersion)
     flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
     flown = jax.tree.map(np.asarray, flown)
@@ -50,6 +54,7 @@ def compared(name: str, count: int) -> None:
             found[n] = outputs[at : at + expected.shape[1]]
         off = np.linalg.norm(found - expected, axis=1)
         size = np.linalg.norm(expected, axis=1)
+        assert np.all(np.isfinite(found)), name
         worst = max(worst, float(np.max(off / np.maximum(size, 1e-300))))
         worst_of_peak = max(worst_of_peak, float(np.max(off) / np.max(size)))
     many = np.repeat(library.first()[None], 100_000, axis=0), np.repeat(given[:1], 100_000, axis=0)
@@ -60,9 +65,32 @@ def compared(name: str, count: int) -> None:
         seconds.append((time.perf_counter() - begin) / 100_000)
     print(
         f"| {name} | {used} of {count} | {worst:.1e} | {worst_of_peak:.1e} | {1e6 * np.median(seconds):.2f} us "
-        f"| {generated:.1f} s |",
+        f"| {generated:.1f} s | {single_precision(made.ready, single, count)} |",
         flush=True,
     )
+
+
+def single_precision(ready: Any, library: Any, count: int) -> str:
+    """RMS window error and mean peak of the trials: how far single precision is off, relative."""
+    from ptsmc_jax.onboard.library import InTheLoop
+    from ptsmc_jax.simulation import rollout
+
+    @partial(jax.jit, static_argnames="software")
+    def fly(trials: jax.Array, software: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def one(trial: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            parts = ready.dispersion.apply(ready.parts, jnp.uint32(0), trial)
+            found = rollout.simulate(parts, jnp.uint32(0), trial, software=software)
+            return found.status, found.metrics.window_error, found.metrics.peak_torque
+
+        return jax.vmap(one)(trials)
+
+    trials, said = jnp.arange(count, dtype=jnp.uint32), []
+    for software in (rollout.OURS, InTheLoop(library, ready.parts).software):
+        status, error, peak = (np.asarray(v) for v in fly(trials, software))
+        flown = np.isin(status, rollout.FINISHED)
+        said.append((np.sqrt(np.mean(error[flown] ** 2)), np.mean(peak[flown]), int(flown.sum())))
+    (error, peak, flown), (other, its_peak, its_flown) = said
+    return f"{abs(other / error - 1):.1e}, {abs(its_peak / peak - 1):.1e}, {its_flown} of {flown}"
 
 
 def main() -> None:
@@ -74,7 +102,7 @@ def main() -> None:
 
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     print("| flight | trials | largest difference of a command, of its own size | of the trial's peak | a step, with "
-          "copies of its rows | generation |")  # fmt: skip
+          "copies of its rows | generation | single precision: RMS error and mean peak off by, trials |")  # fmt: skip
     for name in sys.argv[2:] or SIX:
         compared(name, count)
 

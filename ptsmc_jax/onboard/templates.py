@@ -193,7 +193,9 @@ def _checks(code: Code, about: About) -> list[str]:
              "/* Whether an input can be used. */"]  # fmt: skip
     parameters = "const ptsmc_params *p, " if about.spacecraft else ""
     lines += [f"static int usable({parameters}const ptsmc_state *state, const ptsmc_in *in)", "{"]
-    required = [made for made in reals if not (about.filtered and made.name == "attitude")]
+    of_star = ("attitude", "attitude_age") if about.filtered else ()
+    required = [made for made in reals if made.name not in of_star]
+    aged = any(made.name == "attitude_age" for made in reals)
     if about.spacecraft:
         lines += [
             "    const real *const q = in->attitude;", "    const real *const w = in->rate;",
@@ -206,7 +208,8 @@ def _checks(code: Code, about: About) -> list[str]:
                 "    const real *const known = state->attitude;",
                 "    const int aligned = known[0] * known[0] + known[1] * known[1] + known[2] * known[2] +",
                 "        known[3] * known[3] > R(0.25);",
-                "    const int attitude = in->attitude_valid != 0 ? rotation : aligned;",
+                f"    const int told = rotation{' && isfinite(in->attitude_age)' if aged else ''};",
+                "    const int attitude = in->attitude_valid != 0 ? told : aligned;",
             ]
         turned = ["attitude" if about.filtered else "rotation", "turn < R(1)"]
     else:

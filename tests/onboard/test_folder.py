@@ -12,13 +12,15 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import rollout
-from tests.helpers import SHORT
+from tests.helpers import SHORT, short
 from tests.onboard.compiled import CC, needs_compiler
+from tests.onboard.flights import FLIGHTS
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory):
+def exported(tmp_path_factory):
     """The folder of a short flight on raw samples."""
     place = tmp_path_factory.mktemp("short")
     (place / "short.toml").write_text(SHORT)
@@ -38,8 +40,8 @@ def make(place, *args):
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_it_compiles_without_a_warning_and_replays_the_simulator(short, tmp_path, real):
-    place = shutil.copytree(short, tmp_path / "controller")
+def test_it_compiles_without_a_warning_and_replays_the_simulator(exported, tmp_path, real):
+    place = shutil.copytree(exported, tmp_path / "controller")
     done = make(place, "check", f"REAL={real}")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "130 samples; other status: 0" in done.stdout
@@ -51,11 +53,32 @@ def test_it_compiles_without_a_warning_and_replays_the_simulator(short, tmp_path
     assert make(place, "check", f"REAL={real}").returncode != 0
 
 
+EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "own"]
+
+
+def of_law(plant, kind):
+    """A short flight under this law, every default of its own."""
+    gains = {"delta": 0.5} if kind == "prescribed_time" else {}
+    tables = {"spacecraft": FLIGHTS["raw"], "chain": FLIGHTS["chain"], "system": FLIGHTS["system"]}[plant]
+    return {**tables, "controller": {"kind": kind, "t_f": 5.0, **gains}}
+
+
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_anything_may_come_in(short, tmp_path):
+@pytest.mark.parametrize(("plant", "kind"), short(EVERY, [("spacecraft", "super_twisting")]))
+def test_every_law_of_the_registry_replays_the_simulator(plant, kind, tmp_path):
+    made = scenario.reading.complete(scenario.from_tables(of_law(plant, kind)))
+    place = folder.export(made, tmp_path / "controller", name="law", trials=1)
+    done = make(place, "check")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "other status: 0" in done.stdout
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_anything_may_come_in(exported, tmp_path):
     """A hundredth of what `make fuzz` takes, under the sanitizers where the compiler has them."""
-    place = shutil.copytree(short, tmp_path / "controller")
+    place = shutil.copytree(exported, tmp_path / "controller")
     text = (place / "Makefile").read_text().replace("1000000", "10000")
     (place / "Makefile").write_text(text)
     done = make(place, "fuzz")
@@ -65,12 +88,12 @@ def test_anything_may_come_in(short, tmp_path):
     assert done.stdout.splitlines()[-1].startswith("10000 rounds:")
 
 
-def test_vectors_are_the_run_that_the_simulator_flies(short):
+def test_vectors_are_the_run_that_the_simulator_flies(exported):
     """Command by command: the recorded trial is the rollout's, of which the history keeps commands and estimates."""
-    with (short / "vectors.csv").open() as file:
+    with (exported / "vectors.csv").open() as file:
         header, *rows = csv.reader(file)
     mine = [row for row in rows if row[0] == "1" and row[1] != "-1"]
-    ready = scenario.study(scenario.read(short / "scenario.toml"))
+    ready = scenario.study(scenario.read(exported / "scenario.toml"))
     parts = ready.dispersion.apply(ready.parts, jnp.uint32(0), jnp.uint32(1))
     log = rollout.simulate_jit(parts, jnp.uint32(0), jnp.uint32(1), record=True).log
     assert log is not None
@@ -80,32 +103,35 @@ def test_vectors_are_the_run_that_the_simulator_flies(short):
         np.testing.assert_allclose(found, np.asarray(column)[: len(found)], rtol=1e-11, atol=1e-13)
 
 
-def test_other_gains_are_other_parameters_and_the_same_code(short, tmp_path):
+def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
     known = scenario.replace(
-        scenario.read(short / "scenario.toml"), controller__eta=4.0, spacecraft__inertia=[9, 11, 13]
+        scenario.read(exported / "scenario.toml"), controller__eta=4.0, spacecraft__inertia=[9, 11, 13]
     )
     other = folder.export(known, tmp_path / "other", name="short", trials=1)
 
     def code(place):
         return (place / "ptsmc_short.c").read_text().splitlines()[3:]
 
-    assert code(other) == code(short)
-    assert (other / "ptsmc_short_parameters.c").read_text() != (short / "ptsmc_short_parameters.c").read_text()
+    assert code(other) == code(exported)
+    assert (other / "ptsmc_short_parameters.c").read_text() != (exported / "ptsmc_short_parameters.c").read_text()
 
 
-def test_the_law_stands_in_it_with_its_names_and_equations(short):
-    text = (short / "ptsmc_short.c").read_text()
+def test_the_law_stands_in_it_with_its_names_and_equations(exported):
+    text = (exported / "ptsmc_short.c").read_text()
     assert "(56), (57) before and (59), (60) after the hand-over." in text.replace("\n * ", " ")
     for line in ("const real error_1 = attitude[0] - p->reference_q[0];", "const real wanted_3 = -switching_3"):
         assert line in text
-    assert "eta > 2" in (short / "ptsmc_short.h").read_text()
+    assert "eta > 2" in (exported / "ptsmc_short.h").read_text()
 
 
-def test_a_continuous_loop_and_a_full_folder_are_refused(short, tmp_path):
+def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
     with pytest.raises(ScenarioError, match=r'^loop.mode is "continuous", but must be "sampled" to be exported'):
         folder.export(scenario.from_tables({}), tmp_path / "x")
     with pytest.raises(RefusedError, match="holds something already"):
-        folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), short)
+        folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), exported)
+    filtering = {"loop": {"mode": "sampled"}, "hardware": {"command_filter": {"kind": "first_order", "corner": 2.0}}}
+    with pytest.raises(ScenarioError, match=r"^hardware.command_filter is .*, but must be absent to be exported"):
+        folder.export(scenario.from_tables(filtering), tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
 

@@ -125,6 +125,52 @@ def test_a_star_tracker_without_an_attitude_is_not_missed(filtered):
 
 
 @needs_compiler
+def test_the_age_of_an_attitude_is_one_of_the_period_or_is_refused(tmp_path):
+    """Of a star tracker with times of its own: what is no age is bad input where there is an attitude."""
+    made, library = exported(tmp_path / "controller", "star tracker out of step")
+    samples, at = given(made), names_of(made.board)["in"].index("attitude_age")
+    valid = names_of(made.board)["in"].index("attitude_valid")
+    other = samples.copy()
+    other[:, at] = 0.04  # of a body that turns by 0.02 rad/s
+    turned = other.copy()
+    half = 0.25 + 0.01 * (samples[:, 0] - 0.04)
+    turned[1:, 1], turned[1:, 4] = np.sin(half[1:]), np.cos(half[1:])
+    np.testing.assert_allclose(flown(library, turned)[1][-1], flown(library, samples)[1][-1], rtol=0, atol=1e-9)
+    for age, there, wanted in ((np.nan, 0.0, OK), (np.nan, 1.0, INPUT), (-1.0, 1.0, OK), (1e9, 1.0, OK)):
+        other = samples.copy()
+        other[10, at], other[10, valid] = age, there
+        statuses, outputs = flown(library, other)
+        assert statuses[10] == wanted, age
+        assert np.all(np.isfinite(outputs))
+
+
+@needs_compiler
+def test_bad_telemetry_of_the_wheels_is_bad_input(tmp_path):
+    made, library = exported(tmp_path / "controller", "wheels")
+    samples, at = given(made), names_of(made.board)["in"].index("wheel_momentum[2]")
+    for bad in (np.nan, np.inf, 1e9):
+        other = samples.copy()
+        other[10, at] = bad
+        statuses, outputs = flown(library, other)
+        assert (statuses[10], statuses[11]) == (INPUT, MISSED)
+        assert set(np.delete(statuses, (10, 11))) <= {OK, SATURATED}
+        assert np.all(np.isfinite(outputs))
+        np.testing.assert_array_equal(outputs[11:], flown(library, np.delete(samples, 10, axis=0))[1][10:])
+
+
+@needs_compiler
+def test_a_missed_sample_is_told_and_left_out_of_the_observer(filtered):
+    library, samples = filtered
+    statuses, outputs = flown(library, np.delete(samples, slice(10, 15), axis=0))
+    assert statuses[10] == MISSED
+    assert not np.delete(statuses, 10).any()
+    assert np.all(np.isfinite(outputs))
+    at = library.columns["out"].index("d_hat[0]")
+    np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
+    assert np.any(outputs[11, at : at + 3] != outputs[10, at : at + 3])  # and goes on from there
+
+
+@needs_compiler
 def test_minus_q_is_the_same_attitude(filtered):
     library, samples = filtered
     other = samples.copy()
