@@ -57,6 +57,40 @@ def test_its_cells_run_at_a_small_size(source, monkeypatch):
     plt.close("all")
 
 
+SLIDING = [source for source in SOURCES if "interact(" in source.read_text()]
+
+
+def ends(widget):
+    """Both ends of a slider."""
+    base = getattr(widget, "base", None)
+    return [float(v) if base is None else base**v for v in (widget.min, widget.max)]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("source", SLIDING, ids=lambda path: path.stem)
+def test_every_slider_moves_to_both_ends(source, monkeypatch, capsys):
+    """Each by itself, and all together, of the flight that the notebook flies; few trials a stop."""
+    kept = []
+    monkeypatch.setattr("ipywidgets.interact", lambda function, **widgets: kept.append((function, widgets)))
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
+    cells = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code"]
+    for old, new in {**SMALLER.get(source.stem, {}), "measured(case, 64)": "measured(case, 8)"}.items():
+        cells = [cell.replace(old, new) for cell in cells]
+    exec(compile("\n".join(cells), source.name, "exec"), {})
+    plt.close("all")
+    assert kept
+    for function, widgets in kept:
+        first = {name: widget.value for name, widget in widgets.items()}
+        stops = [{**first, name: end} for name, widget in widgets.items() for end in ends(widget)]
+        stops += [{name: ends(widget)[k] for name, widget in widgets.items()} for k in (0, 1)]
+        for stop in stops:
+            capsys.readouterr()
+            function(**stop)
+            said = capsys.readouterr().out
+            assert said, stop
+            assert "nan" not in said, stop
+
+
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # of the machinery that runs kernels
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
