@@ -55,7 +55,7 @@ def refused(command, tmp_path, *args):
     [
         (CONTINUOUS, (), "loop.mode is \"continuous\", but must be"),
         (SHORT + "[hardware.command_filter]\nkind = 'first_order'\ncorner = 2.0\n", (),
-         "hardware.command_filter is {'kind': 'first_order', 'corner': 2.0}, but must be absent to be exported"),
+         'hardware.command_filter is { corner = 2.0, kind = "first_order" }, but must be absent to be exported'),
         (SHORT, ("--trials", "0"), "--trials is 0, but must be a whole number from 1 to 100"),
         (SHORT, ("--trials", "101"), "--trials is 101, but must be a whole number from 1 to 100"),
         (SHORT, ("--seed", "-1"), "--seed is -1, but must be a whole number"),
@@ -78,8 +78,8 @@ def test_simulate_refuses_what_is_no_controller_of_the_scenario(command, tmp_pat
 
     assert "the controller is nothing, but must be a folder that ptsmc export has written" in said("nothing")
     assert "the controller is s.toml, but must be a folder that ptsmc export" in said("s.toml")
-    (tmp_path / "s.toml").write_text(SHORT.replace("period = 0.1", "period = 0.25"))
-    assert "loop.period is 0.25 s, but must be 0.1 s, that of the controller in" in said(exported)
+    (tmp_path / "s.toml").write_text(SHORT.replace("period = 0.1", "period = 0.05"))
+    assert "loop.period is 0.05 s, but must be 0.1 s, that of the controller in" in said(exported)
     (tmp_path / "s.toml").write_text(SHORT + "[filter]\n")
     assert "has other inputs than the scenario, but must be an export of one with the same plant" in said(exported)
     (tmp_path / "s.toml").write_text(CONTINUOUS)
