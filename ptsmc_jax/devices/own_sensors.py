@@ -30,6 +30,7 @@ class SampledSensor:
     """
 
     draws: ClassVar[int] = 0
+    tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
     model: Any  # the plant as law and observer know it
 
     def begin(self, x: Any) -> Any:

@@ -127,6 +127,20 @@ def _coupling() -> Quantity:
     return Quantity(lambda parts: _paired("mode_coupling", _modes(parts)), read, write)
 
 
+def _jitter() -> Quantity:
+    def below_a_half(given: np.ndarray) -> np.ndarray:
+        fit = (given >= 0.0) & (given < 0.5)
+        UnfitError.check(fit.all(axis=1), lambda k: "a share of the control period from 0 to below 0.5")
+        return given
+
+    return Quantity(
+        lambda parts: ["timing_jitter"] if parts.clock.sampled else [],
+        lambda parts: jnp.zeros(1) if parts.jitter is None else jnp.reshape(parts.jitter, 1),
+        lambda parts, given: replace(parts, jitter=given[0]),
+        below_a_half,
+    )
+
+
 _OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
 OF_MISFITS: dict[str, Quantity] = {
     "actuator_scale": _of_actuators(
@@ -140,6 +154,7 @@ OF_MISFITS: dict[str, Quantity] = {
     "gyro_scale": _of_sensors("rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
     "star_tracker_outage": _of_sensors("outage", _OUTAGE, [np.inf, np.inf]),
     "wheel_failure": _failure(),
+    "timing_jitter": _jitter(),
     "mode_frequency": _frequency(),
     "mode_coupling": _coupling(),
 }  # fmt: skip
@@ -271,8 +286,23 @@ class Failure:
         return jnp.stack([self.earliest + c[0] * (self.latest - self.earliest), wheel])
 
 
+@pytree
+@dataclass(frozen=True)
+class Jitter:
+    """By which samples come early or late at most, as a share of the control period."""
+
+    smallest: Leaf  # [-]
+    largest: Leaf  # [-]
+    drawn: ClassVar[Drawn] = "uniform"
+    count: ClassVar[int] = 1
+
+    def at(self, c: Float[Array, "1"], parts: Parts) -> Float[Array, "1"]:
+        """Smallest + c (largest - smallest) [-], (1,)."""
+        return self.smallest + c * (self.largest - self.smallest)
+
+
 def _between(kind: type, *keys: str) -> Callable:
-    """Made of a table's times [s]; without `latest` until the end of the run."""
+    """Made of a table's numbers, times [s] or shares [-]; without `latest` until the end of the run."""
 
     def made(table: Any, parts: Parts) -> Any:
         values = [parts.t_end if getattr(table, key) is None else getattr(table, key) for key in keys]
@@ -294,6 +324,7 @@ MISFITS: dict[str, Callable[[Any, Parts], Misfit]] = {
     "gyro_scale": _about(Factors, lambda parts: 3),
     "star_tracker_outage": _between(Outage, "earliest", "latest", "duration"),
     "wheel_failure": _between(Failure, "earliest", "latest"),
+    "timing_jitter": _between(Jitter, "smallest", "largest"),
     "mode_frequency": _about(FrequencyFactors, _modes),
     "mode_coupling": _about(CouplingFactors, _modes),
 }

@@ -97,7 +97,8 @@ class Dispersion:
             turned = self.reference.at(coordinates[REFERENCE], q, q)
             parts = replace(parts, reference=replace(parts.reference, q=turned))
         if self.state is not None:
-            parts = replace(parts, initial=self.state.at(coordinates[INITIAL_STATE], parts.initial))
+            seen = self.state.at(coordinates[INITIAL_STATE], parts.plant.seen(parts.initial))
+            parts = replace(parts, initial=parts.plant.at_rest(seen))
         if self.attitude is not None:
             reference = parts.reference(jnp.zeros_like(parts.t_end))
             q = self.attitude.at(coordinates[INITIAL_ATTITUDE], parts.initial.q, reference.q)

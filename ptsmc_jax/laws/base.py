@@ -75,6 +75,10 @@ class Law(ErrorMotion):
         u, s = self.torque(now.t, now.hold, x, target, d_hat, k2)
         return u, s, memory
 
+    def in_hold(self, t: Array, t_next: Array, hold: Bool[Array, "..."]) -> Bool[Array, "..."]:
+        """Which periods, from t to t_next [s], the hold's gains rule; hold: those that begin after the hand-over."""
+        return hold
+
     @property
     def order(self) -> int:
         """Order n of the error's motion: 2, or that of a chain."""
@@ -101,7 +105,7 @@ class Prescribed(Law):
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
     prescribed: ClassVar[bool] = True
 
-    def landing(self, now: Sample, s: Vector, power: Scalar, rate: Scalar, switching: Scalar) -> Vector:
+    def landing(self, now: Sample, s: Vector, handed: Vector, power: Scalar, rate: Scalar, switching: Scalar) -> Vector:
         """Where s is to be at the end of the period that begins, implicit (backward Euler) sampling; (m,).
 
         Where the law in continuous time would bring it, r^power s before the hand-over and e^(-rate h) s after it, and
@@ -109,16 +113,24 @@ class Prescribed(Law):
         sign(s+), whose solution is sign(target) max(|target| - k, 0). Acary, Brogliato, Orlov, Chattering-free digital
         sliding-mode control with state observer and disturbance rejection, IEEE Trans. Automatic Control 57(5), 2012.
         There is no boundary layer to choose, and no border for delta.
+
+        The s is that of the period's end. In a period that the hand-over ends it is the hold's, and lands at `handed`.
         """
-        left = jnp.where(now.hold, 1.0, self.t_f - now.t)
-        kept = (self.remaining(now) / left) ** power
-        target = jnp.where(now.hold, jnp.exp(-rate * now.dt), kept) * s
+        before = jnp.where(self.in_hold(now.t, now.t + now.dt, now.hold), handed, self.share(now) ** power * s)
+        target = jnp.where(now.hold, jnp.exp(-rate * now.dt) * s, before)
         # slope 1 where there is nothing to switch against, at rest too
         return jnp.where(jnp.abs(target) < switching, 0.0, target - switching * jnp.sign(target))
 
-    def remaining(self, now: Sample) -> Scalar:
-        """What is left to t_f at the end of the period that begins [s]; 1 after the hand-over. Never quite nothing."""
-        return jnp.where(now.hold, 1.0, jnp.maximum(self.t_f - now.t - now.dt, 1e-9 * now.dt))
+    def in_hold(self, t: Array, t_next: Array, hold: Bool[Array, "..."]) -> Bool[Array, "..."]:
+        """Which periods, from t to t_next [s], the hold's gains rule: with implicit sampling by where they end."""
+        if not self.implicit:
+            return hold
+        return hold | (t_next > self.hand_over - 1e-6 * (t_next - t))  # rounding must not cost a period
+
+    def share(self, now: Sample) -> Scalar:
+        """What of the time to t_f is left at the end of the period that begins [-]; 1 in hold. Never quite nothing."""
+        left = jnp.where(now.hold, 1.0, self.t_f - now.t)
+        return jnp.where(now.hold, 1.0, jnp.maximum(left - now.dt, 1e-9 * now.dt) / left)
 
     def exact(self, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
         """The error and s, (m,) each, of the exact motion at t [s] before the hand-over.
@@ -227,11 +239,16 @@ class SecondOrder(Prescribed):
         """`torque`, or with implicit sampling the input that lands s where `landing` says: s+ = s_0 + g eps''."""
         if not self.implicit:
             return super().command(memory, now, x, target, d_hat, k2)
-        gains, h, c = self.gains(now.t, now.hold), now.dt, self.remaining(now)
+        h, share, here = now.dt, self.share(now), self.gains(now.t, now.hold)
+        over = self.in_hold(now.t, now.t + h, now.hold)
+        end = self.gains(now.t + h, over)
         error, error_rate = self.errors(x, target)
-        s = gains.c * error_rate + gains.e * error
-        s_0 = c * error_rate + gains.e * (error + h * error_rate)
-        g = h * c + gains.e * h**2 / 2.0
+        s = here.c * error_rate + here.e * error
+        s_0 = end.c * error_rate + end.e * (error + h * error_rate)
+        g = h * end.c + end.e * h**2 / 2.0
+        # s = 0 before the hand-over: eps falls like r^eta. What the hold is given hangs on a rate that is measured, not
+        # on eta / delta times the noise of an attitude
+        handed = share ** (self.eta - 1.0) * (error_rate + self.surface_rate * share * error)
         switching = g * 0.5 * self.influence(x, target) * k2
-        landed = self.landing(now, s, self.eta, 0.5 * self.reaching_gain(), switching)
+        landed = self.landing(now, s, handed, self.eta, 0.5 * self.reaching_gain(), switching)
         return self.invert(x, target, 2.0 * (landed - s_0) / g, d_hat), s, memory

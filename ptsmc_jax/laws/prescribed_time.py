@@ -115,9 +115,9 @@ class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
 
         def newton(_: Any, x: State) -> State:
             off = self.model.position_rate(target, x) - error_rate
-            return jnp.concatenate([error, x[n:] - matrices.solve(self.model.slope(target, x), off)])
+            return jnp.concatenate([error, x[n : 2 * n] - matrices.solve(self.model.slope(target, x), off)])
 
-        x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n:]]))
+        x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n : 2 * n]]))
         w_dot = matrices.solve(self.model.slope(target, x), acceleration - self.model.carried(target, x))
         return Motion(x, w_dot, self.clearance(x, target))
 
@@ -173,18 +173,22 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         """`torque`, or with implicit sampling the input (1,) that lands s where `landing` says: s+ = s_0 + g x_n'."""
         if not self.implicit:
             return super().command(memory, now, x, target, d_hat, k2)
-        n, h, c = self.order, now.dt, expansion(self.eta, self.order)
+        n, h, c, share = self.order, now.dt, expansion(self.eta, self.order), self.share(now)
         ends = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
         pushed = jnp.stack([h ** (n - i) / math.factorial(n - i) for i in range(n)])
         held, left = [*self.surface(), 1.0], jnp.where(now.hold, 1.0, self.t_f - now.t)
 
-        def weights(tau: Scalar) -> Float[Array, " n"]:
-            return jnp.stack([jnp.where(now.hold, held[i], c[i] * tau**i) for i in range(n)])
+        def weights(tau: Scalar, hold: Bool[Array, ""]) -> Float[Array, " n"]:
+            return jnp.stack([jnp.where(hold, held[i], c[i] * tau**i) for i in range(n)])
 
-        after = weights(self.remaining(now))
-        s, s_0 = (jnp.reshape(v, 1) for v in (jnp.dot(weights(left), x), jnp.dot(after, jnp.stack(ends))))
+        after = weights(share * left, self.in_hold(now.t, now.t + h, now.hold))
+        falls = [held[i] * share ** (self.eta - i) * x[i] for i in range(n)]  # on s = 0, x_1 like r^eta
+        s, s_0, handed = (
+            jnp.reshape(v, 1)
+            for v in (jnp.dot(weights(left, now.hold), x), jnp.dot(after, jnp.stack(ends)), sum(falls))
+        )
         g = jnp.dot(after, pushed)
-        landed = self.landing(now, s, self.eta + n - 2, self.k1, g * k2)
+        landed = self.landing(now, s, handed, self.eta + n - 2, self.k1, g * k2)
         u = ((landed - s_0) / g - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, s, memory
 

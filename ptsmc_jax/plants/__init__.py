@@ -3,12 +3,13 @@
 from ptsmc_jax.plants.flexible_body import FlexibleSpacecraft, Modes, flexible
 from ptsmc_jax.plants.integrator_chain import Chain, chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft, spacecraft
-from ptsmc_jax.plants.second_order import System, system
+from ptsmc_jax.plants.second_order import HiddenSystem, System, system
 
 __all__ = [
     "AttitudeState",
     "Chain",
     "FlexibleSpacecraft",
+    "HiddenSystem",
     "Modes",
     "Spacecraft",
     "System",

@@ -35,7 +35,7 @@ class System(Plant):
 
     def _at(self, function: Any, t: Scalar, x: Float[Array, " twice"]) -> Array:
         n = self.inputs
-        return function(t, x[:n], x[n:])
+        return function(t, x[:n], x[n : 2 * n])
 
     def position(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """x_1."""
@@ -43,7 +43,7 @@ class System(Plant):
 
     def velocity(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """x_2."""
-        return x[self.inputs :]
+        return x[self.inputs : 2 * self.inputs]
 
     def position_rate(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """x_1' = F."""
@@ -52,12 +52,12 @@ class System(Plant):
     def slope(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
         """dF/dx2."""
         n = self.inputs
-        return jax.jacfwd(self.F, argnums=2)(t, x[:n], x[n:])
+        return jax.jacfwd(self.F, argnums=2)(t, x[:n], x[n : 2 * n])
 
     def carried(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """What of x_1'' no acceleration makes: dF/dt + dF/dx1 F."""
         n = self.inputs
-        x_1, x_2 = x[:n], x[n:]
+        x_1, x_2 = x[:n], x[n : 2 * n]
         moved = (jnp.ones_like(t), self.F(t, x_1, x_2))
         return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), moved)[1]
 
@@ -110,6 +110,49 @@ class System(Plant):
         return {"x": x}
 
 
+@pytree
+@dataclass(frozen=True)
+class HiddenSystem(System):
+    """A truth with states z (k,) that no sensor sees and no law knows: a lag, a tank, a mode. Build it with `system`.
+
+    x_1' = F, x_2' = H(t, x_1, x_2, z) + G u + D d and z' = Z(t, x_1, x_2, z, u); F, G and D as of any system. The state
+    (2n + k,) is x_1, x_2, z; z is z0 at t = 0.
+    """
+
+    Z: Any  # -> (k,)
+    z0: Leaf  # (k,)
+
+    def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
+        """H."""
+        n = self.inputs
+        return self.H(t, x[:n], x[n : 2 * n], x[2 * n :])
+
+    def rate(
+        self, t: Scalar, x: Float[Array, " whole"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
+    ) -> Float[Array, " whole"]:
+        """Time derivative of the state."""
+        n = self.inputs
+        driven = self.drift(t, x) + self.input_gain(t, x) @ u + self.disturbance_gain(t, x) @ disturbance
+        hidden = self.Z(t, x[:n], x[n : 2 * n], x[2 * n :], u)
+        return jnp.concatenate([self.position_rate(t, x), driven, hidden])
+
+    def seen(self, x: Float[Array, " whole"]) -> Float[Array, " twice"]:
+        """x_1 and x_2."""
+        return x[: 2 * self.inputs]
+
+    def at_rest(self, seen: Float[Array, " twice"]) -> Float[Array, " whole"]:
+        """With z at z0."""
+        return jnp.append(seen, self.z0)
+
+    def columns(self, x: Any) -> dict[str, Any]:
+        """The states x_1 and x_2, one after the other."""
+        return {"x": x[..., : 2 * self.inputs]}
+
+    def hidden_columns(self, x: Any) -> dict[str, Any]:
+        """The states z."""
+        return {"z": x[..., 2 * self.inputs :]}
+
+
 def system(
     n: int,
     F: Callable,
@@ -117,31 +160,58 @@ def system(
     G: Callable,
     D: Callable | None = None,
     inertia: object = None,
+    *,
+    Z: Callable | None = None,
+    z0: object = (),
 ) -> System:
     """Second-order system (25) with n inputs from JAX functions of (t, x_1, x_2); see `System`.
 
     F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None, and must be
     invertible for any observer. inertia: (n, n), symmetric and positive definite, that observers read their gains
-    against (A = l inertia^-1), the identity if None: gains are then in 1/s. Raises ValueError where a function does not
-    take such arguments or returns another shape.
+    against (A = l inertia^-1), the identity if None: gains are then in 1/s. With Z, of (t, x_1, x_2, z, u), it has
+    states z (k,) besides, z0 at first, which H takes as a fourth argument: see `HiddenSystem`; it may fly as a truth.
+    Raises ValueError where a function does not take such arguments or returns another shape.
     """
     if not isinstance(n, int) or n < 1:
         raise ValueError(f"n is {n}, but must be a whole number of at least 1")
     one = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), one.dtype)
-    for name, function, shape in (("F", F, (n,)), ("H", H, (n,)), ("G", G, (n, n)), ("D", D, (n, n))):
+    z = _hidden(z0, Z)
+    whole = (vector, vector) if Z is None else (vector, vector, z)
+    asked: list[tuple[str, Any, tuple, tuple]] = [
+        ("F(t, x_1, x_2)", F, (vector, vector), (n,)),
+        ("H(t, x_1, x_2)" if Z is None else "H(t, x_1, x_2, z)", H, whole, (n,)),
+        ("G(t, x_1, x_2)", G, (vector, vector), (n, n)),
+        ("D(t, x_1, x_2)", D, (vector, vector), (n, n)),
+        ("Z(t, x_1, x_2, z, u)", Z, (vector, vector, z, vector), z.shape),
+    ]
+    for name, function, arguments, shape in asked:
         if function is None:
             continue
         try:
-            returned = jax.eval_shape(function, one, vector, vector)
+            returned = jax.eval_shape(function, one, *arguments)
         except Exception as error:
             said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-            raise ValueError(f"{name}(t, x_1, x_2) fails for x_1 and x_2 of shape ({n},): {said}") from error
+            raise ValueError(f"{name} fails for x_1 and x_2 of shape ({n},): {said}") from error
         got = getattr(returned, "shape", type(returned).__name__)
         if got != shape:
-            raise ValueError(f"{name}(t, x_1, x_2) returns {got}, but for n = {n} must return an array {shape}")
+            raise ValueError(f"{name} returns {got}, but for n = {n} must return an array {shape}")
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
     definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
     if not definite:
         raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
-    return System(called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale)))
+    made = called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
+    return System(*made) if Z is None else HiddenSystem(*made, called(Z), z)
+
+
+def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:
+    """The initial hidden states. Raises ValueError where they are no list of numbers, or Z is missing."""
+    try:
+        z = np.atleast_1d(np.asarray(z0, dtype=float))
+    except (TypeError, ValueError):
+        z = np.full((1, 1), np.nan)
+    if z.ndim != 1 or not np.all(np.isfinite(z)):
+        raise ValueError(f"z0 is {z0}, but must be a list of finite numbers")
+    if (Z is None) != (z.size == 0):
+        raise ValueError("Z and z0 go together: a hidden state needs its derivative and where it begins")
+    return jnp.asarray(z)

@@ -193,7 +193,7 @@ def _check_misfits(scenario: Scenario) -> None:
     def asked(*keys: str) -> list[str]:
         return [key for key in keys if getattr(dispersion, key, None) is not None]
 
-    for key in asked("actuator_scale", "actuator_misalignment"):
+    for key in asked("actuator_scale", "actuator_misalignment", "timing_jitter"):
         if scenario.loop.mode != "sampled":
             raise ScenarioError(f'dispersion.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
@@ -212,6 +212,12 @@ def _check_misfits(scenario: Scenario) -> None:
         latest = scenario.end if times.latest is None else times.latest
         if times.earliest > latest:
             raise wrong(f"dispersion.{key}.earliest", times.earliest, f"at most {latest}, the latest time")
+    for key in asked("timing_jitter"):
+        jitter = getattr(dispersion, key)
+        if not jitter.largest < 0.5:
+            raise wrong(f"dispersion.{key}.largest", jitter.largest, "below 0.5, half a control period")
+        if jitter.smallest > jitter.largest:
+            raise wrong(f"dispersion.{key}.smallest", jitter.smallest, f"at most {jitter.largest}, the largest")
     for key in asked("mode_frequency", "mode_coupling"):
         if getattr(scenario, "flexible", None) is None:
             raise ScenarioError(f"dispersion.{key} needs flexible modes, but there is no [flexible] table")

@@ -227,6 +227,19 @@ class Outage(Table, frozen=True):
     latest: NotNegative | None = None
 
 
+class Jitter(Table, frozen=True):
+    """Of each trial its own, between two, uniformly; each sample then comes early or late by up to it, uniformly.
+
+    Attributes:
+        largest: share of loop.period by which a sample may come early or late, below a half
+        smallest: likewise
+    """
+
+    kind: Literal["uniform"] = "uniform"
+    largest: Positive = 0.1
+    smallest: NotNegative = 0.0
+
+
 class Failure(Table, frozen=True):
     """Of any one wheel, at any time between two, uniformly.
 
@@ -306,6 +319,7 @@ class Dispersion(Table, frozen=True):
         gyro_scale: factor on the rate that the gyro reads about each axis
         star_tracker_outage: an interval without samples of the star tracker, with a filter
         wheel_failure: a wheel that gives no torque any more
+        timing_jitter: share of loop.period by which samples come early or late, of which flight software knows nothing
         mode_frequency: factor on each of flexible.frequency
         mode_coupling: factor on each row of flexible.coupling
         own: what code of one's own makes of numbers that are drawn
@@ -327,6 +341,7 @@ class Dispersion(Table, frozen=True):
     gyro_scale: RelativeNormal | RelativeUniform | None = None
     star_tracker_outage: Outage | None = None
     wheel_failure: Failure | None = None
+    timing_jitter: Jitter | None = None
     mode_frequency: RelativeNormal | RelativeUniform | None = None
     mode_coupling: RelativeNormal | RelativeUniform | None = None
     own: Any = None  # `own_devices.OwnDraw`
@@ -342,6 +357,7 @@ class StateDispersion(Table, frozen=True):
         disturbance_bias: a constant, added
         state_noise: factor on hardware.state_noise
         torque_limit: factor on hardware.torque_limit
+        timing_jitter: share of loop.period by which samples come early or late, of which flight software knows nothing
         own: what code of one's own makes of numbers that are drawn
     """
 
@@ -351,4 +367,5 @@ class StateDispersion(Table, frozen=True):
     disturbance_bias: NormalBias | UniformBias | None = None
     state_noise: RelativeNormal | RelativeUniform | None = None
     torque_limit: RelativeNormal | RelativeUniform | None = None
+    timing_jitter: Jitter | None = None
     own: Any = None  # `own_devices.OwnDraw`

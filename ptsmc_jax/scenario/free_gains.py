@@ -1,6 +1,7 @@
 """What tuning may move in a scenario: the default bounds of each gain, and how far they may be set."""
 
 import math
+from collections.abc import Mapping
 
 import msgspec
 
@@ -21,7 +22,8 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     if free is None:
         law = scenario.controller
         first, rest = law.free(sampled=scenario.loop.mode == "sampled")
-        free = (*first, *scenario.observer.gains, *rest, *scenario.estimator.gains, *scenario.devices.gains)
+        sensed = _of_sensors(scenario)
+        free = (*first, *scenario.observer.gains, *rest, *sensed, *scenario.estimator.gains, *scenario.devices.gains)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -41,11 +43,12 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     assert free is not None  # `resolve` filled it in
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    if not set(free) <= {*tables.FREE, *scenario.controller.gains, *scenario.observer.gains}:
+    own = {*scenario.controller.gains, *scenario.observer.gains, *_of_sensors(scenario)}
+    if not set(free) <= {*tables.FREE, *own}:
         raise wrong("tune.free", free, tables.FREE_TOLD)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in ("observer_gain", *_OTHERS, *scenario.controller.gains, *scenario.observer.gains):
+        if name not in ("observer_gain", *_OTHERS, *own):
             known = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, "observer_gain"))
             raise ScenarioError(
                 f"{said} the law of controller.kind = {errors.show(scenario.controller.kind)} has no {name}; "
@@ -83,7 +86,8 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 
 def _check_bounds(choice: Choice, name: str) -> None:
     key, (lower, upper) = f"tune.bounds.{name}", choice.bounds[name]
-    known = dict.fromkeys((*choice.scenario.controller.gains, *choice.scenario.observer.gains, *tables.FREE))
+    own = *choice.scenario.controller.gains, *choice.scenario.observer.gains, *_of_sensors(choice.scenario)
+    known = dict.fromkeys((*own, *tables.FREE))
     if name not in known:
         raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
     if name not in choice.free:
@@ -98,8 +102,13 @@ def _check_bounds(choice: Choice, name: str) -> None:
 
 def _gain(scenario: Scenario, name: str) -> GainBounds:
     """The bounds of a gain that the scenario has."""
-    others = scenario.observer.gains, scenario.estimator.gains, scenario.devices.gains
-    return {**scenario.controller.gains, **others[0], **others[1], **others[2]}[name]
+    others = scenario.observer.gains, _of_sensors(scenario), scenario.estimator.gains, scenario.devices.gains
+    return {name: gain for gains in (scenario.controller.gains, *others) for name, gain in gains.items()}[name]
+
+
+def _of_sensors(scenario: Scenario) -> Mapping[str, GainBounds]:
+    """Those of sensors of one's own."""
+    return {} if scenario.sensors is None else scenario.sensors.gains
 
 
 def _default(choice: Choice, name: str) -> tuple[float, float]:
@@ -125,6 +134,8 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
     if name == "command_corner":
         filtering = scenario.devices.command_filter
         return () if filtering is None else (filtering.corner,)
+    if name in _of_sensors(scenario):
+        return (float(getattr(scenario.sensors, name.removeprefix("sensors_"))),)
     law = name in scenario.controller.gains
     value = getattr(scenario.controller if law else scenario.observer, name if law else _field(name), None)
     return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)

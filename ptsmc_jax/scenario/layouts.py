@@ -44,6 +44,7 @@ DISPERSIONS: dict[str, Kinds] = {
     **dict.fromkeys(("actuator_misalignment", "star_tracker_misalignment"), _TURN),
     "star_tracker_outage": {"uniform": dt.Outage},
     "wheel_failure": {"uniform": dt.Failure},
+    "timing_jitter": {"uniform": dt.Jitter},
     "own": {"own": own_devices.OwnDraw},
     "x0": {"uniform": dt.UniformState, "normal": dt.NormalState},
 }

@@ -15,6 +15,8 @@ class OwnSensors(Own, Table, kw_only=True, frozen=True):
     kind: Literal["own"] = "own"
     code: Code
     needs: ClassVar[tuple[str, ...]] = ("see",)
+    tuned: ClassVar[bool] = True
+    prefix: ClassVar[str] = "sensors_"
 
     @classmethod
     def base(cls) -> type:
@@ -28,7 +30,9 @@ class OwnSensors(Own, Table, kw_only=True, frozen=True):
         from ptsmc_jax.devices.own_sensors import OwnSensors as Physics
         from ptsmc_jax.numerics.pytrees import vector
 
-        return Physics(build(self, model=model), vector(1.0))
+        made = build(self, model=model)
+        type(made).tunable = tuple(name.removeprefix(self.prefix) for name in self.gains)
+        return Physics(made, vector(1.0))
 
 
 SENSORS: Kinds = {"own": OwnSensors}  # those that are built in are keys of [hardware] and [filter]

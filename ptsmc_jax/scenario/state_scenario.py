@@ -41,7 +41,8 @@ class SystemPlant(Table, frozen=True):
 
     Attributes:
         system: where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed
-        truth: the system that flies, where it is another one than law and observer know; it stands likewise
+        truth: the system that flies, where it is another one than law and observer know, of as many inputs; states that
+            they do not know of it may have besides (Z, z0)
         x0: initial state, x_1 and then x_2
     """
 
@@ -205,6 +206,11 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
             found = systems.load(value)
         except ValueError as error:
             raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
+        if key == "system" and hasattr(found, "z0"):
+            raise ScenarioError(
+                f"plant.system is {errors.brief(value)}, which has states that no law knows (Z, z0); "
+                "allowed is one without, and this one as plant.truth"
+            )
         n = found.inputs
         if n * 2 != len(self.plant.x0):
             raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.{key} has n = {n}")

@@ -32,6 +32,7 @@ class Setup:
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     command_filter: CommandFilter | None = None  # between the law and the actuators
+    jitter: Leaf | None = None  # by which a sample comes early or late at most, as a share of the control period [-]
     pointing: Pointing | None = None  # what pointing error indices are taken of
 
     def __post_init__(self) -> None:

@@ -26,8 +26,9 @@ INDICES = {
     "rke": "RKE, that error less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-AT_A_TIME = tuple(f"{index}_{axis}" for index in ("ape", "ake") for axis in AXES)  # of which there are shares of time
-KNOWLEDGE = ("ake", "mke", "rke", "within_ake")  # how metrics begin that a run without noise lacks
+TIMED = ("ape", "mpe", "ake", "mke")  # of which there are shares of time
+AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
+KNOWLEDGE = ("ake", "mke", "rke", "within_ake", "within_mke")  # how metrics begin that a run without noise lacks
 WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
 
 CATALOGUE = {

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from ptsmc_jax.simulation.assembly import Parts
 
 AXIS = "observer_gain_"
+SENSORS = "sensors_"  # how the names of gains begin that sensors of one's own have
 _OF_FILTERS = ("filter_bandwidth", "command_corner")
 
 
@@ -29,9 +30,14 @@ def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
     return {name: v for name, v in found.items() if base(f"observer_{name}") != "observer_gain"}
 
 
+def of_sensors(gains: Mapping[str, Any]) -> dict[str, Any]:
+    """Gains of sensors of one's own, by their fields."""
+    return {name.removeprefix(SENSORS): v for name, v in gains.items() if name.startswith(SENSORS)}
+
+
 def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
     """Gains of the law."""
-    return {k: v for k, v in gains.items() if not k.startswith("observer_") and k not in _OF_FILTERS}
+    return {k: v for k, v in gains.items() if not k.startswith(("observer_", SENSORS)) and k not in _OF_FILTERS}
 
 
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
@@ -51,6 +57,9 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     each = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
     if each is not None:
         parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
+    if of_sensors(gains):
+        own_sensors = replace(parts.sensors.own, **of_sensors(gains))
+        parts = replace(parts, sensors=replace(parts.sensors, own=own_sensors))
     if "filter_bandwidth" in gains:
         known: Any = parts
         sensors = known.sensors.with_bandwidth(gains["filter_bandwidth"], known.clock.period)
@@ -66,6 +75,7 @@ def _check_names(parts: Parts, names: Iterable[str]) -> None:
     allowed = {"t_f", *parts.controller.tunable, *(f"observer_{name}" for name in parts.observer.tunable)}
     if each:
         allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(each))}
+    allowed |= {SENSORS + name for name in _tunable_of_sensors(parts)}
     if getattr(parts.sensors, "filter", None) is not None:
         allowed.add("filter_bandwidth")
     if parts.command_filter is not None:
@@ -73,6 +83,11 @@ def _check_names(parts: Parts, names: Iterable[str]) -> None:
     for name in names:
         if name not in allowed and not hasattr(parts.controller, name):
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(allowed))}")
+
+
+def _tunable_of_sensors(parts: Parts) -> tuple[str, ...]:
+    """Those of sensors of one's own, by their fields."""
+    return getattr(getattr(parts.sensors, "own", None), "tunable", ())
 
 
 def _check_clock(parts: Parts) -> None:
@@ -104,6 +119,8 @@ def gains_of(parts: Parts) -> dict[str, float]:
         gains["observer_gain"] = sum(each) / len(each)
     gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
+    for name in _tunable_of_sensors(parts):
+        gains[SENSORS + name] = float(getattr(parts.sensors.own, name))
     if getattr(parts.sensors, "filter", None) is not None:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
     if parts.command_filter is not None:

@@ -135,25 +135,35 @@ def _tally(start: Start, criteria: Criteria) -> pointing.Tally | None:
     return None if criteria.pointing is None else pointing.begin(jnp.zeros_like(criteria.t_f))
 
 
-def _observed(tally: Any, course: pointing.Course, name: str, interval: Interval, criteria: Criteria) -> pointing.Tally:
+def _observed(
+    tally: Any, course: pointing.Course, names: tuple[str, str], interval: Interval, criteria: Criteria
+) -> pointing.Tally:
     assert criteria.pointing is not None
     asked = criteria.pointing
-    limits = jnp.stack([jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES])
+    each = [[jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES] for name in names]
+    limits = jnp.stack([jnp.stack(some) for some in each])
     begins = criteria.t_f + asked.after
     return pointing.update(tally, course, interval.t, interval.t_next, begins, asked.window, limits)
 
 
 def _pointing(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.pointing(), "ape", interval, criteria)  # pyright: ignore[reportOptionalCall]
+    return tally if tally is None else _observed(tally, interval.pointing(), ("ape", "mpe"), interval, criteria)  # pyright: ignore[reportOptionalCall]
 
 
 def _knowledge(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.knowledge(), "ake", interval, criteria)  # pyright: ignore[reportOptionalCall]
+    return tally if tally is None else _observed(tally, interval.knowledge(), ("ake", "mke"), interval, criteria)  # pyright: ignore[reportOptionalCall]
 
 
 def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
     assert criteria.pointing is not None
     return tally.within / (criteria.t_end - criteria.t_f - criteria.pointing.after)
+
+
+def _means_within(tally: pointing.Tally, criteria: Criteria) -> Array:
+    """Of the time in whole windows; NaN where none is over."""
+    assert criteria.pointing is not None
+    observed = tally.windows * criteria.pointing.window
+    return jnp.where(observed > 0.0, tally.means_within / jnp.where(observed > 0.0, observed, 1.0), jnp.nan)
 
 
 def _from(first: str, index: Callable[[pointing.Tally, Criteria], Array], axis: int) -> Callable:
@@ -173,12 +183,14 @@ POINTING = {
     "rpe": lambda tally, criteria: tally.relative,
     "pde": lambda tally, criteria: pointing.drift(tally),
     "within_ape": _time_within,
+    "within_mpe": _means_within,
 }
 KNOWLEDGE = {
     "ake": POINTING["ape"],
     "mke": POINTING["mpe"],
     "rke": POINTING["rpe"],
     "within_ake": _time_within,
+    "within_mke": _means_within,
 }
 
 

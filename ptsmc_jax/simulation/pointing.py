@@ -138,21 +138,22 @@ class Tally(NamedTuple):
     means_low: Array
     windows: Scalar  # how many are closed
     within: Array  # time within the limits [s]
+    means_within: Array  # time in windows whose means are within theirs [s]
 
 
 def begin(zero: Scalar) -> Tally:
     """Before the observation; zero: of the run's numbers."""
     four, many = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
     window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf)
-    return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four)
+    return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four, four)
 
 
 def update(
-    tally: Tally, course: Course, t: Scalar, t_next: Scalar, begins: Scalar, window: Scalar, limits: Float[Array, "4"]
+    tally: Tally, course: Course, t: Scalar, t_next: Scalar, begins: Scalar, window: Scalar, limits: Float[Array, "2 4"]
 ) -> Tally:
     """After an interval from t to t_next that is no longer than a window; begins: when the observation does [s].
 
-    limits: (4,) [rad].
+    limits: (2, 4) [rad], on the error and on its means.
     """
     length = course.length
     share = jnp.clip((begins - t) / length, 0.0, 1.0)
@@ -169,7 +170,7 @@ def update(
     still = tally._replace(
         largest=jnp.maximum(started, sizes[1]),
         window=present,
-        within=tally.within + length * (1.0 - share) * _share_within(*sizes, limits),
+        within=tally.within + length * (1.0 - share) * _share_within(*sizes, limits[0]),
     )
 
     def closed() -> Tally:
@@ -185,6 +186,7 @@ def update(
             means_high=jnp.maximum(still.means_high, means),
             means_low=jnp.minimum(still.means_low, means),
             windows=still.windows + 1.0,
+            means_within=still.means_within + jnp.where(_sizes(mean) <= limits[1], window, 0.0),
         )
 
     found = jax.lax.cond(closes, closed, lambda: still)

@@ -41,6 +41,7 @@ SINGULAR_CLEARANCE = 1e-3  # there the law's gain, which grows like 1 / clearanc
 LEFT = 0.05  # share of the initial angle, and SETTLED settling angles, beyond which a run has missed t_f
 SETTLED = 10.0
 DISTURBANCE_WALK = "disturbance_walk"
+SAMPLE_TIMES = "timing_jitter_samples"
 
 
 class Log(NamedTuple):
@@ -95,6 +96,7 @@ class _World(NamedTuple):
     acting: Any  # state of the actuators
     pushed: Array | None  # random walk of the disturbance [N m]
     within: Any  # what sensors saw in the period before, see `computer.seen_within`
+    late: Array | None  # by how much the sample comes after its time; None: never [s]
 
 
 def simulate(
@@ -129,6 +131,11 @@ def walk_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
     return draws.stream(seed, trial, DISTURBANCE_WALK)
 
 
+def jitter_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
+    """The stream that the deviations of a trial's samples from their times are drawn from."""
+    return draws.stream(seed, trial, SAMPLE_TIMES)
+
+
 # One compiled program for all parts of the same structure.
 simulate_jit = programs.jit(simulate, static_argnames=("record", "software"))
 
@@ -138,11 +145,21 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = parts.observer.error_bound()
     listed, about, started = schedule(parts, ticks)
-    walk = walk_stream(seed, trial)
+    walk, jitter = walk_stream(seed, trial), jitter_stream(seed, trial)
+
+    def late(t: Scalar, sample: Array) -> Scalar:
+        """By how much a sample comes after its time t [s]; the first and the end of the run are where they are."""
+        assert parts.jitter is not None
+        most = jnp.minimum(parts.jitter * parts.clock.period, jnp.minimum(t, parts.t_end - t) / 2.0)  # pyright: ignore[reportAttributeAccessIssue]
+        return most * (2.0 * draws.uniforms(jitter, 1, sample)[0] - 1.0)
 
     def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
         (now, *_), (state, world) = tick, carry
-        dt, pushed = now.t_next - now.t, world.pushed
+        told, pushed, after = now.t_next - now.t, world.pushed, None
+        if parts.jitter is not None:  # flight software takes samples to come at their times
+            after = late(now.t_next, now.sample + 1)
+            now = now._replace(t=now.t + world.late, t_next=now.t_next + after)
+        dt = now.t_next - now.t
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w, channels), computer = software.decide(
             parts, k2, about(tick)._replace(within=world.within), computer, parts.plant.seen(state.x), world.acting
@@ -164,9 +181,9 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
 
         sight, flown = None if parts.sensors is None else computer.seen, until(now.t_next)
         state = _advance(parts, course, state, now, target, flown, torques, until, dt / parts.substeps, sight)
-        computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, dt))
+        computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, told))
         acting, within = actuators.end(world.acting, drive, queue, dt), seen_within(parts, now, until)
-        return (state, _World(computer, acting, pushed, within)), row
+        return (state, _World(computer, acting, pushed, within, after)), row
 
     acting = actuators.begin(parts.plant.inputs)
     state = _begin(parts, course, acting.h)
@@ -175,7 +192,8 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     computer = software.boot(parts, seed, trial, parts.plant.seen(course.x0), started)
     if actuators.holds:  # the state has it
         computer = computer._replace(applied=None)
-    world = _World(computer, acting, pushed, seen_within(parts, started, lambda t: course.x0))
+    first_late = None if parts.jitter is None else late(ticks.t[0], ticks.sample[0])
+    world = _World(computer, acting, pushed, seen_within(parts, started, lambda t: course.x0), first_late)
     (state, world), rows = jax.lax.scan(period, (state, world), listed)
     return _finish(parts, course, first, state, world.computer.memory, k2, rows, world)
 

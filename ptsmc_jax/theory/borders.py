@@ -100,9 +100,11 @@ def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool =
     """Smallest delta [s] for which the last sample before the hand-over is stable.
 
     On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
-    may lie at the hand-over itself: (eta - 1/2) h. With implicit sampling and without delay there is no border: 0.
+    may lie at the hand-over itself: (eta - 1/2) h. With implicit sampling, whose last such period ends before the
+    hand-over, it lies a period earlier on either; without delay there is no border: 0.
     """
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - float(anchored)) * h)
+    before = float(anchored) + float(implicit)
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - before) * h)
 
 
 def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = False) -> float:

@@ -268,7 +268,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])
     last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
-    before = whole & ~ticks.hold
+    before = whole & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
     left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
     nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)
     return jnp.append(jnp.where(jnp.any(before), nearest, last), last)

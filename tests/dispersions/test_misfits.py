@@ -11,6 +11,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.devices import actuators
 from ptsmc_jax.dispersions import misfits
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants import flexible_body
 from ptsmc_jax.simulation import rollout
 from tests.helpers import vector
@@ -35,7 +36,11 @@ DRAWN = {
 @pytest.fixture(scope="module")
 def drawn():
     ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DRAWN}))
-    assert set(ready.dispersion.misfits) == set(misfits.MISFITS) - {"star_tracker_outage", "wheel_failure"}
+    assert set(ready.dispersion.misfits) == set(misfits.MISFITS) - {
+        "star_tracker_outage",
+        "wheel_failure",
+        "timing_jitter",
+    }
     return ready, montecarlo.run(ready.parts, ready.dispersion, 5, np.arange(3))
 
 
@@ -173,6 +178,50 @@ def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
     np.testing.assert_allclose(run.metrics["window_error"], other.metrics.window_error, rtol=1e-12)
     whole = rollout.simulate_jit(parts, 0, 0)
     assert abs(float(whole.metrics.window_error) / run.metrics["window_error"] - 1.0) > 1e-6
+
+
+CHAIN = {
+    "plant": {"kind": "chain", "order": 2, "x0": [1.0, -0.3]},
+    "controller": {"t_f": 5.0, "delta": 0.45, "disturbance_bound": 0.0},
+    "disturbance": {"kind": "constant", "amplitude": [0.01]},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 7.0},
+    "dispersion": {"timing_jitter": {"kind": "uniform", "largest": 0.4, "smallest": 0.2}},
+}
+
+
+def test_samples_that_come_early_or_late_by_hand():
+    """A double integrator, its motion exact over every period as long as it is; the law counts on whole periods."""
+    ready = scenario.study(scenario.from_tables(CHAIN))
+    run = runs.fly(ready, 3, 2)
+    jitter = float(ready.dispersion.values(run.parts)["timing_jitter"])
+    assert 0.2 <= jitter <= 0.4
+    key, h, x = rollout.jitter_stream(3, 2), 0.1, np.array([1.0, -0.3])
+    nodes = np.maximum(4.55 + h * np.arange(-46, 26), 0.0).clip(max=7.0)
+    most = np.minimum(jitter * h, np.minimum(nodes, 7.0 - nodes) / 2.0)
+    number = np.arange(-46, 26)
+    off = np.array([float(draws.uniforms(key, 1, int(k))[0]) for k in number])
+    true = nodes + most * (2.0 * off - 1.0)
+    kept = np.flatnonzero(np.diff(nodes) > 0.0)
+    times, states = [], []
+    for k in kept:
+        times.append(true[k])
+        states.append(x)
+        tau, hold = 5.0 - nodes[k], number[k] >= 0
+        u = -x[1] - (x[1] + x[0]) if hold else -(2.0 * x[1] / tau + 3.0 * (tau * x[1] + 3.0 * x[0]) / tau**2)
+        dt = true[k + 1] - true[k]
+        x = np.array([x[0] + dt * x[1] + dt**2 / 2 * (u + 0.01), x[1] + dt * (u + 0.01)])
+    log = run.log
+    np.testing.assert_allclose(log.t[:-1], times, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(log.x[:-1], states, rtol=1e-12, atol=1e-12)
+    assert np.abs(np.diff(times) / h - 1.0).max() > 0.2
+
+
+@pytest.mark.parametrize("tables", [CHAIN, FLIGHT], ids=["chain", "flexible spacecraft with noise"])
+def test_samples_that_are_in_time_change_no_digit(tables):
+    parts = scenario.study(scenario.from_tables({**tables, "dispersion": {}})).parts
+    one, other = (rollout.simulate_jit(p, 5, 1) for p in (parts, replace(parts, jitter=vector(0.0))))
+    for name, value in one.metrics._asdict().items():
+        np.testing.assert_array_equal(value, getattr(other.metrics, name), err_msg=name)
 
 
 def test_streams_of_their_own():

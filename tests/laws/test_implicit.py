@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.closed_forms import expansion
 from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem
@@ -16,7 +17,7 @@ from ptsmc_jax.plants import rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import borders, linear, margins
 from tests.helpers import FULL_INERTIA, vector
 from tuning.search.gains import with_gains
 
@@ -24,7 +25,7 @@ H, T_F = 0.1, 5.0
 X0 = {2: [1.0, 0.3], 3: [1.0, 0.3, -0.2]}
 
 
-def study(order=2, bound=0.0, disturbance=0.0, x0=None, **controller):
+def study(order=2, bound=0.0, disturbance=0.0, x0=None, clock="anchored", **controller):
     """A sampled chain, d known to be within `bound`."""
     law = {
         "t_f": T_F,
@@ -38,7 +39,7 @@ def study(order=2, bound=0.0, disturbance=0.0, x0=None, **controller):
         "plant": {"kind": "chain", "order": order, "x0": x0 or X0[order]},
         "controller": law,
         "disturbance": {"kind": "constant", "amplitude": [disturbance]},
-        "loop": {"mode": "sampled", "period": H, "t_end": 7.0, "clock": "anchored"},
+        "loop": {"mode": "sampled", "period": H, "t_end": 7.0, "clock": clock},
     }
     return scenario.study(scenario.from_tables(tables)).parts
 
@@ -58,6 +59,11 @@ def test_s_lands_on_the_continuous_law_at_every_sample(order):
     before, hold = t < T_F - 0.4 - 1e-9, t > T_F - 0.4 - 1e-9
     np.testing.assert_allclose(s[before], s[0] * (left[before] / T_F) ** power, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(s[hold], s[hold][0] * np.exp(-1.3 * (t[hold] - t[hold][0])), rtol=1e-10, atol=1e-15)
+    # where the hand-over ends a period s is that of (39), all poles at -1, x_i as it falls on s = 0, r^(eta + 1 - i)
+    last = np.flatnonzero(before)[-1]
+    share = (0.4 / left[last]) ** (order + 0.7 - np.arange(order))
+    weights = {2: [1.0, 1.0], 3: [1.0, 2.0, 1.0]}[order]
+    np.testing.assert_allclose(s[last + 1], weights @ (share * x[last]), rtol=1e-10)
     c = np.array([float(v) for v in expansion(vector(order + 0.7), order)])
     np.testing.assert_allclose(s[0], c @ (T_F ** np.arange(order) * x[0]), rtol=1e-14)
 
@@ -116,9 +122,9 @@ def replace_noise(parts):
 
 @pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
 def test_frozen_gains_are_those_of_the_law_and_have_no_border(eta):
-    parts = study(eta=eta)
+    parts = study(eta=eta, delta=H)
     law = parts.controller
-    for tau in (2.0, 3.5, 20.0):
+    for tau in (2.1, 3.5, 20.0):
         now = Sample(vector(T_F - tau * H), jnp.asarray(False), vector(H))
         by = jax.jit(jax.jacfwd(lambda x, now=now: law.command(None, now, x, None, jnp.zeros(1), vector(0.0))[0]))(
             jnp.zeros(2)
@@ -147,6 +153,27 @@ def test_a_delta_of_one_period_that_explicit_sampling_cannot_fly():
     assert found["implicit"][1] <= found["explicit"][1]
 
 
+def test_a_hand_over_a_period_before_t_f_turns_no_noise_of_position_into_a_rate():
+    """Landing the approach's s there would leave eta / h of each sample's noise as a rate for K1 to take back.
+
+    In the second after t_f, K1 = 1 1/s, that is an error of about 0.4 s times it: 0.4 * 30 noises. Left is less than
+    a third, and explicit sampling, unstable at so late a hand-over, leaves more than that.
+    """
+    noise, error = 1e-5, {}
+    for sampling in ("explicit", "implicit"):
+        tables = {
+            "plant": {"kind": "chain", "order": 2, "x0": [0.02, 0.0]},
+            "controller": {"t_f": T_F, "eta": 3.0, "delta": H, "sampling": sampling, "disturbance_bound": 0.0},
+            "disturbance": {"kind": "none"},
+            "hardware": {"state_noise": [noise, 1e-7]},
+            "loop": {"mode": "sampled", "period": H, "t_end": 7.0},
+        }
+        ready = scenario.study(scenario.from_tables(tables))
+        trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(256))
+        error[sampling] = np.sqrt(np.mean(trials.metrics.window_error**2))
+    assert error["implicit"] < 0.4 * 3.0 / H * noise / 3.0 < error["explicit"]
+
+
 @pytest.mark.parametrize("hold", [False, True])
 def test_a_second_order_systems_s_lands_exactly_where_its_input_is_an_acceleration(hold):
     plant = system(1, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: 2.0 * jnp.eye(1))
@@ -159,6 +186,22 @@ def test_a_second_order_systems_s_lands_exactly_where_its_input_is_an_accelerati
     after = rate + 1.2 * e if hold else (left - h) * rate + 3.0 * e
     share = np.exp(-1.5 * h) if hold else ((left - h) / left) ** 3
     np.testing.assert_allclose(after, share * s[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("clock", ["anchored", "flight"])
+def test_the_stable_region_extends_past_the_border_of_explicit_sampling(clock):
+    """eta = 4, delta a period, where explicit sampling asks for 2.5 or 3.5: poles of the loop that flies."""
+    radius = {}
+    for sampling in ("explicit", "implicit"):
+        parts = study(eta=4.0, delta=H, sampling=sampling, clock=clock)
+        radius[sampling] = margins.at_ends(parts)["hand_over"][1]
+        law, run = parts.controller, linear.nominal(parts)
+        last = linear.full_periods(parts, run, hold=False)[-1]
+        tau = float(law.t_f - run.period.now.t[last]) / H
+        kp, kd = borders.implicit_gains(4.0, tau) if law.implicit else (16.0 / tau**2, 7.0 / tau)
+        # a memory that nothing changes, there is no observer, is a pole at 1
+        np.testing.assert_allclose(radius[sampling], max(1.0, borders.radius(kp, kd, 1.0)), rtol=1e-6)
+    assert radius["implicit"] < 1.0 + margins.NEUTRAL < 1.1 < radius["explicit"]
 
 
 @pytest.mark.parametrize("hold", [False, True])

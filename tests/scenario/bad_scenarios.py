@@ -281,6 +281,13 @@ BAD = [
         "dispersion.wheel_failure.earliest is 20",
         "at most 10",
     ),
+    ("dispersion.timing_jitter = {}", "dispersion.timing_jitter needs the sampled loop", 'loop.mode is "continuous"'),
+    (SAMPLED + "dispersion.timing_jitter = { largest = 0.5 }", "dispersion.timing_jitter.largest is 0.5", "below 0.5"),
+    (
+        SAMPLED + "dispersion.timing_jitter = { smallest = 0.2 }",
+        "dispersion.timing_jitter.smallest is 0.2",
+        "at most 0.1, the largest",
+    ),
     ("dispersion.mode_frequency = {}", "dispersion.mode_frequency needs flexible modes", "no [flexible] table"),
     (
         SAMPLED + "dispersion.actuator_misalignment = { std_deg = -1 }",

@@ -18,6 +18,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
 from tests.helpers import SHORT
+from tuning.search import gains
 
 FILE = """
 import dataclasses
@@ -38,6 +39,20 @@ class Noisy(ptsmc.SampledSensor):
     def see(self, memory, x, noise, t, dt):
         seen = x + self.sigma * noise
         return jnp.concatenate([memory, seen[1:]]), seen[:1]
+
+
+class Smoothed(ptsmc.SampledSensor):
+    '''Both states with white noise, through a filter of first order.'''
+
+    draws = 2
+    share: float = ptsmc.gain(0.5, (0.05, 1.0), below=1.0 + 1e-9)
+
+    def begin(self, x):
+        return x
+
+    def see(self, memory, x, noise, t, dt):
+        memory = memory + self.share * (x + 1e-2 * noise - memory)
+        return memory, memory
 
 
 class Drift(ptsmc.Draw):
@@ -182,9 +197,9 @@ SEES = [
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
-    ("sigma: tuple = (1e-3, 2e-3)", "sigma: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
 ]
 DRAWS = [
+    ("std: float = 0.1", "std: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
     ("def at", "def be", "the class Drift has no method at"),
     ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns something else"),
     ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
@@ -221,3 +236,29 @@ def test_sensors_of_ones_own_are_all_that_there_are(tables, said):
     with pytest.raises(ScenarioError, match=r"filter\.kind"):
         scenario.from_tables({"loop": {"mode": "sampled"}, "filter": {"bandwidth": 1.0}, "sensors": NOISY})
     assert dataclasses.is_dataclass(ptsmc.SampledSensor)
+
+
+def test_gains_of_sensors_of_ones_own_are_tuned_and_stand_in_the_file():
+    tables = {**CHAIN, "sensors": {"kind": "own", "code": "mine.py:Smoothed"}, "tune": {}}
+    loaded = reading.complete(scenario.from_tables(tables))
+    assert loaded.tune is not None
+    assert loaded.tune.free == ("k_p", "k_d", "sensors_share")
+    assert loaded.tune.bounds["sensors_share"] == (0.05, 1.0)
+    parts = scenario.study(loaded).parts
+    assert gains.gains_of(parts)["sensors_share"] == 0.5
+    assert gains.units_of(loaded)["sensors_share"] == "-"
+    other = gains.in_scenario(loaded, {"sensors_share": 0.3})
+    assert other.sensors.share == 0.3
+    assert gains.differ(loaded, other)
+    one, two = (
+        rollout.simulate_jit(p, 1, 2).metrics.window_error
+        for p in (gains.with_gains(parts, {"sensors_share": 0.3}), scenario.study(other).parts)
+    )
+    assert float(one) == float(two) != float(rollout.simulate_jit(parts, 1, 2).metrics.window_error)
+
+    def error(share):
+        return rollout.simulate(gains.with_gains(parts, {"sensors_share": share}), 1, 2).metrics.window_error
+
+    slope = float(jax.jit(jax.grad(error))(0.3))
+    both = [float(jax.jit(error)(0.3 + step)) for step in (1e-6, -1e-6)]
+    np.testing.assert_allclose(slope, (both[0] - both[1]) / 2e-6, rtol=1e-5)

@@ -210,6 +210,7 @@ COMPLETE = [
             "mode_coupling": {"kind": "relative_uniform", "half_width": 0.1},
             "star_tracker_outage": {"kind": "uniform", "duration": 5.0, "earliest": 1.0, "latest": 20.0},
             "wheel_failure": {"kind": "uniform", "earliest": 1.0, "latest": 20.0, "known": True},
+            "timing_jitter": {"kind": "uniform", "largest": 0.1, "smallest": 0.01},
         },
     },
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
@@ -246,6 +247,7 @@ COMPLETE = [
                 "dispersion": {
                     "state_noise": {"kind": "relative_normal", "std": 0.1},
                     "torque_limit": {"kind": "relative_uniform", "half_width": 0.1},
+                    "timing_jitter": {"kind": "uniform", "largest": 0.1, "smallest": 0.01},
                 },
             },
             {"requirements": dict.fromkeys(STATE_CATALOGUE, 0.5)},

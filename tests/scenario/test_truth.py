@@ -1,15 +1,20 @@
 """A system of one's own that flies while law and observer know another one."""
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import linear, margins
 
 FILE = """
 import jax.numpy as jnp
@@ -19,6 +24,8 @@ known = system(1, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: jn
 true = system(1, lambda t, a, b: b, lambda t, a, b: -0.5 * a - 0.3 * b, lambda t, a, b: 1.2 * jnp.eye(1))
 two = system(2, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: jnp.eye(2))
 number = 3
+late = system(1, lambda t, a, b: b, lambda t, a, b, z: -0.5 * a + z, lambda t, a, b: jnp.zeros((1, 1)),
+              Z=lambda t, a, b, z, u: (u - z) / 0.3, z0=[0.1])
 """
 PERIOD = 0.1
 TABLES = {
@@ -53,6 +60,65 @@ def test_the_truth_flies_under_a_law_that_knows_the_model():
         held = -2.0 * state[0] - 1.5 * state[1]
         np.testing.assert_allclose(u[k, 0], held, rtol=0.0, atol=1e-5)
         state = block[:2, :2] @ state + block[:2, 2] * held
+
+
+HIDDEN = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:late"}}
+
+
+def test_a_truth_with_a_state_that_nobody_sees():
+    """An input that comes late, z' = (u - z) / 0.3 s: the motion of all three states by the matrix exponential.
+
+    RK4 leaves (h / 0.3)^5 / 120 = 3e-5 of z a period where one step is taken; steps of 0.1 / 0.3 s, which how fast z is
+    asks for, leave less than a millionth.
+    """
+    ready = scenario.study(scenario.from_tables({**HIDDEN, "hardware": {"state_noise": [0.0, 0.0]}}))
+    parts = ready.parts
+    assert parts.substeps > 1
+    run = runs.fly(ready, 0)
+    x, u = np.asarray(run.log.x), np.asarray(run.log.u)
+    motion = np.array([[0.0, 1.0, 0.0, 0.0], [-0.5, 0.0, 1.0, 0.0], [0.0, 0.0, -1 / 0.3, 1 / 0.3], [0.0] * 4])
+    block, state = expm(PERIOD * motion), np.array([1.0, -0.2, 0.1])
+    for k in range(60):
+        np.testing.assert_allclose(x[k], state, rtol=0.0, atol=1e-6)
+        held = -2.0 * state[0] - 1.5 * state[1]
+        np.testing.assert_allclose(u[k, 0], held, rtol=0.0, atol=1e-5)
+        state = block[:3, :3] @ state + block[:3, 3] * held
+    told = run.columns()
+    np.testing.assert_array_equal(told["z1"], x[:, 2])
+    assert [name for name in told if name[0] == "x"] == ["x1", "x2"]
+    loop = jax.tree.map(lambda v: np.asarray(v)[-1], margins.at(parts, jnp.ones(1)).loops)  # with z
+    poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
+    closed = block[:3, :3] + np.outer(block[:3, 3], [-2.0, -1.5, 0.0])
+    slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
+    np.testing.assert_allclose(slowest, np.abs(np.linalg.eigvals(closed)).max(), rtol=1e-5)
+
+
+def test_trials_of_a_truth_with_hidden_states():
+    """Drawn, told in rows and given by them is what sensors see at the start; z begins at z0."""
+    drawn = {"x0": {"kind": "uniform", "half_width": [0.1, 0.0]}}
+    ready = scenario.study(scenario.from_tables({**HIDDEN, "dispersion": drawn}))
+    flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(3))
+    assert [name for name in flown.drawn if name.startswith("initial_x")] == ["initial_x1", "initial_x2"]
+    by_hand = replace(ready.parts, initial=jnp.array([flown.drawn["initial_x1"][2], -0.2, 0.1]))
+    again = rollout.simulate_jit(by_hand, 0, 2).metrics
+    np.testing.assert_allclose(flown.metrics.window_error[2], again.window_error, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"Z": None}, "Z and z0 go together"),
+        ({"z0": []}, "Z and z0 go together"),
+        ({"z0": "no"}, "z0 is no, but must be a list of finite numbers"),
+        ({"Z": lambda t, a, b, z, u: 0.0}, "Z(t, x_1, x_2, z, u) returns (), but for n = 1 must return an array (2,)"),
+        ({"H": lambda t, a, b: a}, "H(t, x_1, x_2, z) fails"),
+    ],
+)
+def test_hidden_states_that_cannot_be(changes, said):
+    good = {"H": lambda t, a, b, z: z[:1], "Z": lambda t, a, b, z, u: -z, "z0": [0.0, 1.0]}
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **{**good, **changes})
+    assert said in str(caught.value)
 
 
 def test_the_observer_sees_what_the_model_leaves_out():
@@ -109,3 +175,8 @@ def test_what_is_no_truth_is_refused(truth, said):
         scenario.study(scenario.from_tables({**TABLES, "plant": {**TABLES["plant"], "truth": truth}}))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_law_cannot_know_what_nobody_sees():
+    with pytest.raises(ScenarioError, match=r'plant.system is "my.py:late", which has states that no law knows'):
+        scenario.study(scenario.from_tables({**TABLES, "plant": {**TABLES["plant"], "system": "my.py:late"}}))

@@ -1,13 +1,14 @@
 """The worst trial inside what the dispersions can draw, against closed forms."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax.dispersions import attitudes, inertias, numbers, variation
+from ptsmc_jax.dispersions import attitudes, inertias, misfits, numbers, variation
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
@@ -81,6 +82,29 @@ def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
         np.linalg.norm([found.start[f"initial_w{k}"] for k in range(1, 4)]), 1e-3 * size, rtol=1e-9
     )
     np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-6)  # the body only slows down from there
+
+
+def test_the_worst_misfits_are_found_by_their_slopes():
+    """A star tracker turned by a leaves sin(a / 2) of error; as far as a box goes: to a corner, 3^(1/2) of its edge.
+
+    The gyro's factor and late samples move the error of a body at rest by nothing, and slopes must say so.
+    """
+    edge, limit = 0.02, 0.01
+    drawn: dict[str, Any] = {
+        "star_tracker_misalignment": misfits.Turn(numbers.Uniform(vector([edge] * 3))),
+        "gyro_scale": misfits.Factors(numbers.Uniform(vector([0.05] * 3))),
+        "timing_jitter": misfits.Jitter(vector(0.0), vector(0.3)),
+    }
+    spread = variation.Dispersion(misfits=drawn)
+    problem, wanted = posed(
+        spread, Requirement("window_error", limit), q=[0.0, 0.0, 0.0, 1.0], noise=(0.0, 0.0), k1=4.0, surface_rate=2.0
+    )
+    found = worst.hardest(problem, wanted, np.array([ETA, 4.0]))
+    assert set(found.moved) == set(spread.misfits)
+    np.testing.assert_allclose(found.ratio, np.sin(edge * np.sqrt(3.0) / 2.0) / limit, rtol=1e-3)
+    assert found.screened < found.ratio
+    turn = [found.start[f"star_tracker_misalignment_{k}"] for k in (1, 2, 3)]
+    np.testing.assert_allclose(np.abs(turn), edge, rtol=1e-3)
 
 
 def test_slopes_of_the_ascent_agree_with_central_differences():

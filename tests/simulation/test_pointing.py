@@ -2,6 +2,7 @@
 
 import dataclasses
 import tomllib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,10 @@ from tests.helpers import SHORT, drawn, vector
 SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # half-cones of deviations are known to this factor, from above
 
 
-def brute_force(t, error, mean_of, begins, window, t_end):
+def brute_force(t, error, mean_of, begins, window, t_end, limits: Any = None) -> Any:
     """Indices (4,) each from errors (n, 5) at times t (n,) and a function of two times for their mean between them.
 
-    About x, y, z, and the half-cone.
+    About x, y, z, and the half-cone. limits: the share of windows whose means keep them (4,) instead.
     """
     count = int((t_end - begins) / window + 1e-9)
     interpolated = mean_of("at")
@@ -40,6 +41,8 @@ def brute_force(t, error, mean_of, begins, window, t_end):
         relative.append(sizes(points - means[-1]).max(axis=0))
     means = np.stack(means)
     apart = sizes(means[:, None] - means[None]).max(axis=(0, 1))
+    if limits is not None:
+        return np.mean(sizes(means) <= limits, axis=0)
     return {"ape": largest, "mpe": sizes(means).max(axis=0), "rpe": np.max(relative, axis=0), "pde": apart}
 
 
@@ -89,9 +92,12 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
         spline = CubicHermiteSpline(NODES, error, rate)
         expected = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1])
         limits = np.array([0.5, 1.0, 1.5, 2.0])
-        tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, limits)))
+        of_means = 0.9 * expected["mpe"]  # which some windows keep
+        tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, np.stack([limits, of_means]))))
         close(indices(tally), expected, 1e-10)  # sums of a hundred numbers
         assert float(tally.windows) == int((NODES[-1] - begins) / window + 1e-9)
+        kept = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1], of_means)
+        np.testing.assert_allclose(tally.means_within / (tally.windows * window), kept, rtol=1e-12)
         # the time within a limit, sizes going straight from node to node
         sizes = np.concatenate([np.abs(error[:, :3]), np.linalg.norm(error[:, 3:], axis=1)[:, None]], axis=1)
         fine = np.linspace(begins, NODES[-1], 200_001)
@@ -109,12 +115,12 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
 
 def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
     error = np.tile([1.0, -2.0, 3.0, 0.6, 0.8], (NODES.size, 1))
-    tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full(4, np.inf))))
+    tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full((2, 4), np.inf))))
     np.testing.assert_allclose(tally.largest, [1.0, 2.0, 3.0, 1.0], rtol=1e-14)
     np.testing.assert_allclose(tally.mean, [1.0, 2.0, 3.0, 1.0], rtol=1e-13)
     np.testing.assert_allclose(tally.relative, 0.0, atol=1e-13)
     ramp, slope = NODES[:, None] * np.ones(5), np.ones((NODES.size, 5))
-    tally = tallied(*map(jnp.asarray, (NODES, ramp, slope, 2.0, 1.0, np.full(4, np.inf))))
+    tally = tallied(*map(jnp.asarray, (NODES, ramp, slope, 2.0, 1.0, np.full((2, 4), np.inf))))
     np.testing.assert_allclose(tally.relative[:3], 0.5, rtol=1e-12)
     np.testing.assert_allclose(pointing.drift(tally)[:3], 7.0, rtol=1e-12)  # eight windows of 1 s
     np.testing.assert_allclose(tally.mean[:3], 9.5, rtol=1e-12)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
@@ -46,6 +46,7 @@ def test_verdict_on_a_single_run(value, ok, met):
 
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.floats(), st.booleans()), min_size=1, max_size=20))
+@example([(9e307, True)])  # beyond what a share of the limit can say
 def test_a_verdict_is_what_each_trial_says(trials):
     told = verdict([value for value, _ in trials], [ok for _, ok in trials])
     assert told.failures == sum(not (ok and value <= LIMIT) for value, ok in trials)

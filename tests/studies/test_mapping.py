@@ -136,6 +136,14 @@ def test_borders_are_drawn_over_period_and_delta_only():
         lines = mapping.lines(scenario.replace(loaded, loop__clock=clock), x, y)
         delta, period = lines[f"$\\delta = (\\eta - {label}) h$"]
         np.testing.assert_allclose(delta, factor * np.asarray(period))
+    lines = mapping.lines(
+        scenario.replace(loaded, controller__sampling="implicit"), x, y
+    )  # with the border that is gone
+    np.testing.assert_allclose(
+        lines["$\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
+    )
+    delta, period = lines["with a period of delay"]
+    assert np.all(delta < mapping.lines(loaded, x, y)["the same with a period of delay"][0])
     assert not mapping.lines(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert not mapping.lines(third, x, y)  # another law, another border

@@ -96,7 +96,7 @@ QUESTIONS = (
         1,
         logarithmic=False,
         limit="gain_margin",
-        note="Drawn: gain, of the worst axis in hold; one that is asked for: the worst that was judged.",
+        note="Drawn: gain, of the worst axis in hold; one asked for: the worst that was judged. Below 0: unstable.",
     ),
     Question(
         "What if the model is wrong?",
@@ -205,8 +205,16 @@ WORDS = {
 }
 
 
-def best(summary: Summary) -> str | None:
-    """The law with the smallest error of those that meet every requirement."""
+def winner(summary: Summary) -> str:
+    """Which law has the smallest error of those that meet every requirement, and how far the paper's is behind it."""
     met = {law: found["window_error"] for law, found in summary["laws"].items() if found["met"]}
     known = {law: error for law, error in met.items() if error is not None}
-    return min(known, key=lambda law: known[law]) if known else None
+    if not known:
+        return "no law meets every requirement"
+    best, ours = min(known, key=lambda law: known[law]), "prescribed_time"
+    behind = f"; {_name(ours)} has {known[ours] / known[best]:.3g} times that" if best != ours and ours in known else ""
+    return f"smallest error of those that meet every requirement: {_name(best)}, {known[best]:.2e}{behind}"
+
+
+def _name(law: str) -> str:
+    return law.replace("_", " ")

@@ -154,7 +154,8 @@ def _digest(script: str) -> str:
 
 
 def _table(made: sentences.Table, note: str = "") -> Block:
-    return Block("table", head=made.head, rows=made.rows, note=note)
+    numbers = all(row[-1][:1] in "-0123456789" for row in made.rows)  # the last column, which else is words or a unit
+    return Block("table", head=made.head, rows=made.rows, note=note, shape="numbers" if numbers else "")
 
 
 def _text(lines: Iterable[str]) -> Block:
@@ -292,10 +293,9 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
     lines = [f"each law tuned alike, all of its gains free, judged on {judged}"]
-    best = law_sentences.best(summary)
-    said = f"smallest error of those that meet every requirement: {best.replace('_', ' ')}" if best else ""
-    lines.append(said or "no law meets every requirement")
-    meets = {"met": "The tuned law meets every requirement", "not met": "The tuned law does NOT meet every requirement"}
+    lines.append(law_sentences.winner(summary))
+    meets = {"met": "The paper's law, tuned, meets every requirement",
+             "not met": "The paper's law, tuned, does NOT meet every requirement"}  # fmt: skip
     mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
     headline = meets.get(summary["status"], "Interrupted: the best so far")
     lines += sentences.cautions(summary)

@@ -299,7 +299,12 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
     from tuning.search.gains import units
 
     known, rows = units(kind), list[tuple[str, ...]]()
-    for table, prefix in (("controller", ""), ("observer", "observer_"), ("filter", "filter_")):
+    for table, prefix in (
+        ("controller", ""),
+        ("observer", "observer_"),
+        ("filter", "filter_"),
+        ("sensors", "sensors_"),
+    ):
         for key, value in scenario.get(table, {}).items():
             numbers = value if isinstance(value, list) else [value]
             said = ", ".join(f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers)

@@ -118,7 +118,8 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     say(f"comparison {how}: {alike}")
     for one in law_sentences.answers(summary):
         table(one.table, title=one.title, title_justify="left")
-    say(*law_sentences.lines(summary), *sentences.cautions(summary), f"results in {folder}")
+    said = [law_sentences.winner(summary), *law_sentences.lines(summary)]
+    say(*said, *sentences.cautions(summary), f"results in {folder}")
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:

@@ -15,7 +15,7 @@ from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.gains import AXIS, of_law, of_observer, on_every_axis
+from ptsmc_jax.simulation.gains import AXIS, SENSORS, of_law, of_observer, of_sensors, on_every_axis
 from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
 from ptsmc_jax.simulation.gains import own as own
@@ -42,7 +42,9 @@ def units(plant: str) -> dict[str, str]:
 def units_of(scenario: Scenario) -> dict[str, str]:
     """The unit of each gain of a scenario, those of a law or an observer of one's own among them."""
     found = units(scenario.plant.kind)
-    for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_")):
+    for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_"), (scenario.sensors, SENSORS)):
+        if table is None:
+            continue
         named = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}
         found |= {name: unit for name, unit in named.items() if name in table.gains}
     return found
@@ -64,6 +66,7 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
     """The scenario with other gains, checked; all else stays, defaults too, and with another t_f the time after it."""
     changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
     changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
+    changes |= {f"sensors__{name}": value for name, value in of_sensors(gains).items()}
     each = on_every_axis(gains, list(getattr(scenario.observer, "gain", ())))
     if each is not None:
         changes["observer__gain"] = each
@@ -105,4 +108,5 @@ def papers(scenario: Scenario) -> Scenario:
 
 def differ(one: Scenario, other: Scenario) -> bool:
     """Whether two scenarios fly another law or other gains."""
-    return any(getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "estimator"))
+    kept = ("controller", "observer", "estimator", "sensors")
+    return any(getattr(one, name) != getattr(other, name) for name in kept)

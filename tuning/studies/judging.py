@@ -68,6 +68,8 @@ def judged_on(flown: Scenario) -> str:
     """What a scenario was flown on to be judged, in words."""
     if flown.loop.mode != "sampled":
         return "the continuous loop"
+    if getattr(flown.controller, "implicit", False):
+        return "flight clock, the sign solved for"
     width = getattr(flown.controller, "sign_width", None)
     if width is None:
         return "flight clock"

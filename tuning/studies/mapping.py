@@ -188,15 +188,18 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
-    labels = {f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$": 0.0, "the same with a period of delay": 1.0}
-    if scenario.controller.implicit:  # without delay it has no border
-        labels = {"with a period of delay": 1.0}
-    if delay > 1:
-        labels[f"with {delay} periods of delay"] = float(delay)
+    implicit, border = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
+    late = {"a period": 1.0} | ({f"{delay} periods": float(delay)} if delay > 1 else {})
+    if implicit:  # without delay it has no border: where it would be is drawn
+        asked = {f"{border}, of explicit sampling only": (0.0, False)}
+        asked |= {f"with {how_long} of delay": (by, True) for how_long, by in late.items()}
+    else:
+        asked = {border: (0.0, False)}
+        asked |= {f"the same with {how_long} of delay": (by, False) for how_long, by in late.items()}
     found = {}
-    for label, delay in labels.items():
-        how = {"anchored": anchored, "implicit": scenario.controller.implicit}
-        delta = np.array([borders.smallest_delta(eta, float(period), delay, **how) for period in h])
+    for label, (by, backward) in asked.items():
+        how = {"anchored": anchored, "implicit": backward}
+        delta = np.array([borders.smallest_delta(eta, float(period), by, **how) for period in h])
         found[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return found
 
