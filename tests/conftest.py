@@ -43,10 +43,10 @@ MANY = 25_000  # mappings of memory; Linux allows a process 65 530, and a compil
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
 LONGEST = """
     cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements test_conformity
-    campaigns/test_plans search/test_tuning laws/test_chain cli/test_campaign_commands search/test_worst
-    batching/test_lanes simulation/test_rollout theory/test_margins dispersions/test_misfits plants/test_systems
-    devices/test_hardware paper/test_paper studies/test_mapping campaigns/test_montecarlo test_docs
-    campaigns/test_campaign_processes theory/test_covariance batching/test_kernel theory/test_theory
+    campaigns/test_campaign_processes search/test_tuning campaigns/test_plans cli/test_campaign_commands
+    search/test_worst batching/test_lanes simulation/test_rollout theory/test_margins paper/test_paper
+    dispersions/test_misfits plants/test_systems devices/test_hardware studies/test_mapping laws/test_chain
+    campaigns/test_montecarlo theory/test_covariance batching/test_kernel test_docs theory/test_theory
 """.split()
 TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # tune by the same programs, in one worker
 assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
