@@ -185,30 +185,31 @@ def slew_times(slews: Sequence[Any], units: Mapping[str, str], limits: Mapping[s
 
     Slews have t_f, rms, interval, costs by metric and meets; units and limits by metric.
     """
-    names = ["window_error", *slews[0].costs]
-    columns = 3
-    figure = Figure(figsize=(10.5, 3.0 * -(-len(names) // columns)), layout="constrained")
-    figure.suptitle("What a faster slew costs, fresh trials")
-    times = [slew.t_f for slew in slews]
-    for k, name in enumerate(names):
-        axes = figure.add_subplot(-(-len(names) // columns), columns, k + 1)
-        values = [slew.rms if name == "window_error" else slew.costs[name] for slew in slews]
-        axes.plot(times, values, "-", color=STYLES[0][0], lw=1.2)
-        for met, fill in ((True, STYLES[0][0]), (False, "white")):
-            some = [(t, v) for t, v, slew in zip(times, values, slews, strict=True) if slew.meets == met]
-            said = "meets every requirement" if met else "does not"
-            axes.plot(*zip(*some, strict=True) if some else ([], []), "o", ms=5, mfc=fill, mec=STYLES[0][0], label=said)
-        if name == "window_error":
-            low, high = zip(*(slew.interval or (slew.rms, slew.rms) for slew in slews), strict=True)
-            axes.fill_between(times, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
-            axes.legend(fontsize=8)
-        if np.all(np.asarray(values) > 0.0):
-            axes.set_yscale("log")
-        if name in limits:
-            axes.axhline(limits[name], color="0.3", lw=1.0, ls=(0, (6, 3)))
-        title = "RMS window error" if name == "window_error" else f"{name.replace('_', ' ')}, largest"
-        axes.set_title(f"{title} [{units[name]}]", fontsize=10)
-        axes.set_xlabel("prescribed time t_f [s]")
+    names, columns = ["window_error", *slews[0].costs], 3
+    rows, times = -(-len(names) // columns), [slew.t_f for slew in slews]
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(10.5, 3.0 * rows), layout="constrained")
+        figure.suptitle("What a faster slew costs, fresh trials")
+        for k, name in enumerate(names):
+            axes, error = figure.add_subplot(rows, columns, k + 1), name == "window_error"
+            values = [slew.rms if error else slew.costs[name] for slew in slews]
+            axes.plot(times, values, "-", color=STYLES[0][0], lw=1.2)
+            for met, fill, label in ((True, STYLES[0][0], "meets every requirement"), (False, "white", "does not")):
+                some = [(t, v) for t, v, slew in zip(times, values, slews, strict=True) if slew.meets == met]
+                at = zip(*some, strict=True) if some else ([], [])
+                axes.plot(*at, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
+            if error:
+                low, high = zip(*(slew.interval or (slew.rms, slew.rms) for slew in slews), strict=True)
+                axes.fill_between(times, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
+                axes.legend(fontsize=8)
+            if np.all(np.asarray(values) > 0.0):
+                axes.set_yscale("log")
+                plain_ticks(axes.yaxis)
+            if name in limits:
+                axes.axhline(limits[name], color="0.3", lw=1.0, ls=(0, (6, 3)))
+            title = "RMS window error" if error else f"largest {name.replace('_', ' ')}"
+            axes.set_title(f"{title} [{units[name]}]", fontsize=10)
+            axes.set_xlabel("prescribed time t_f [s]", fontsize=10)
     return figure
 
 
