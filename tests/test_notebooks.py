@@ -71,6 +71,7 @@ def ends(widget):
 def test_every_slider_moves_to_both_ends(source, monkeypatch, capsys):
     """Each by itself, and all together, of the flight that the notebook flies; few trials a stop."""
     kept = []
+    monkeypatch.chdir(source.parent)  # where a kernel runs
     monkeypatch.setattr("ipywidgets.interact", lambda function, **widgets: kept.append((function, widgets)))
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
     cells = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code"]

@@ -65,6 +65,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         sensors = known.sensors.with_bandwidth(gains["filter_bandwidth"], known.clock.period)
         parts = replace(parts, sensors=sensors)
     if "command_corner" in gains:
+        assert parts.command_filter is not None  # `_check_names`
         parts = replace(parts, command_filter=replace(parts.command_filter, corner=gains["command_corner"]))
     _check_clock(parts)
     return parts

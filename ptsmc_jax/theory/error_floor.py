@@ -166,7 +166,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     if said.start is not None:
         rows, covariance = said.start
         start = _corrected(start, wide(rows) @ start, root(covariance))
-    lengths = np.asarray(ticks.t_next - ticks.t)
+    lengths, sample = np.asarray(ticks.t_next - ticks.t), np.asarray(ticks.sample)
     walk = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
     drift = np.diag(np.concatenate([np.zeros(n), said.own_drift, walk]))[:, n:]
     move = np.tile(np.eye(size), (periods, 1, 1))
@@ -175,8 +175,8 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
     return Model(
         start=start,
-        rows=wide(said.rows_at(ticks.sample, np.append(0.0, lengths[:-1]))),
-        noise=np.where(said.there(ticks.sample), said.noise, np.inf),
+        rows=wide(said.rows_at(sample, np.append(0.0, lengths[:-1]))),
+        noise=np.where(said.there(sample), said.noise, np.inf),
         kick=lengths[:, None, None] * drift,
         move=move,
         output=output,

@@ -166,9 +166,7 @@ def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sampl
     def errors(trial):
         def one(memory, k):
             dt = jnp.where(k > 0, 0.25, 0.0)
-            ahead = sensor.filter.propagate(
-                memory.estimate, memory.rate, sensor.sample(memory, rest, tick(k), dt)[0].w, dt
-            )
+            ahead = found.propagate(memory.estimate, memory.rate, sensor.sample(memory, rest, tick(k), dt)[0].w, dt)
             _, after = sensor.measure(memory, rest, tick(k), dt, rest)
             return after, jnp.stack([2 * ahead.q[:3], ahead.bias - after.bias])
 

@@ -92,7 +92,7 @@ def times_of(option: str, value: str) -> tuple[float, ...]:
         found = tuple(sorted(float(part) for part in value.split(",")))
     except ValueError:
         found = ()
-    if len(set(found)) < 2 or len(set(found)) != len(found) or not (found[0] > 0.0 and found[-1] < float("inf")):
+    if len(found) < 2 or len(set(found)) < len(found) or not all(0.0 < t_f < float("inf") for t_f in found):
         raise UsageError(f"{option} is {value}, but must be two times or more in s, all different, such as 20,30,45")
     return found
 
