@@ -46,11 +46,17 @@ class _Asked:
 
     def __call__(self, method: str, function: Callable, *args: Any) -> Any:
         try:
-            returned = function(*args)
-            return jax.tree.map(jnp.asarray, returned)
+            returned = jax.tree.map(jnp.asarray, function(*args))
+            _trace(function, args)
+            return returned
         except Exception as error:
             file = inspect.getsourcefile(self._made) or ""
-            raise ScenarioError(f"{self._said} {method} fails: {systems.failure(error, file)}") from None
+            told = f"fails: {systems.failure(error, file)}"
+            if isinstance(error, _TRACED):
+                told = (
+                    f"needs the value of a number that is known in flight only{systems.line(error, file)}; {_INSTEAD}"
+                )
+            raise ScenarioError(f"{self._said} {method} {told}") from None
 
     def refused(self, method: str, returns: str, must: str) -> ScenarioError:
         """The error for what a method returns."""
@@ -69,6 +75,20 @@ class _Asked:
         was, now = (jax.tree.map(_kind, tree) for tree in (before, after))
         if was != now:
             raise self.refused(method, f"a memory {now}", f"one as begin does, {was}")
+
+
+_TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_INSTEAD = "allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
+
+
+def _trace(function: Callable, args: tuple) -> None:
+    """Raise what a method raises as it is flown, where its arguments and its own fields are traced."""
+    own = getattr(function, "__self__", function)
+    if jax.tree_util.all_leaves([own]):  # what is no pytree has no fields to trace
+        jax.eval_shape(function, *args)
+        return
+    called = getattr(function, "__func__", type(own).__call__)
+    jax.eval_shape(lambda own, args: called(own, *args), own, args)
 
 
 def _kind(value: Any) -> str:

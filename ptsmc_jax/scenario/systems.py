@@ -82,10 +82,14 @@ def item(where: str, allowed: str) -> object:
 
 def failure(error: BaseException, place: str) -> str:
     """What went wrong in code of one's own, in one line: the error, and the last line of that file that led to it."""
-    said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-    walked = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    lines = [line for file, line in walked if os.path.realpath(file) == os.path.realpath(place)]
-    return f"{said} (line {lines[-1]} of {Path(place).name})" if lines else said
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}{line(error, place)}"
+
+
+def line(error: BaseException, place: str) -> str:
+    """The last line of a file that led to an error, in parentheses after a space; nothing where none of it did."""
+    walked = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(error.__traceback__)]
+    numbers = [number for file, number in walked if os.path.realpath(file) == os.path.realpath(place)]
+    return f" (line {numbers[-1]} of {Path(place).name})" if numbers else ""
 
 
 def digest(where: object) -> str | None:

@@ -26,6 +26,11 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
         ("controller.eta", "3", ""),
         ("observer.gain", "1, 2, 3", "N m s"),
     ]
+    own = {"controller": {"kind": "own", "t_f": 30.0, "k": 2.0}}  # whose class may say another unit than a built-in k
+    assert sentences.flown_gains(own, "spacecraft").rows[1:] == [
+        ("controller.t_f", "30", "s"),
+        ("controller.k", "2", ""),
+    ]
 
 
 def test_a_comparison_says_which_requirement_each_law_breaks_and_in_how_many_trials():

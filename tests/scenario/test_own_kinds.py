@@ -226,6 +226,14 @@ BAD = [
         changed("return 0.5 * wanted", "return jnp.log(-1.0) * wanted"), {},
         "returns an acceleration [nan]", "finite numbers",
     ),
+    (
+        changed("return 0.5 * wanted", "return wanted if wanted[0] > 9.0 else 0.5 * wanted"), {},
+        "acceleration needs the value of a number that is known in flight only (line", "jax.numpy.where in place of if",
+    ),
+    (
+        changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
+        "acceleration needs the value", "jax.numpy in place of numpy and float()",
+    ),
     (changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {}, "the gain eta has no bounds", "usual=(lower, upper)"),
     (
         changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},

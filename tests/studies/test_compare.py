@@ -333,3 +333,10 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 trials" in lines
         assert not [line for line in lines if "delay_margin" in line]
     assert "no law meets every requirement" in page.build(tmp_path / "out")
+
+
+def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):
+    status, _, err = command("compare", "s.toml", "--law", "gone.py:Mine")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "gone.py is not there" in err
+    assert not (tmp_path / "out").exists()

@@ -284,6 +284,8 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = _with_tune(loaded)
+    if law:  # before a folder is begun
+        comparing.that_fly(loaded, comparing.Rivals((), law))
     known_by = comparing.identity(loaded, seed, rivals)
     return _search(
         loaded, folder, known_by, force, quiet, "",

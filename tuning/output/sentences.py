@@ -299,16 +299,14 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
     from tuning.search.gains import units
 
     known, rows = units(kind), list[tuple[str, ...]]()
-    for table, prefix in (
-        ("controller", ""),
-        ("observer", "observer_"),
-        ("filter", "filter_"),
-        ("sensors", "sensors_"),
-    ):
+    prefixes = {"controller": "", "observer": "observer_", "filter": "filter_", "sensors": "sensors_"}
+    for table, prefix in prefixes.items():
+        own = scenario.get(table, {}).get("kind") == "own"  # its class, which reading does not run, has the units
         for key, value in scenario.get(table, {}).items():
             numbers = value if isinstance(value, list) else [value]
             said = ", ".join(f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers)
-            rows.append((f"{table}.{key}", said, known.get(prefix + key, "").replace("-", "")))
+            unit = "" if own and key not in ("t_f", "delta") else known.get(prefix + key, "").replace("-", "")
+            rows.append((f"{table}.{key}", said, unit))
     return Table(("key", "value", "unit"), rows)
 
 

@@ -147,6 +147,17 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
     return found
 
 
+def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
+    """The contenders; raises ScenarioError where one cannot fly: before hours of search, not after."""
+    found = contenders(scenario, rivals)
+    for law, posed in found.items():
+        try:
+            study(posed)
+        except ScenarioError as error:
+            raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
+    return found
+
+
 def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
     """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
     if tune.objective != T_F:
@@ -187,12 +198,7 @@ def compare(
 ) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
     fresh_seed = judging.seed_of_judge(seed)
-    rivals = contenders(scenario, against)
-    for law, posed in rivals.items():
-        try:
-            study(posed)
-        except ScenarioError as error:  # before hours of search, not after
-            raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
+    rivals = that_fly(scenario, against)
     others, refused = judging.beside(scenario)
     made = {}
     if "paper" in others:
