@@ -87,6 +87,11 @@ def test_the_worst_come_first_failed_ones_before_all():
     assert statistics.most_extreme(values, failed, 4).tolist() == [3, 1, 4, 2]
 
 
+def test_the_bound_of_a_mean_of_shares_is_a_share():
+    """Nearly all of them one: so far beyond the mean there is none."""
+    assert statistics.mean_bound(np.append(np.ones(40), [0.5, 0.9]), 0.99) == 1.0
+
+
 def test_the_bound_of_a_mean_is_clopper_and_pearsons_of_zeros_and_ones():
     for ones, n, confidence in ((0, 852, 0.9), (0, 1109, 0.95), (3, 1000, 0.95), (60, 1000, 0.9)):
         shares = np.zeros(n)

@@ -63,6 +63,12 @@ def test_a_limit_below_the_disturbance_cannot_be_kept():
     assert str(found) == "no t_f up to 100 times the scenario's keeps these gains below the limit of 0.009"
 
 
+def test_the_sentence_says_what_simulation_found():
+    said = "shortest t_f for a limit of 0.5 with these gains: 20.12 s by theory"
+    assert design.text(0.5, 20.1234, 20.5) == f"{said}, 20.5 s as flown"
+    assert design.text(0.5, 20.1234, None) == f"{said}; none found by simulation"
+
+
 def test_shortest_time_of_a_chain():
     chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
     found = design.shortest_time(chain, 5.0, 0, np.arange(1))
