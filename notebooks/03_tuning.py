@@ -19,11 +19,14 @@ from ptsmc_jax.configure import configure
 
 configure()
 
+from IPython.display import display
+
 import ptsmc_jax as ptsmc
 from ptsmc_jax.explore import Figures
 from ptsmc_jax.figures import study_plots
 from tuning.output import terminal
-from tuning.studies import pareto, tune_files, tuner
+from tuning.search import gains
+from tuning.studies import pareto, stability, tune_files, tuner
 
 flight = ptsmc.read("../scenarios/first_flight.toml")
 small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
@@ -68,6 +71,43 @@ Figures({"tradeoff": made["tradeoff"]})
 # %%
 front = pareto.trace(small, 0, 4)
 Figures({"front": study_plots.front(front.points, front.others, 0.5, ("-", "N m"))})
+
+# %% [markdown]
+# Click a point: its gains, its margins in hold and before the hand-over, and one flight with it. What stands below is the knee; the
+# front that can be clicked follows where `ipywidgets`, `plotly` and `anywidget` are installed.
+
+
+# %%
+def chosen(point):
+    flown = gains.in_scenario(small, point.gains)
+    print("gains:", ", ".join(f"{name} = {value:.4g}" for name, value in point.gains.items()))
+    for where, least in stability.worst(ptsmc.study(flown)).items():
+        print(where, {name: least[name] for name in ("gain_margin", "phase_margin")}, "dB and deg; None: unlimited")
+    return ptsmc.simulate(flown, trial=7).plot("error", "torque")
+
+
+def clicked(trace, places, state):
+    with below:
+        below.clear_output(wait=True)
+        display(chosen(front.points[places.point_inds[0]]))
+
+
+display(chosen(next(point for point in front.points if point.knee)))
+try:
+    from ipywidgets import Output, VBox
+    from plotly import graph_objects
+
+    drawn = graph_objects.FigureWidget(
+        graph_objects.Scatter(
+            x=[one.peak for one in front.points], y=[one.rms for one in front.points], mode="markers"
+        ),
+        {"xaxis_title": "peak torque [N m]", "yaxis_title": "RMS window error [-]", "yaxis_type": "log"},
+    )
+    below = Output()
+    drawn.data[0].on_click(clicked)
+    display(VBox([drawn, below]))
+except ImportError:
+    pass
 
 # %% [markdown]
 # One command, and the accuracy that noise had taken is back at a fraction of the torque; a page to send comes from

@@ -20,9 +20,16 @@ executed = importlib.import_module("execute").executed
 SOURCES = sorted((ROOT / "notebooks").glob("0*.py"))
 
 
-def test_all_five_are_there():
+def test_all_six_are_there():
     names = [path.stem for path in SOURCES]
-    assert names == ["01_paper", "02_sampling_and_noise", "03_tuning", "04_monte_carlo", "05_your_own_plant"]
+    assert names == [
+        "01_paper",
+        "02_sampling_and_noise",
+        "03_tuning",
+        "04_monte_carlo",
+        "05_your_own_plant",
+        "06_gradients",
+    ]
 
 
 # what makes a cell smaller, of the notebooks whose cells fly much
