@@ -137,11 +137,15 @@ def _smallest(values: Array) -> tuple[Array, Array]:
 
 
 def real_at(seen: Array) -> tuple[Array, Array]:
-    """Between which points L [-] is real and negative, bool, and ln of the gain with which it is -1 there."""
+    """Between which points L [-] is real and negative, bool, and ln of the gain with which it is -1 there.
+
+    What no gain below `MOST` brings to -1 counts for nothing: so large an L is rounding, next to poles at 1.
+    """
     real, imag = seen.real, seen.imag
     share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
     crossing = real[:-1] + share * (real[1:] - real[:-1])
-    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < 0.0)
+    limit = 10.0 ** (MOST / 20.0)
+    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit)
     return there, -jnp.log(jnp.where(there, -crossing, 1.0))
 
 

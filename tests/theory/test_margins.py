@@ -11,7 +11,7 @@ from scipy import optimize, signal
 from ptsmc_jax import scenario
 from ptsmc_jax.plants import second_order
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import borders, linear, margins
+from ptsmc_jax.theory import borders, crossings, linear, margins
 from tests.helpers import short
 from tuning.search.gains import with_gains
 
@@ -280,3 +280,11 @@ def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
     for mean, several in zip(jax.tree.leaves(means), jax.tree.leaves(each), strict=True):
         np.testing.assert_allclose(mean[0], np.mean(several, axis=0), rtol=1e-12, atol=1e-15)
     assert np.ptp(each.a, axis=0).max() > 1e-6
+
+
+def test_rounding_next_to_a_pole_at_one_is_no_crossing():
+    """Where L is as large as 1e9, beside the poles of stored momentum, its sign is noise: no gain brings it to -1."""
+    seen = jnp.asarray([-1e9 + 1e8j, -1e9 - 1e8j, 3.0 - 3.0j, -2.0 - 1.0j, -2.0 + 3.0j])
+    there, factor = crossings.real_at(seen)
+    assert there.tolist() == [False, False, False, True]
+    assert factor[-1] == pytest.approx(-np.log(2.0), rel=1e-12)
