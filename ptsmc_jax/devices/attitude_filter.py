@@ -131,7 +131,7 @@ def attitude_filter(
 
 
 def cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    """Lower factor of a covariance; without derivatives that are not finite where there is no noise."""
+    """Lower factor (2, 2) of a covariance, in the units of its roots; its derivatives are finite without noise, too."""
     (a, b), (_, d) = covariance
     first = guards.sqrt(jnp.maximum(a, 0.0))
     along = jnp.where(first > 0.0, b / jnp.where(first > 0.0, first, 1.0), 0.0)

@@ -75,7 +75,7 @@ class Reading(NamedTuple):
     slopes: np.ndarray | None = None  # (m, n + own) rates of what is read, where it is read at own times
 
     def there(self, sample: np.ndarray) -> np.ndarray:
-        """Whether control samples (N,), by their numbers, have each of the readings, (N, m)."""
+        """Whether control samples (N,), by their numbers, have each of the readings, (N, m) bool [-]."""
         found = sample[:, None] % np.maximum(self.every, 1) == 0
         if self.own_times is None:
             return found
