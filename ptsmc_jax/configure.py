@@ -53,13 +53,15 @@ def configure(
     XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
     first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
     of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in
-    which no code is patched, see `ptsmc_jax.programs`. Call it before anything runs on JAX; later it raises
-    RuntimeError where the backend has already started with something else.
+    which no code is patched, see `ptsmc_jax.programs`. Called before JAX is imported, it also silences what XLA says to
+    stderr by itself ("Very slow compile?" after two minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before
+    anything runs on JAX; later it raises RuntimeError where the backend has already started with something else.
     """
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     flags = os.environ.get("XLA_FLAGS", "")
     if fast and "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when jaxlib is loaded; what is fatal is still said
     global programs, _called
     _called = True
     programs = folder / "programs" if keep_programs and folder is not None else None

@@ -33,6 +33,14 @@ def test_options_are_written_as_xla_reads_them():
     assert setup._flags(()) == ""
 
 
+@pytest.mark.parametrize("said", ["", "elsewhere"])
+def test_the_cache_lies_where_the_desktop_standard_says(tmp_path, monkeypatch, said):
+    """$XDG_CACHE_HOME, or ~/.cache where that is not set or empty."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / said) if said else "")
+    assert setup._cache_folder().parent == tmp_path / (said or ".cache") / "ptsmc-jax"
+
+
 def test_the_verdict_is_kept_and_not_asked_for_again(tried, tmp_path):
     assert setup._accepted(tmp_path) == GOOD
     assert setup._accepted(tmp_path) == GOOD
@@ -99,13 +107,26 @@ def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bits_and_device_are_set():
-    code = (
-        "from ptsmc_jax.configure import configure; configure(device='cpu', bits=32); "
+WATCHING = """
+import os, sys
+class Watching:
+    def find_spec(self, name, *_):
+        if name == "jaxlib":
+            print(os.environ["TF_CPP_MIN_LOG_LEVEL"])
+sys.meta_path.insert(0, Watching())
+"""
+
+
+def test_bits_and_device_are_set_and_the_compiler_is_silent():
+    """XLA's log ("Very slow compile?") is off when jaxlib is looked for, which reads its level once."""
+    code = WATCHING + (
+        "from ptsmc_jax.configure import configure; configure(device='cpu', bits=32)\n"
         "import jax; print(jax.numpy.zeros(1).dtype, jax.config.jax_platforms)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == "float32 cpu\n"
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    call = [sys.executable, "-c", code]
+    done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "3\nfloat32 cpu\n"
 
 
 def test_a_cache_that_rejects_its_own_entries_is_told_of_once(capsys, tmp_path):

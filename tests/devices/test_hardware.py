@@ -60,6 +60,47 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
             np.testing.assert_allclose(second[0], area, rtol=0, atol=1e-6)
 
 
+def commanded(device, u, *, v=None, h=None, dt=0.1):
+    """The drive that a command becomes in one period from t = 0, and what the channels have come to at its end."""
+    state = actuators.ActuatorState(None, None if v is None else vector(v), None if h is None else vector(h))
+    t, dt, rest = vector(0.0), vector(dt), vector([0.0] * 3)
+    drive, queue = device.command(state, vector(u), rest, t, dt, vector(1.0))
+    return drive, device.end(state, drive, queue, dt)
+
+
+@pytest.mark.parametrize("lag", [None, 0.05])
+def test_a_command_is_limited_once_one_axis_is_out_of_reach(lag):
+    """A rate limit R brings an axis at most R (dt + lag) nearer: with the lag, v' = (c - v) / lag stays below R."""
+    device = actuators.Actuators(rate_limit=vector(2.0), lag=None if lag is None else vector(lag))
+    most = 2.0 * (0.1 + (lag or 0.0))
+    for far, limited in ((0.99 * most, False), (1.01 * most, True)):
+        assert bool(commanded(device, [far, 0.0, -0.1], v=[0.0] * 3)[0].limited) == limited
+
+
+@pytest.mark.parametrize("lag", [None, 0.08])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_wheels_end_a_period_at_their_limit_of_momentum(lag, way):
+    """h' = -v: what asks for more than is left there, whichever way, is cut to what ends the period exactly there."""
+    wheels = reaction_wheels.wheels(np.eye(3), None, momentum_limit=0.5)
+    device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=wheels)
+    v = None if lag is None else [0.3 * way] * 3
+    drive, end = commanded(device, [50.0 * way] * 3, v=v, h=[0.2, -0.3, 0.0])
+    np.testing.assert_allclose(end.h, [-0.5 * way] * 3, rtol=1e-13)
+    assert drive.limited
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])
+def test_effort_follows_what_a_lag_delivers_within_the_period(share):
+    """Integral of c - (c - v) exp(-s/lag), which keeps its sign: Simpson is off by dt^5/2880 of its fourth slope."""
+    lag, v, c, u = 0.2, vector([0.1, -0.4, 0.0]), vector([0.5, -0.2, 0.3]), vector([0.0] * 3)
+    dt = share * lag
+    device = actuators.Actuators(lag=vector(lag))
+    torques = rollout._torques(device, actuators.Drive(v, c, None, jnp.asarray(False)), u, vector(dt))
+    got = dt * sum(w * np.sum(np.abs(at)) for w, at in zip(torques.weights, torques.delivered, strict=True))
+    exact = float(np.sum(np.abs(c * dt + (c - v) * lag * np.expm1(-share))))
+    assert 0.0 < abs(got - exact) < dt**5 / 2880 * float(np.sum(np.abs(c - v))) / lag**4
+
+
 def test_quantisation_rounds_and_lets_the_slope_through():
     u = vector([0.024, -0.036, 0.0])
     np.testing.assert_allclose(actuators.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)

@@ -106,6 +106,14 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
 
 
+@pytest.mark.parametrize(("status", "asked", "mood"), [
+    ("met", True, "good"), ("met", False, "calm"), ("ok", False, "calm"),
+    ("diverged", False, "bad"), ("not met", False, "bad"), ("interrupted", True, "bad"),
+])  # fmt: skip
+def test_what_failed_looks_bad_whether_or_not_anything_was_asked(status, asked, mood):
+    assert page._verdict({"status": status}, [], asked).mood == mood
+
+
 def hostile_folder(flown):
     """The same result as a user could have named everything in it."""
     folder = flown.with_name(re.sub("/", "", HOSTILE))

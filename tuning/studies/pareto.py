@@ -254,11 +254,8 @@ def _beats(one: tuple[Point, Trials], other: tuple[Point, Trials]) -> bool:
 
 def knee_of(points: np.ndarray) -> int:
     """Which of the points (count, 2), in order along a front, lies farthest below the line between its ends, in log."""
-    logs = np.log(points)
-    span = np.ptp(logs, axis=0)
-    unit = (logs - logs.min(axis=0)) / np.where(span > 0.0, span, 1.0)
-    along = unit[-1] - unit[0]
-    off = unit - unit[0]
+    off = np.log(points) - np.log(points[0])
+    along = off[-1]  # scaling an axis changes all distances by one factor
     return int(np.argmax(off[:, 0] * along[1] - off[:, 1] * along[0]))
 
 
