@@ -43,7 +43,7 @@ HOUSE = {
             rollout
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
-        "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | margins | hold",
+        "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | rest | margins | hold",
         "scenario": """
             errors systems values
             attitude_keys dispersion_tables gain_record keys pointing_table scales

@@ -18,7 +18,7 @@ from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
-from ptsmc_jax.theory import linear, margins
+from ptsmc_jax.theory import linear, margins, rest
 
 TRIALS = 256  # whose loops are looked at, where inertias are drawn
 CALL = 32  # of them that are flown and linearised at once
@@ -30,19 +30,27 @@ BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 
 
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
-    """One for each margin that is asked of the loop of these parts, see `margins.judged`."""
+    """One for each margin that is asked of the loop of these parts, see `margins.judged`.
+
+    None is left where the nominal run does not come to rest, see `rest`.
+    """
     if not asked:
         return []
-    return _verdicts(asked, margins.judged_jit(parts)[0].worst())
+    found, hold, history = margins.judged_jit(parts)
+    if rest.swing(parts, history) is not None:
+        found = rest.none_left(found, hold)
+    return _verdicts(asked, found.worst())
 
 
 def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
     """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops.
 
-    rows: those of a plan, in place of the first trials.
+    rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one.
     """
     given = isinstance(rows, Row) and bool({INERTIA, *OF_MISFITS} & set(rows.given))
     if not ready.margins or not (given or differ(ready.dispersion)):
+        return of_loop(ready.parts, ready.margins)
+    if rest.swing(ready.parts) is not None:
         return of_loop(ready.parts, ready.margins)
     limits = {one.metric: one.limit for one in ready.margins}
     trials = np.arange(TRIALS) if rows is None else rows

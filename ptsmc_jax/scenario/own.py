@@ -160,6 +160,7 @@ def _with_keys(table: Any, found: Any) -> Any:
             if table.prefix + field.name == "observer_gain":
                 raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
             gains[table.prefix + field.name] = _bounds(field.name, about)
+            _inside(field, about.usual)
     first = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
     return msgspec.defstruct(
         found.__name__, keys, bases=(table,), frozen=True, kw_only=True,
@@ -211,6 +212,17 @@ def _key(field: dataclasses.Field, about: Any) -> tuple[Any, Any]:
 
 def _plain(value: object) -> typing.TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _inside(field: dataclasses.Field, usual: Any) -> None:
+    """Raise ValueError where the default of a gain lies outside its usual bounds, where these are two numbers."""
+    value = float(typing.cast(Any, field.default))
+    plain = isinstance(usual, tuple | list) and len(usual) == 2 and all(map(_plain, usual)) and usual[0] < usual[1]
+    if plain and not usual[0] <= value <= usual[1]:
+        raise ValueError(
+            f"the default of the gain {field.name} is {value:g}, but must be a number from {usual[0]:g} to "
+            f"{usual[1]:g}, its usual bounds"
+        )
 
 
 def _bounds(name: str, about: Any) -> GainBounds:

@@ -17,9 +17,10 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.theory import crossings, linear
+from ptsmc_jax.theory import crossings, linear, rest
 from ptsmc_jax.theory.crossings import MOST, SPLIT, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
+from ptsmc_jax.theory.rest import History, history
 
 Scalar = Float[Array, ""]
 
@@ -226,6 +227,7 @@ class Course(NamedTuple):
     at_input: Margins  # (times, m)
     at_sensors: Margins  # (k,) in hold
     together: dict[str, float]  # the same of all axes of the input at once, in hold
+    swing: rest.Swing | None = None  # by which the run does not come to rest in hold
 
     @property
     def hold(self) -> tuple[Loop, Margins]:
@@ -262,7 +264,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     it is no farther off than at the hand-over.
     """
     ticks, law = run.period.now, parts.controller
-    whole = ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    whole = rest.whole(parts, run)
     off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
     first = jnp.argmax(hold)
@@ -295,17 +297,18 @@ def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None 
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
-def judged_loops(parts: Parts) -> tuple[Loop, Array]:
+def judged_loops(parts: Parts, known: linear.Nominal | None = None) -> tuple[Loop, Array]:
     """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s]."""
-    run = linear.nominal(parts)
+    run = linear.nominal(parts) if known is None else known
     indices = moments(parts, run, judged_times(parts))
     return linear.loops_at(parts, run, indices), run.period.now.hold[indices]
 
 
-def judged(parts: Parts) -> tuple[Margins, Array]:
-    """Margins of `judged_loops`, (times + 1, m), and which are in hold; for any transformation."""
-    loops, hold = judged_loops(parts)
-    return of_each(loops), hold
+def judged(parts: Parts) -> tuple[Margins, Array, History]:
+    """Margins of `judged_loops`, (times + 1, m), which are in hold, and the run; for any transformation."""
+    run = linear.nominal(parts)
+    loops, hold = judged_loops(parts, run)
+    return of_each(loops), hold, history(parts, run)
 
 
 judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)

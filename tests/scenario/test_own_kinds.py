@@ -244,6 +244,7 @@ BAD = [
         "bounds of controller.k1 fail", "TypeError",
     ),
     (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number above 2"),
+    (changed("(2.1, 6.0)", "(3.1, 6.0)"), {}, "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
     (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "a number"),
     (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
     ("Mine = [3]", {}, "a list, which is not derived from", "ptsmc_jax.AccelerationLaw"),

@@ -31,7 +31,10 @@ def table(summary: Summary) -> Table:
 
 def lines(summary: Summary) -> Iterator[str]:
     """Whether the loop is stable, and what is least where it is judged."""
-    yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
+    if "swing" in summary:
+        yield _swings(summary["swing"])
+    else:
+        yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
     for counts in (True, False):
         times = sorted(one["time_to_go"] for one in summary["before"] if not one["stable"] and one["judged"] == counts)
         if not times:
@@ -53,6 +56,9 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
         if found is None or where not in found:
             continue
         known = found[where]
+        if "swing" in known:
+            yield _swings(known["swing"])
+            continue
         if not known["stable"]:
             yield f"the frozen loop is NOT stable {place}: what the model leaves out may cost the stability"
             continue
@@ -64,6 +70,14 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
         ]
         if few:
             yield f"less than {' and '.join(few)} {place}: what the model leaves out may cost the stability"
+
+
+def _swings(swing: Mapping[str, Any]) -> str:
+    return (
+        f"the nominal run does NOT come to rest in hold: without noise and disturbance its command still swings by "
+        f"{swing['size']:.3g} {swing['unit']} every {swing['periods']:.3g} control periods, as a sign does whose width "
+        "is too small for the period; a loop that swings by itself has no margins left, and they count as zero"
+    )
 
 
 def _shown(found: Mapping[str, Any]) -> str:

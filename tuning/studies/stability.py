@@ -10,8 +10,10 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.theory import margins
+from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.theory import margins, rest
 from ptsmc_jax.theory.margins import FIELDS, Course
+from ptsmc_jax.theory.rest import Swing
 
 _NO_SIGN = "the exact sign has no slope: it counts as if it were not there"
 
@@ -27,22 +29,41 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
             f"margins need slopes of the loop by all that it carries, but with controller.kind = "
             f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
         )
+    swing = rest.swing(ready.parts)
+    if swing is not None:
+        seen = jax.tree.map(lambda v: v[None], course.at_sensors)
+        course = course._replace(
+            at_input=rest.none_left(course.at_input, np.arange(len(course.t)) == len(course.t) - 1),
+            at_sensors=jax.tree.map(lambda v: v[0], rest.none_left(seen, [True])),
+            together=dict.fromkeys(FIELDS, float("nan")),
+            swing=swing,
+        )
     return ready, course
 
 
 def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """Margins of the worst axis "before" the hand-over, where they are judged, and in "hold".
 
-    None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable".
+    None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable"; where the
+    nominal run does not come to rest none are left in hold, and its `swing` stands there.
     """
     if ready.scenario.loop.mode != "sampled":
         return None
-    found, hold = jax.tree.map(np.asarray, margins.judged_jit(ready.parts))
+    found, hold, history = jax.tree.map(np.asarray, margins.judged_jit(ready.parts))
     if np.isnan(found.modulus[-1]).any():
         return None
+    swing = rest.swing(ready.parts, history)
+    if swing is not None:
+        found = rest.none_left(found, hold)
     places = {"before": ~hold, "hold": hold}
-    return {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in places.items()
+    each = {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in places.items()
             if rows.any()}  # fmt: skip
+    return each if swing is None else each | {"hold": {**each["hold"], **_swing(ready.scenario, swing)}}
+
+
+def _swing(scenario: Scenario, swing: Swing) -> dict[str, Any]:
+    unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
+    return {"swing": {**swing._asdict(), "unit": unit}}
 
 
 def _worst(found: margins.Margins) -> dict[str, Any]:
@@ -88,6 +109,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
         "said": _NO_SIGN if exact else None,
+        **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }
 
 
