@@ -343,6 +343,13 @@ def test_the_command_tunes_it(command, here, monkeypatch):
     found = tomllib.loads((here / "out/tune-s/tuned.toml").read_text())["controller"]
     assert 2.1 <= found["eta"] <= 6.0
     assert found["eta"] != 3.0
+    assert found["code"] == "mine.py:Mine"
+    (here / "out/tune-s").rename(here / "sent")  # to somebody who has no mine.py
+    (here / "mine.py").unlink()
+    assert command("simulate", "sent/tuned.toml", "--no-figures", "--quiet")[0] == 2
+    status, _, error = command("simulate", "sent/tuned.toml", "--no-figures", "--quiet", "--trust")
+    assert status in (0, 1)
+    assert error == f"ptsmc: runs {here}/sent/mine.py, which controller.code of sent/tuned.toml names\n"
 
 
 def test_a_law_flies_what_its_step_remembers():

@@ -246,3 +246,45 @@ def test_folders_that_nobody_could_have_made_are_refused_in_one_sentence(command
         code, out, error = command(asked[0], "theirs", *asked[1:])
         assert (code, out) == (2, ""), asked
         assert error.count("\n") == 1
+
+
+def _tables(*codes):
+    laws = [{"kind": "own", "code": str(code)} for code in codes]
+    return {"controller": laws[0], "disturbance": {"terms": laws[1:]}} if laws[1:] else {"controller": laws[0]}
+
+
+def test_a_folder_carries_the_files_that_its_scenario_names(tmp_path):
+    """Two files of one name, one of them named twice: two copies."""
+    made = tmp_path / "made"
+    made.mkdir()
+    for name, text in {"a": "x = 1\n", "b": "x = 2\n"}.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.py").write_text(text)
+    where = [f"{tmp_path}/a/mine.py:Law", f"{tmp_path}/b/mine.py:Push", f"{tmp_path}/a/mine.py:Pull", "pack.age:Mine"]
+    found = own_parts.carry(_tables(*where), made)
+    assert found == _tables("mine.py:Law", "mine_2.py:Push", "mine.py:Pull", "pack.age:Mine")
+    assert {path.name: path.read_text() for path in made.iterdir()} == {"mine.py": "x = 1\n", "mine_2.py": "x = 2\n"}
+
+
+@pytest.mark.parametrize(
+    ("text", "carried"),
+    [
+        ("import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\n", True),
+        ("import beside\n", False),
+        ("from beside.of import it\n", False),
+        ("from package import it\n", False),
+        ("import other\n", True),
+        ("def f():\n    import beside\n", False),
+        ("print(__file__)\n", False),
+        ("x = = 1\n", False),
+    ],
+)
+def test_a_file_that_needs_others_is_named_where_it_lies(tmp_path, text, carried):
+    made = tmp_path / "made"
+    for folder in (made, tmp_path / "package"):
+        folder.mkdir()
+    (tmp_path / "beside.py").touch()
+    (tmp_path / "mine.py").write_text(text)
+    where = f"{tmp_path}/mine.py:Law"
+    assert own_parts.carry(_tables(where), made) == _tables("mine.py:Law" if carried else where)
+    assert [path.name for path in made.iterdir()] == (["mine.py"] if carried else [])

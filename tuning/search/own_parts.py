@@ -4,6 +4,8 @@ A scenario that a user names is the user's own program. One that a ptsmc command
 everything in its folder, the digests too: what it names is run with `--trust` only, and as it was when that was made.
 """
 
+import ast
+import itertools
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -58,6 +60,37 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
                 f"{results} was made with another {key} than {systems.location(where)} is now "
                 f"(SHA-256 {str(was)[:12]} then, {now[:12]} now); allowed is the file as it was"
             )
+
+
+def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The tables of a scenario, their Python files copied into a folder and named as they lie in it.
+
+    Not a file that needs others, see `alone`, nor a module: these are named where they lie.
+    """
+    for table, key in own.named(tables):
+        place, _, name = table[key].rpartition(":")
+        file = Path(place)
+        if not place.endswith(".py") or not alone(file):
+            continue
+        content = file.read_bytes()
+        copies = (folder / (file.name if k == 1 else f"{file.stem}_{k}.py") for k in itertools.count(1))
+        copy = next(one for one in copies if not one.exists() or one.read_bytes() == content)
+        copy.write_bytes(content)
+        table[key] = f"{copy.name}:{name}"
+    return tables
+
+
+def alone(file: Path) -> bool:
+    """Whether a copy of a Python file can be run: it imports nothing from its own folder, and asks not where it is."""
+    try:
+        found = list(ast.walk(ast.parse(file.read_bytes())))
+    except (OSError, ValueError, SyntaxError, RecursionError):
+        return False
+    imported = {alias.name for node in found if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {node.module for node in found if isinstance(node, ast.ImportFrom) and node.module}
+    beside = (file.with_name(name.partition(".")[0]) for name in imported)
+    asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in found)
+    return not asks and not any(one.is_dir() or one.with_suffix(".py").exists() for one in beside)
 
 
 def _say(programs: Mapping[str, str], where_named: Path) -> None:

@@ -25,7 +25,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.errors import UsageError
-from tuning.search import gains, trust
+from tuning.search import gains, own_parts, trust
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.progress import Report
@@ -307,7 +307,8 @@ def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, kno
     store.write_json(folder / "summary.json", said)
     (folder / "scenarios").mkdir()
     for law, one in made.contenders.items():
-        store.write_toml(folder / "scenarios" / f"{law}.toml", parsing.dump(one.flown))
+        named = own_parts.carry(parsing.dump(one.flown), folder / "scenarios")
+        store.write_toml(folder / "scenarios" / f"{law}.toml", named)
     store.write_csv(folder / "compare.csv", *_rows(scenario, said))
     if figures:
         style.save(dict(_figures(made)), folder / "figures")

@@ -16,7 +16,7 @@ from ptsmc_jax.scenario import cautions, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
-from tuning.search import trust
+from tuning.search import own_parts, trust
 from tuning.search.descents import Step
 from tuning.studies.judging import judged_on
 from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning
@@ -153,7 +153,7 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
     """Fill a result folder; known_by: see `identity`."""
     store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    store.write_toml(folder / "tuned.toml", parsing.dump(tuning.tuned))
+    store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
     store.write_json(folder / "versions.json", store.versions(**known_by))
     store.write_json(folder / "summary.json", summary(tuning))
     assert scenario.tune is not None
