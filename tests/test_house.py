@@ -99,7 +99,7 @@ HOUSE = {
             fronts
         """,
         "output": """
-            cells page_captions page_charts progress_lines
+            cells made_again page_captions page_charts progress_lines
             margin_sentences pointing_sentences
             search_sentences sentences
             law_sentences

@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers import short, tree
 from tests.output.pages import Page, checked
-from tuning.output import page, page_charts
+from tuning.output import made_again, page, page_charts
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -251,3 +251,12 @@ def test_other_plants_have_pages_too(command, tmp_path):
     command("simulate", "c.toml", "--out", "chain", "--quiet")
     read = checked(tmp_path / "chain")
     assert set(read.charts) == {"history"}
+
+
+def test_a_comparison_is_made_again_with_its_laws():
+    mine = {"laws": ["prescribed_time", "pd", "Growing"], "own_laws": {"/at/mine.py:Growing": "1f"}, "seed": 2}
+    for laws, said in ((mine, "--seed 2 --against pd --law /at/mine.py:Growing"), ({"seed": 2}, "--seed 2")):
+        assert made_again.call({"command": "compare", **laws}, {"loop": {}}) == f"ptsmc compare scenario.toml {said}"
+    own = {"controller": {"kind": "own", "code": "/at/mine.py:Growing"}}
+    assert made_again.call({"command": "margins"}, own) == "ptsmc margins scenario.toml --trust"
+    assert made_again.call({"command": "reproduce", "seed": None}, {}) == "ptsmc reproduce"

@@ -77,11 +77,17 @@ def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flo
     assert "farthest" in said
     assert (flown / "figures" / "distributions.png").exists()
     assert not (flown / "figures" / "fan.png").exists()  # of histories, which would be flown
-    assert command("worst", FOLDER, "--by", "farthest", "-n", 1)[0] == 0
+    code, said, _ = command("worst", FOLDER, "--by", "farthest", "-n", 1)
+    assert (code, f"ptsmc replay {FOLDER} --trial {pl.read_csv(flown / 'worst.csv')['trial'][0]} --trust" in said) == (
+        0,
+        True,
+    )
     assert pl.read_csv(flown / "worst.csv")["farthest"][0] == rows["farthest"].max()
     assert command("report", FOLDER)[0] == 0
     assert not ran(tmp_path)
-    assert "farthest" in (flown / "report.html").read_text()
+    page = (flown / "report.html").read_text()
+    assert "farthest" in page
+    assert "--metrics my.py:farthest --seed 1000 --trust" in page
 
 
 def test_rows_are_read_where_the_program_is_not(command, flown, tmp_path):

@@ -77,8 +77,8 @@ def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
     print("when all are there, in this folder or gathered into one: ptsmc summarize DIR")
 
 
-def worst(frame: Any, by: str, folder: Path) -> None:
-    """The worst trials."""
+def worst(frame: Any, by: str, folder: Path, *, own_code: bool = False) -> None:
+    """The worst trials, and how to see one in full; own_code: flying it runs code of one's own."""
     from rich.console import Console
     from rich.table import Table
 
@@ -89,7 +89,7 @@ def worst(frame: Any, by: str, folder: Path) -> None:
         table.add_row(*("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
     console = Console(highlight=False)
     console.print(table)
-    one = f"ptsmc replay {folder} --trial {frame['trial'][0]}"
+    one = f"ptsmc replay {folder} --trial {frame['trial'][0]}" + (" --trust" if own_code else "")
     console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
 
 

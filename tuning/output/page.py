@@ -8,7 +8,6 @@ import base64
 import csv
 import hashlib
 import json
-import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
 from tuning.output import (
     law_sentences,
+    made_again,
     margin_sentences,
     page_captions,
     page_charts,
@@ -365,9 +365,6 @@ SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
     "reproduce": _reproduce,
 }
 
-# kept in `versions.json`
-OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "against", "times", "metrics", "seed", "global_check")
-
 
 def _pictures(result: Result) -> Iterator[Section]:
     """The figures of the folder."""
@@ -386,14 +383,7 @@ def _origin(result: Result) -> Iterator[Section]:
     path = result.folder / "scenario.toml"
     if path.exists():
         yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"))])
-    command = ["ptsmc", versions["command"], *(["scenario.toml"] if path.exists() else [])]
-    for key in OPTIONS:
-        if key == "trials" and versions.get("plan") is not None:
-            continue  # the plan says how many
-        if versions["command"] != "reproduce" and versions.get(key) is not None:
-            option = f"--{key.replace('_', '-')}"
-            command += [option] if versions[key] is True else [option, str(versions[key])]
     note = "Where the scenario above is the file scenario.toml." if path.exists() else ""
-    yield Section("How to make this again", [Block("code", text=shlex.join(command), note=note)])
+    yield Section("How to make this again", [Block("code", text=made_again.call(versions, result.scenario), note=note)])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
     yield Section("Made by", [_table(sentences.Table(("", "version"), rows))])

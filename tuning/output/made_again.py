@@ -1,0 +1,29 @@
+"""The call that makes a result again, from what `versions.json` and the scenario say."""
+
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from ptsmc_jax.scenario import own
+
+# kept in `versions.json`
+OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "against", "times", "metrics", "seed", "global_check")
+
+
+def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:
+    """As it is typed; scenario: its tables, none where there was no file."""
+    command = ["ptsmc", versions["command"], *(["scenario.toml"] if scenario else [])]
+    for key in OPTIONS:
+        if key == "trials" and versions.get("plan") is not None:
+            continue  # the plan says how many
+        if versions["command"] != "reproduce" and versions.get(key) is not None:
+            option = f"--{key.replace('_', '-')}"
+            command += [option] if versions[key] is True else [option, str(versions[key])]
+    laws, files = versions.get("laws", ()), list(versions.get("own_laws", ()))
+    for kind in laws[1 : len(laws) - len(files)]:  # the paper's is the first, those of one's own are the last
+        command += ["--against", kind]
+    for file in files:
+        command += ["--law", file]
+    if any(own.named(scenario)) or versions.get("metrics") is not None:
+        command.append("--trust")
+    return shlex.join(command)
