@@ -172,7 +172,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     roomy = rounds._with_room(problem, rounds.SPARE)
     assert roomy.trials.size == 8 + rounds.SPARE
     drawn = {name: v.tolist() for name, v in own.items()}
-    given = rounds._add(roomy, 0, rounds.Joining(np.asarray([7]), np.array([True]), drawn))
+    given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
     at = vector([3.2, 0.9])
     measure = jax.jit(objective.measure)
     f, c, _ = measure(more, at)
@@ -183,12 +183,13 @@ def test_coordinates_given_are_flown_as_drawn_ones():
 
 
 def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
-    problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
-    problem, joined = rounds._with_room(problem, 16), 0
+    problem, wanted = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    search, joined = rounds.Rounds(evaluate, problem, wanted, robust=False), 0
     for count in (8, 8, 3, 8, 1):
         new = np.arange(200 + joined, 200 + joined + count)
-        more = rounds.Joining(new, np.array([True]))
-        problem, joined = rounds._add(problem, joined, more), joined + count
+        search._join(rounds.Joining(new, np.array([True])))
+        problem, joined = search.problem, joined + count
         # the last 16 of those that joined, in whatever order, and the first trial where there is room
         kept = [0] * max(0, 16 - joined) + [*range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)

@@ -17,11 +17,6 @@ def search(summary: Summary) -> Iterator[str]:
             lost = ratio is None or math.isinf(ratio)
             far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
             yield f"no gains found within the bounds keep every limit: with the best ones, {far} on the training trials"
-    if found.get("averaged", 0) > found.get("asked", math.inf):
-        yield (
-            f"tuned on {found['averaged']} trials, not tune.trials = {found['asked']}: on so few every single trial "
-            "would have to keep a limit that is asked for in a share of them with a confidence"
-        )
     for one in found.get("confirmed", []):
         most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
         yield (

@@ -13,6 +13,7 @@ FRESH = 1000  # trials on which gains are judged, at least
 FEWEST, TIMES = 4096, 8  # trials to count on: this many, and so many times what the gains are judged on
 SHOWN = 2  # times the fewest trials that can show a quantile: some may then break its limit
 SURE = 0.98  # probability that gains which are confirmed are met by the verdict
+FARTHER, NEARER = 16, 8  # trials of a band: so many of those that may break a limit, at most, and of those that may not
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Count:
     allowed: int | None  # of them; None: even with none the verdict would not be sure
     probability: float  # that the verdict on fresh trials is met
     harder: np.ndarray  # trials beyond the limit but for the `allowed` farthest, the farthest of these first
+    band: np.ndarray  # trials about the last that may break it, within the limit or not, see `may_break`
 
     @property
     def held(self) -> bool:
@@ -38,13 +40,26 @@ def fresh_trials(requirements: Sequence[Requirement]) -> int:
     return max([FRESH, *(SHOWN * count for count in needed)])
 
 
-def training_trials(requirements: Sequence[Requirement], wanted: int) -> int:
-    """Trials to tune on: those wanted, or as many as show every quantile that is asked for with some beyond the limit.
+def counted_on(requirements: Sequence[Requirement]) -> int:
+    """Trials to count on."""
+    return max(FEWEST, TIMES * fresh_trials(requirements))
 
-    With the fewest that can show it every single one would have to keep the limit: 99 % with 95 % takes 299.
+
+def may_break(requirement: Requirement, requirements: Sequence[Requirement], trials: int) -> tuple[int | None, bool]:
+    """How many of the trials that a limit is kept among may break it, and whether these are a band.
+
+    None of a limit on every trial. Training trials show a share themselves where there are `SHOWN` times the fewest
+    that can: with the fewest every single one would have to keep the limit, 99 % with 95 % takes 299. Where there are
+    fewer than that, those in the `band` of a count stand for all that are counted on.
     """
-    needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([wanted, *(SHOWN * count for count in needed)])
+    quantile, confidence = requirement.quantile, requirement.confidence
+    if quantile is None:
+        return None, False
+    if confidence is None or trials >= SHOWN * fewest_trials(quantile, confidence):
+        kept = must_keep(trials, quantile, confidence)
+        assert kept is not None
+        return trials - kept, False
+    return min(FARTHER, allowed(requirement, fresh_trials(requirements), counted_on(requirements)) or 0), True
 
 
 def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) -> float:
@@ -73,8 +88,7 @@ def count(
     problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, first: int, turn: int
 ) -> list[Count]:
     """Fly gains (gains,) on trials from number `first` on, others each turn, and count those beyond each limit."""
-    fresh = fresh_trials(requirements)
-    many = max(FEWEST, TIMES * fresh)
+    fresh, many = fresh_trials(requirements), counted_on(requirements)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
     flown = flights.trials(problem.others(numbers), gains)
     found = []
@@ -83,15 +97,16 @@ def count(
         ratio = over(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
         order = np.argsort(-ratio, kind="stable")
         beyond = int(np.sum(ratio > 1.0))
-        most = allowed(requirement, fresh, numbers.size)
+        most = allowed(requirement, fresh, many)
         found.append(
             Count(
                 metric=requirement.metric,
-                trials=numbers.size,
+                trials=many,
                 beyond=beyond,
                 allowed=most,
-                probability=probability(requirement, fresh, numbers.size, beyond),
+                probability=probability(requirement, fresh, many, beyond),
                 harder=numbers[order[(most or 0) : beyond]],
+                band=numbers[order[max(0, (most or 0) - FARTHER) : (most or 0) + NEARER]],
             )
         )
     return found

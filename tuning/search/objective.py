@@ -33,10 +33,11 @@ class Rules:
     """The part of a `Problem` that metrics are judged by."""
 
     limits: Leaf
+    among: Leaf
     counted: Leaf
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})
-    must_keep: tuple[int | None, ...] = field(metadata={"static": True})
+    may_break: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(metadata={"static": True})
     tail: int | None = field(metadata={"static": True})
     torque_weight: float = field(metadata={"static": True})
@@ -45,7 +46,11 @@ class Rules:
 @pytree
 @dataclass(frozen=True)
 class Problem:
-    """A tuning problem. The first `averaged` trials count in the objective, all of them in the constraints."""
+    """A tuning problem. The first `averaged` trials count in the objective.
+
+    A limit on every trial is one on each trial that is `counted`. A limit on a share of the trials is one on each of
+    those that are `among` its own, but for the `may_break` that are farthest beyond it, and on each that is `counted`.
+    """
 
     parts: Parts
     dispersion: Dispersion
@@ -53,12 +58,13 @@ class Problem:
     trials: Leaf  # (trials,) uint32, that name the noise
     coordinates: Coordinates  # of what is drawn, arrays over the trials first
     limits: Leaf  # (requirements,) in the metrics' units
-    counted: Leaf  # (requirements, trials) bool: whether a trial beyond the averaged ones must keep a limit
+    among: Leaf  # (requirements, trials) bool: trials of which a share must keep a limit
+    counted: Leaf  # (requirements, trials) bool: trials that must keep it by themselves
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
-    # of the averaged trials, how many must keep each limit; None: every trial must
-    must_keep: tuple[int | None, ...] = field(metadata={"static": True})
+    # of those that are among, how many may break each limit; None: it is one on every trial
+    may_break: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
     torque_weight: float = field(default=0.0, metadata={"static": True})
@@ -98,9 +104,15 @@ def problem(
     trials: np.ndarray,
     names: tuple[str, ...],
     requirements: Sequence[Requirement] = (),
+    may_break: tuple[int | None, ...] | None = None,
+    banded: tuple[bool, ...] | None = None,
     **others: object,
 ) -> Problem:
-    """A problem over these trials of the seed; others: fields of `Problem`."""
+    """A problem over these trials of the seed; others: fields of `Problem`.
+
+    may_break: how many trials may break each requirement, None for those on every trial; of these trials, or, banded,
+    of a band that joins later, until when each of these must keep it. By default all are on every trial.
+    """
     made = Problem(
         parts=parts,
         dispersion=dispersion,
@@ -108,13 +120,16 @@ def problem(
         trials=jnp.zeros(0, dtype=jnp.uint32),
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=jnp.asarray([r.limit for r in requirements], dtype=float),
+        among=jnp.zeros((len(requirements), 0), dtype=bool),
         counted=jnp.zeros((len(requirements), 0), dtype=bool),
         averaged=len(trials),
         names=names,
         metrics=tuple(r.metric for r in requirements),
-        must_keep=(None,) * len(requirements),
+        may_break=may_break or (None,) * len(requirements),
     )
-    return replace(with_trials(made, trials), **others)
+    alone = kept_by_every_trial(made) if banded is None else kept_by_every_trial(made) | np.asarray(banded, dtype=bool)
+    made = with_trials(made, trials, counted=alone)
+    return replace(made, among=~made.counted, **others)
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
@@ -145,6 +160,7 @@ def with_trials(
     return replace(
         problem,
         trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
+        among=jnp.pad(problem.among, [(0, 0), (0, len(trials))]),
         counted=jnp.concatenate([problem.counted, jnp.tile(rows[:, None], (1, len(trials)))], axis=1),
         coordinates={name: jnp.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
     )
@@ -156,23 +172,27 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
         return problem
     kept = np.r_[:averaged, problem.averaged : problem.trials.size]
 
-    def share(count: int | None) -> int | None:
-        return None if count is None else max(1, math.ceil(count * averaged / problem.averaged))
+    def share(count: int) -> int:
+        return max(1, math.ceil(count * averaged / problem.averaged))
+
+    def allowed(count: int | None, averaged_are_among: bool) -> int | None:
+        return averaged - share(problem.averaged - count) if count is not None and averaged_are_among else count
 
     return replace(
         problem,
         trials=problem.trials[kept],
+        among=problem.among[:, kept],
         counted=problem.counted[:, kept],
         coordinates={name: v[kept] for name, v in problem.coordinates.items()},
         averaged=averaged,
-        must_keep=tuple(share(count) for count in problem.must_keep),
-        tail=share(problem.tail),
+        may_break=tuple(map(allowed, problem.may_break, np.asarray(problem.among)[:, 0].tolist())),
+        tail=None if problem.tail is None else share(problem.tail),
     )
 
 
 def kept_by_every_trial(problem: Problem) -> np.ndarray:
     """(requirements,) bool: limits that every trial must keep."""
-    return np.asarray([must_keep is None for must_keep in problem.must_keep], dtype=bool)
+    return np.asarray([allowed is None for allowed in problem.may_break], dtype=bool)
 
 
 def watched(problem: Problem) -> tuple[str, ...]:
@@ -216,10 +236,8 @@ def judge(
     if rules.torque_weight:
         weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
     rows = [
-        _asked(
-            judged(near(one, limit, at_least=False), status) - 1.0, must_keep, rules.averaged, counted[rules.averaged :]
-        )
-        for one, limit, must_keep, counted in zip(limited, rules.limits, rules.must_keep, rules.counted, strict=True)
+        _asked(judged(near(one, limit, at_least=False), status) - 1.0, *asked)
+        for one, limit, *asked in zip(limited, rules.limits, rules.may_break, rules.among, rules.counted, strict=True)
     ]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
     return weighted, constraints, value
@@ -252,10 +270,12 @@ def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array,
 
 
 def _asked(
-    over: Float[Array, " trials"], must_keep: int | None, averaged: int, counted: Bool[Array, " added"]
+    over: Float[Array, " trials"], may_break: int | None, among: Bool[Array, " trials"], counted: Bool[Array, " trials"]
 ) -> Float[Array, " trials"]:
-    """What is asked of c: of the averaged trials all but the worst beyond `must_keep`, of the others those counted."""
-    first = over[:averaged]
-    if must_keep is not None:
-        first = jnp.minimum(first, -jax.lax.top_k(-first, must_keep)[0][-1])
-    return jnp.concatenate([first, jnp.where(counted, over[averaged:], -1.0)])
+    """What is asked of c: of the trials that are counted, and of those among which so many may break the limit."""
+    alone = jnp.where(counted, over, -1.0)
+    if may_break is None:
+        return alone
+    together = jnp.where(among, over, -1.0)
+    last = jax.lax.top_k(together, may_break + 1)[0][-1]
+    return jnp.maximum(alone, jnp.minimum(together, last))

@@ -1,6 +1,6 @@
 """Rounds of a search: which trials, and which loops, join the constraints for the gains that were found last."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that ar
 SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
 HARDEST = 8  # of the screened trials, that join the constraints
 SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
+BAND = confirm.FARTHER + confirm.NEARER  # places of a band
 ROUNDS = 6  # searches again with hardest trials added, at most
 
 
@@ -35,28 +36,36 @@ class Rounds:
     A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
     screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
     not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
-    on others after each search: where more of them break it than may, the hardest of the rest join.
+    on others after each search: where more of them break it than may, the hardest of the rest join. Where the training
+    trials are too few to show it, a band joins first: those about the last that may break it, of as many as are counted
+    on.
     """
 
     def __init__(self, evaluate: Evaluator, problem: Problem, requirements: Sequence[Requirement], *, robust: bool):
         self._evaluate, self._robust = evaluate, robust
         every = [r for r in requirements if r.quantile is None]
         self._every = every if problem.dispersion.varies else []  # limits on every trial
-        several = problem.trials.size > 1
-        self._shares = [r for r in requirements if r.quantile is not None] if several else []  # of the trials
+        several, among = problem.trials.size > 1, np.asarray(problem.among)
+        # limits on a share of the trials, and of these those with a band, by their rows in the problem
+        self._shares = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
+        self._bands = [k for k in self._shares if not among[k].any()]
         self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
         if self._every or self._shares:
             problem = _with_room(problem, HARDEST + SPARE if self._every else SPARE)
-        self.problem = problem
+        self._places = np.arange(problem.averaged, problem.trials.size)  # for those that join
+        self.problem = _with_room(problem, len(self._bands) * BAND)
         self.count = 0  # rounds so far
         self.hardest: Hardest | None = None  # for the gains found last
         self.counts: list[confirm.Count] = []
-        self._joined = 0
+        self._joined, self._counted = 0, 0  # trials; times
         self._known: worst_case.Screened | None = None
 
     def begin(self, gains: np.ndarray) -> None:
         """What is hardest for gains that are about right, (gains,), joins."""
         self.problem, _ = _harder_margins(self.problem, gains)
+        if self._bands:
+            counts = dict(zip(self._shares, self._count(gains), strict=True))
+            self.problem = _with_bands(self.problem, {k: counts[k].band for k in self._bands})
         if self._every:
             hardest = _hardest(self.problem, *self._screened(gains))
             self._join(Joining(hardest, kept_by_every_trial(self.problem)))
@@ -99,19 +108,27 @@ class Rounds:
         self._evaluate.rollouts += worst_case.SCREENED
         return worst_case.screen(self.problem, self._every, gains)
 
+    def _count(self, gains: np.ndarray) -> list[confirm.Count]:
+        """Each time on other trials."""
+        first = self.problem.averaged + worst_case.SCREENED
+        found = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
+        self._counted += 1
+        self._evaluate.rollouts += found[0].trials
+        return found
+
     def _confirmed(self, gains: np.ndarray) -> list[Joining]:
         """Trials that join since more of those counted break a limit than may."""
-        first = self.problem.averaged + worst_case.SCREENED
-        self.counts = confirm.count(self.problem, self._shares, gains, first, self.count)
-        self._evaluate.rollouts += self.counts[0].trials
+        self.counts = self._count(gains)
+        rows = np.arange(len(self.problem.metrics))
         return [
-            Joining(one.harder[:HARDEST], np.asarray([metric == asked.metric for metric in self.problem.metrics]))
-            for asked, one in zip(self._shares, self.counts, strict=True)
+            Joining(one.harder[:HARDEST], rows == k)
+            for k, one in zip(self._shares, self.counts, strict=True)
             if not one.held
         ]
 
     def _join(self, more: Joining) -> None:
-        self.problem, self._joined = _add(self.problem, self._joined, more), self._joined + more.trials.size
+        at = self._places[(self._joined + np.arange(more.trials.size)) % self._places.size]
+        self.problem, self._joined = _add(self.problem, at, more), self._joined + more.trials.size
 
 
 def _with_room(problem: Problem, places: int) -> Problem:
@@ -127,21 +144,36 @@ def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]
     return replace(problem, margins=asked), near > 1.0
 
 
-def _add(problem: Problem, joined: int, more: Joining) -> Problem:
-    """The problem with more trials in the places left for them, and then in those of the ones that joined first.
+def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
+    """The problem with more trials, in these places."""
+    placed = _placed(problem, at, more.trials, more.coordinates)
+    return replace(placed, counted=placed.counted.at[:, at].set(jnp.asarray(more.counted)[:, None]))
 
-    joined: how many have been added to `_with_room`'s.
-    """
-    places = problem.trials.size - problem.averaged
-    at = problem.averaged + (joined + np.arange(more.trials.size)) % places
-    if more.coordinates is None:
-        own = coordinates_of(problem.dispersion, int(problem.seed), more.trials)
+
+def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
+    """With limits, by their rows, kept among these trials, in the last places, in stead of by the averaged ones."""
+    for turn, (row, band) in enumerate(bands.items(), start=1):
+        at = problem.trials.size - turn * BAND + np.arange(band.size)
+        problem = _placed(problem, at, band)
+        problem = replace(
+            problem,
+            among=problem.among.at[row, at].set(True),
+            counted=problem.counted.at[row, : problem.averaged].set(False),
+        )
+    return problem
+
+
+def _placed(
+    problem: Problem, at: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
+) -> Problem:
+    """With other trials in these places; coordinates: of a single one, where they are not its own."""
+    if coordinates is None:
+        own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
-        own = {name: jnp.asarray(v)[None] for name, v in more.coordinates.items()}
+        own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
-        trials=problem.trials.at[at].set(jnp.asarray(more.trials, dtype=jnp.uint32)),
-        counted=problem.counted.at[:, at].set(jnp.asarray(more.counted)[:, None]),
+        trials=problem.trials.at[at].set(jnp.asarray(trials, dtype=jnp.uint32)),
         coordinates={name: v.at[at].set(own[name]) for name, v in problem.coordinates.items()},
     )
 

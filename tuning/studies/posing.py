@@ -8,7 +8,7 @@ import numpy as np
 from ptsmc_jax.scenario import Study, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
-from ptsmc_jax.simulation.requirements import Requirement, must_keep
+from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, gains, margin_rows, objective
 from tuning.search import shares as gain_bounds
 from tuning.search.evaluate import Evaluator
@@ -36,7 +36,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
     ready = study(scenario, reach=reach(scenario, table, **farther))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
     asked = [r.implied_by for r in ready.requirements]
-    trained = judging.trials_of(ready, confirm.training_trials(asked, table.trials))
+    trained = judging.trials_of(ready, table.trials)
+    may_break = [confirm.may_break(r, asked, trained) for r in asked]
     problem = objective.problem(
         ready.parts,
         ready.dispersion,
@@ -44,7 +45,8 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         np.arange(trained),
         bounds.names,
         asked,
-        must_keep=tuple(_must_keep(r, trained) for r in asked),
+        may_break=tuple(allowed for allowed, _ in may_break),
+        banded=tuple(banded for _, banded in may_break),
         goal=T_F if table.objective == T_F else "window_error",
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
@@ -78,13 +80,6 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
         surface_rate=interval("surface_rate", own.surface_rate)[1],
     )
     return dataclasses.replace(found, **farther)
-
-
-def _must_keep(requirement: Requirement, trials: int) -> int | None:
-    """How many training trials must keep a limit."""
-    if requirement.quantile is None:
-        return None
-    return must_keep(trials, requirement.quantile, requirement.confidence) or trials
 
 
 def _tail(table: tables.Tune, trials: int) -> int | None:

@@ -91,7 +91,6 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
             "trials": np.asarray(found.problem.trials).tolist(),
             "averaged": found.problem.averaged,
-            "asked": tuning.tuned.tune.trials,
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
