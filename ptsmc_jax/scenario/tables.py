@@ -76,7 +76,7 @@ class Tune(Table, frozen=True):
         level: the CVaR is the RMS of the worst 1 - level of the trials; with "cvar" only, default: 0.9
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
-        trials: trials to tune on; more where a quantile with a confidence takes more to be shown at all
+        trials: trials to tune on; what quantiles take more of are counted besides
         starts: points to search from, most of them a few steps: the scenario's, and the best of a sweep
         steps: points looked at from a start, at most, with slopes
     """

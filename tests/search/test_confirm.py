@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,9 @@ def test_a_limit_on_a_share_is_kept_among_the_training_trials_or_a_band():
     every = Requirement("peak_torque", 0.5)
     assert confirm.may_break(every, [every], 64) == (None, False)
     assert confirm.may_break(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 keep it
-    assert confirm.may_break(SHOWN, [SHOWN], 598) == (598 - must_keep(598, 0.99, 0.95), False)
+    kept = must_keep(598, 0.99, 0.95)
+    assert kept is not None
+    assert confirm.may_break(SHOWN, [SHOWN], 598) == (598 - kept, False)
     most = confirm.allowed(SHOWN, 1000, 8000)
     assert confirm.may_break(SHOWN, [SHOWN], 597) == (most, True)
     assert most is not None
@@ -68,7 +71,9 @@ def test_a_band_holds_the_last_that_may_break_the_limit_and_those_next_to_it(mon
         return flown
 
     monkeypatch.setattr(confirm.flights, "trials", fly)
-    (found,) = confirm.count(SimpleNamespace(others=lambda numbers: numbers), [loose], np.zeros(2), 100, 2)
+    some: Any = SimpleNamespace(others=lambda numbers: numbers)
+    (found,) = confirm.count(some, [loose], np.zeros(2), 100, 2)
+    assert found.allowed is not None
     first = 100 + 2 * count
     order = [first + 5, *range(first + count - 1, first + count // 2, -1)]
     assert found.beyond == count

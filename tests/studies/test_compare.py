@@ -264,7 +264,8 @@ def rivals(monkeypatch, eight, interrupt=None):
     """What a comparison asks of `report`: seeds that laws are tuned and judged by, without any search."""
     asked = []
 
-    def tune(posed, seed, told, journal, *, trusted):
+    def tune(posed, seed, told, journal, *, trusted, tries):
+        assert tries == 1  # further ones would be judged on other trials
         law = posed.controller.kind
         asked.append(("tune", law, seed))
         return SimpleNamespace(tuned=posed, gains={}, at_bound={}, fresh={"tuned": eight}, verdicts=[],

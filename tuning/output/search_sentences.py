@@ -17,6 +17,15 @@ def search(summary: Summary) -> Iterator[str]:
             lost = ratio is None or math.isinf(ratio)
             far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
             yield f"no gains found within the bounds keep every limit: with the best ones, {far} on the training trials"
+    earlier = found.get("earlier", [])
+    kept = [*(one["margin"] for one in earlier[1:]), found.get("margin", 0.0)]
+    for one, margin in zip(earlier, kept, strict=False):
+        reached = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in one["over"].items())
+        yield (
+            f"gains that kept every limit in the search reached {reached} on fresh trials (seed {one['fresh_seed']}): "
+            f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
+            f"{100 * one['margin']:.2g} %, and what it found is judged on other trials"
+        )
     for one in found.get("confirmed", []):
         most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
         yield (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import montecarlo
@@ -235,10 +235,8 @@ def judge(
         weighted = value + jnp.sum(squares[: rules.averaged] >= FAILED**2) * math.log(FAILED)
     if rules.torque_weight:
         weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
-    rows = [
-        _asked(judged(near(one, limit, at_least=False), status) - 1.0, *asked)
-        for one, limit, *asked in zip(limited, rules.limits, rules.may_break, rules.among, rules.counted, strict=True)
-    ]
+    over = [judged(near(one, rules.limits[k], at_least=False), status) - 1.0 for k, one in enumerate(limited)]
+    rows = [_asked(rules, k, one) for k, one in enumerate(over)]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
     return weighted, constraints, value
 
@@ -269,13 +267,11 @@ def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array,
     return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(kept) / jnp.maximum(count, 1), FAILED**2))
 
 
-def _asked(
-    over: Float[Array, " trials"], may_break: int | None, among: Bool[Array, " trials"], counted: Bool[Array, " trials"]
-) -> Float[Array, " trials"]:
+def _asked(rules: Rules, row: int, over: Float[Array, " trials"]) -> Float[Array, " trials"]:
     """What is asked of c: of the trials that are counted, and of those among which so many may break the limit."""
-    alone = jnp.where(counted, over, -1.0)
+    alone, may_break = jnp.where(rules.counted[row], over, -1.0), rules.may_break[row]
     if may_break is None:
         return alone
-    together = jnp.where(among, over, -1.0)
+    together = jnp.where(rules.among[row], over, -1.0)
     last = jax.lax.top_k(together, may_break + 1)[0][-1]
     return jnp.maximum(alone, jnp.minimum(together, last))

@@ -53,6 +53,7 @@ def search(
     sloped: bool = True,
     robust: bool = False,
     judged: bool = True,
+    margin: float = 0.0,
     report: Report = lambda *_: None,
     prepare: Callable[[], None] = lambda: None,
 ) -> Search:
@@ -61,12 +62,13 @@ def search(
     `Descents` finds gains, `Rounds` says which trials they must meet besides those that are drawn: after each search,
     harder ones join, and the search goes on. own: (gains,) the scenario's gains, the first start. steps: points that
     may be looked at from each start. sloped: F has slopes to go by. robust: what joins is the worst case inside the
-    dispersions' support. judged: say how hard the worst case is. report is called after every step; prepare once the
+    dispersions' support. judged: say how hard the worst case is. margin: to keep from the limits, where it is more than
+    the search's own. report is called after every step; prepare once the
     search's own programs are being compiled, for those of what comes after it. Interrupted, it returns the best so far
     once there is one.
     """
     rounds = Rounds(evaluate, problem, requirements, robust=robust)
-    margin = rounds.margin
+    margin = max(margin, rounds.margin)
     report = Work(report, evaluate, *planned(rounds.problem, starts, steps, sloped=sloped))
     run = Descents(evaluate, margin, steps, np.random.default_rng(seed), report)
     interrupted = False

@@ -209,7 +209,7 @@ def compare(
         def report(what: str, *others: Any, law: str = law) -> None:
             tell(f"{law}: {what}", *others)
 
-        tuned = tuner.tune(posed, seed, report, journal, trusted=False)
+        tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)  # all on the same fresh trials
         fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
         made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
         stopped = tuned.search.interrupted

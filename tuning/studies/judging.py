@@ -14,9 +14,9 @@ from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from tuning.search import confirm, gains
 
 
-def seed_of_judge(seed: int) -> int:
-    """The seed of the fresh trials."""
-    return draws.derive(seed, "fresh trials")
+def seed_of_judge(seed: int, turn: int = 0) -> int:
+    """The seed of the fresh trials; of others each turn, where gains that had broken a limit on some were tuned on."""
+    return draws.derive(seed, f"fresh trials {turn}" if turn else "fresh trials")
 
 
 def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:

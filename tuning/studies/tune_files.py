@@ -81,6 +81,8 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "starts": len({step.start for step in found.history}),
             "steps": len(found.history),
             "rounds_with_harder_trials": found.rounds,
+            "margin": found.margin,
+            "earlier": [asdict(one) for one in tuning.earlier],
             "largest_over_limit": dict(zip(found.problem.rows, found.worst.tolist(), strict=True)),
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts

@@ -1,7 +1,7 @@
 """What a tuning run hands its user: gains judged on fresh trials beside the paper's and the scenario's own."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory import margins
 from tuning.search import flights, gains, global_check, trust
+from tuning.search.descents import Step
 from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.global_check import Check
 from tuning.search.journal import Journal
@@ -26,6 +27,8 @@ from tuning.studies import judging, posing, stability
 
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
+TRIES = 3  # searches at most, each of whose gains are judged on fresh trials of their own
+FARTHER = 1.02  # a further search keeps so much more from the limits than what fresh trials found too little
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
 
 
@@ -54,12 +57,23 @@ class Beyond:
 
 
 @dataclass(frozen=True)
+class Try:
+    """A search whose gains kept every limit, and broke one on fresh trials: another one went on from them."""
+
+    fresh_seed: int
+    gains: dict[str, float]
+    margin: float  # that it kept from the limits
+    over: dict[str, float]  # how many times its limit each metric reached on the fresh trials, as it is judged
+
+
+@dataclass(frozen=True)
 class Tuning:
     """A finished tuning run."""
 
     tuned: Scenario  # as it was judged
     gains: dict[str, float]
     search: Search
+    earlier: list[Try]
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials as they were trained on
     fresh: dict[str, Trials]  # by whose gains: "tuned" and those it is set `beside`
@@ -96,8 +110,12 @@ def tune(
     *,
     globally: bool = False,
     trusted: bool = True,
+    tries: int = TRIES,
 ) -> Tuning:
     """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw.
+
+    Where these break a limit that the search kept, it goes on from the gains it found with more distance from the
+    limits, and is judged on others. tries: searches, at most.
 
     journal: of evaluations, from which an interrupted run goes on; globally: compare with differential evolution;
     trusted: find out what makes the result believable too.
@@ -109,35 +127,44 @@ def tune(
     posed = posing.pose(scenario, seed, journal)
     ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
     others, refused = judging.beside(scenario)
-    found = search(
+    look = partial(
+        search,
         evaluate,
         problem,
         posed.asked,
-        own,
-        table.starts,
-        table.steps,
-        seed,
+        steps=table.steps,
+        seed=seed,
         sloped=posed.sloped,
         robust=table.worst_case,
         report=report,
-        prepare=partial(_prepare, scenario),
     )
-    seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
+    found, earlier = look(own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
+    while True:
+        seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
+        report("judging on fresh trials", 0, 0, found.value, 0.0)
+        named = evaluate.bounds.rounded(found.gains, DIGITS)
+        tuned = judging.as_flown(gains.in_scenario(scenario, named))
+        fresh_seed = judging.seed_of_judge(seed, len(earlier))
+        fresh = {"tuned": judging.judge(tuned, fresh_seed, ready.requirements)}
+        verdicts = judging.verdicts_of(tuned, fresh["tuned"], fresh_seed)
+        over = _over(found, verdicts)
+        if not over or found.interrupted or len(earlier) + 1 >= tries:
+            break
+        earlier.append(Try(fresh_seed, named, found.margin, over))
+        reached = dict(zip(found.problem.rows, found.worst, strict=True))  # on the trials of the search
+        more = look(found.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
+        found = replace(more, history=[*found.history, *_after(found.history, more.history)])
     check = None
     if globally and not found.interrupted:
         check = global_check.check(evaluate, found, seed, report, sloped=posed.sloped)
 
-    report("judging on fresh trials", 0, 0, found.value, 0.0)
-    named = evaluate.bounds.rounded(found.gains, DIGITS)
-    tuned = judging.as_flown(gains.in_scenario(scenario, named))
     training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*named.values()]))
-    fresh_seed = judging.seed_of_judge(seed)
-    fresh, judged_gains, floors = {}, {}, {}
+    judged_gains, floors = {}, {}
     for name, candidate in {"tuned": tuned, **others}.items():
-        fresh[name] = judging.judge(candidate, fresh_seed, ready.requirements)
+        if name != "tuned":
+            fresh[name] = judging.judge(candidate, fresh_seed, ready.requirements)
         judged_gains[name] = gains.gains_of(study(judging.as_flown(candidate)).parts)
         floors[name] = judging.floor_of(candidate, fresh_seed)
-    verdicts = judging.verdicts_of(tuned, fresh["tuned"], fresh_seed)
     limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
     shortest = None
     if limit is not None and T_F not in problem.names and ready.parts.controller.prescribed:
@@ -163,6 +190,7 @@ def tune(
         tuned=tuned,
         gains=named,
         search=found,
+        earlier=earlier,
         at_bound=at_bound,
         training=training,
         fresh=fresh,
@@ -180,6 +208,24 @@ def tune(
         gradients=gradients,
         seconds=seconds,
     )
+
+
+def _over(found: Search, verdicts: list[Verdict]) -> dict[str, float]:
+    """How many times its limit each metric reached that broke it on fresh trials; empty: more distance is no help.
+
+    It is one where the search kept every limit, and every value is a number.
+    """
+    # what is asked for a share of the time is searched for as a limit
+    over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
+            for one in verdicts if not one.met and one.limit}  # fmt: skip
+    helped = bool(np.all(found.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
+    return over if helped else {}
+
+
+def _after(history: list[Step], more: list[Step]) -> list[Step]:
+    """The steps of a search that goes on, as from one start more."""
+    first = 1 + max((step.start for step in history), default=-1)
+    return [replace(step, start=first + step.start) for step in more]
 
 
 def _beyond(
