@@ -2,8 +2,14 @@
 
 import inspect
 
+import numpy as np
+
+from ptsmc_jax import scenario
+from ptsmc_jax.simulation.requirements import Requirement
 from tuning.cli import campaign_commands
-from tuning.output import search_sentences
+from tuning.output import search_sentences, sentences
+from tuning.search import gains
+from tuning.studies import tune_files, tuner
 
 
 def summary(over, *, searched=0.97):
@@ -30,3 +36,54 @@ def test_a_campaign_does_not_fly_the_trials_of_a_search():
         for command in (main.tune, main.pareto, main.compare)
     }
     assert inspect.signature(campaign_commands.montecarlo).parameters["seed"].default not in seeds.values()
+
+
+def tuned(times, counts, *, met=True, **more):
+    """What `accuracy` reads."""
+    group = {"window_error": None, "trials": 64, "counts": counts, "floor": None}
+    verdict = {"metric": "peak_torque", "limit": 0.5, "unit": "N m", "met": met}
+    return {"fresh": group, "training": group, "accuracy_gain_over_paper": times, "verdicts": [verdict], **more}
+
+
+def test_less_accurate_gains_are_not_praised():
+    """The interval of a ratio turns over with it: from 0.05..0.1 to 10..20."""
+    interval = {"accuracy_gain_interval": [0.05, 0.1]}
+    (said,) = sentences.accuracy(tuned(0.08, {"ok": 64}, paper_is="paper, scaled", **interval))
+    assert said == (
+        "the tuned gains are less accurate than the paper's gains, scaled to this body and period: they leave 12.5 "
+        "times the error (95 %: 10 to 20)"
+    )
+    (said,) = sentences.accuracy(tuned(40.0, {"ok": 64}, met=False, paper_is="paper's law"))
+    assert said == (
+        "the tuned gains are 40 times as accurate as the paper's law with the paper's gains, but break peak_torque"
+    )
+
+
+def test_where_nothing_arrives_it_is_said_and_nothing_compared():
+    said = list(sentences.accuracy(tuned(0.08, {"ok": 0, "missed": 60, "diverged": 4}, met=False)))
+    assert said == ["with the tuned gains 64 of 64 fresh trials do not arrive: 60 missed, 4 diverged"]
+    training = {"trials": 16, "counts": {"ok": 2, "missed": 14}}
+    (said,) = [
+        s for s in search_sentences.search(summary(None, searched=None) | {"training": training}) if "no gains" in s
+    ]
+    assert said.endswith("14 of 16 training trials do not arrive (14 missed), and so keep no limit")
+
+
+def test_a_broken_requirement_is_named_with_its_limit():
+    reached = summary(1.2, searched=1.2)
+    reached["verdicts"][0]["unit"] = "N m"
+    (said,) = [s for s in search_sentences.search(reached) if "no gains" in s]
+    assert said.endswith("peak_torque reaches 1.2 times its limit, 0.5 N m, on the training trials")
+    seen = tuner.Beyond(4.3, 0.5, str(Requirement("peak_torque", 0.5).verdict(np.array([0.4, 0.7]), np.ones(2, bool))))
+    assert not seen.better
+    assert tune_files._beyond(seen, 4.0) == (
+        "no better beyond its bound: at 4.3 peak_torque at most 0.5 N m: worst 0.7: NOT met in 1 of 2 trials"
+    )
+
+
+def test_a_column_is_called_after_whose_gains_it_holds():
+    paper = scenario.from_tables({"loop": {"mode": "sampled"}})
+    assert gains.paper_is(paper) == "paper"
+    assert gains.paper_is(scenario.replace(paper, loop__period=0.5)) == "paper, scaled"  # a hand-over of a period
+    assert gains.paper_is(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "paper, scaled"
+    assert gains.paper_is(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"

@@ -503,12 +503,13 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     ("ratio", "said"),
     [
         (1.234, "effort reaches 1.23 times its limit"),
-        (None, "a trial fails or has no effort"),
-        (np.inf, "a trial fails"),
+        (None, "2 of 8 training trials do not arrive (2 diverged), and so keep no limit"),
+        (np.inf, "2 of 8 training trials do not arrive"),
     ],
 )
 def test_what_breaks_a_limit_in_training_is_said(ratio, said):
     """Infinite in a result, absent from the file it is read from."""
     found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
-    (line,) = search_sentences.search({"search": found})
+    training = {"trials": 8, "counts": {"ok": 6, "diverged": 2}}
+    (line,) = search_sentences.search({"search": found, "verdicts": [], "training": training})
     assert said in line

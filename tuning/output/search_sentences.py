@@ -14,9 +14,8 @@ def search(summary: Summary) -> Iterator[str]:
     found = summary["search"]
     for metric, ratio in found.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
-            lost = ratio is None or math.isinf(ratio)
-            far = f"a trial fails or has no {metric}" if lost else f"{metric} reaches {ratio:.3g} times its limit"
-            yield f"no gains found within the bounds keep every limit: with the best ones, {far} on the training trials"
+            far = _far(summary, metric, ratio)
+            yield f"no gains found within the bounds keep every limit: with the best ones {far}"
     earlier = found.get("earlier", [])
     kept = [*(one["margin"] for one in earlier[1:]), found.get("margin", 0.0)]
     for one, margin in zip(earlier, kept, strict=False):
@@ -64,6 +63,19 @@ def search(summary: Summary) -> Iterator[str]:
         }[kept, checked["kept"]]
         found = f"{checked['value']:.4e}, {beside}"
         yield f"differential evolution, a global search with {checked['rollouts']} rollouts, found {found}"
+
+
+def _far(summary: Summary, metric: str, ratio: float | None) -> str:
+    """How far the training trials are beyond a limit, or how many of them do not arrive, in words."""
+    if ratio is not None and math.isfinite(ratio):
+        limit = next((f", {v['limit']:g} {v['unit']}," for v in summary["verdicts"] if v["metric"] == metric), "")
+        return f"{metric} reaches {ratio:.3g} times its limit{limit} on the training trials"
+    training = summary.get("training", {})
+    lost = {status: n for status, n in training.get("counts", {}).items() if n and status != "ok"}
+    if not lost:
+        return f"a training trial has no {metric}"
+    ended = ", ".join(f"{n} {status}" for status, n in lost.items())
+    return f"{sum(lost.values())} of {training['trials']} training trials do not arrive ({ended}), and so keep no limit"
 
 
 def advice(summary: Summary) -> Iterator[str]:

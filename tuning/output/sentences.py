@@ -78,7 +78,8 @@ def tuning(summary: Summary) -> Table:
     from ptsmc_jax.simulation.catalogues import CATALOGUES
     from tuning.search.gains import base, units
 
-    groups = {"paper": summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
+    called = summary.get("paper_is", "paper")  # what its column is
+    groups = {called: summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     rows: list[tuple[str, ...]] = []
     kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
@@ -109,14 +110,33 @@ def tuning_heading(summary: Summary) -> str:
     return f"judged on {summary['fresh']['trials']} fresh trials, {judged}"
 
 
+PAPER = {  # columns of the paper's gains in words
+    "paper": "the paper's gains",
+    "paper, scaled": "the paper's gains, scaled to this body and period",
+    "paper's law": "the paper's law with the paper's gains",
+}
+
+
 def accuracy(summary: Summary) -> Iterator[str]:
-    """How accurate the tuned gains are."""
-    times = summary["accuracy_gain_over_paper"]
-    if times is not None:
-        within = _between(summary.get("accuracy_gain_interval"), ".3g")
-        yield f"the tuned gains are {times:.3g} times as accurate as the paper's{within}"
+    """How accurate the tuned gains are; no praise where trials do not arrive or limits are broken."""
+    fresh, times = summary["fresh"], summary["accuracy_gain_over_paper"]
+    lost = {status: n for status, n in fresh["counts"].items() if n and status != "ok"}
+    if lost:
+        ended = ", ".join(f"{n} {status}" for status, n in lost.items())
+        yield f"with the tuned gains {sum(lost.values())} of {fresh['trials']} fresh trials do not arrive: {ended}"
+    broken = [v["metric"] for v in summary["verdicts"] if not v["met"]]
+    paper = PAPER[summary.get("paper_is", "paper")]
+    if times is not None and fresh["counts"].get("ok", 0):
+        within = summary.get("accuracy_gain_interval")
+        but = f", but break {' and '.join(broken)}" if broken else ""
+        if times >= 1.0:
+            yield f"the tuned gains are {times:.3g} times as accurate as {paper}{_between(within, '.3g')}{but}"
+        else:
+            within = None if within is None else [1.0 / v for v in reversed(within)]
+            worse = f"the tuned gains are less accurate than {paper}: they leave {1.0 / times:.3g} times the error"
+            yield f"{worse}{_between(within, '.3g')}{but}"
     yield from paper_refused(summary)
-    trained, fresh = summary["training"]["window_error"], summary["fresh"]["window_error"]
+    trained, fresh = summary["training"]["window_error"], fresh["window_error"]
     before = summary.get("before")
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
         yield "the scenario's own gains are more accurate than these: see tune.bounds and the requirements"

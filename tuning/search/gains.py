@@ -106,6 +106,14 @@ def papers(scenario: Scenario) -> Scenario:
     return in_scenario(scenario, own)
 
 
+def paper_is(scenario: Scenario) -> str:
+    """What the paper's gains are for a scenario: its own, scaled to another body or period, or those of its law."""
+    if not scenario.controller.prescribed:
+        return "paper's law"
+    own, kept = of_paper(scenario), {"delta": 0.05, "observer_gain": 10.0}
+    return "paper" if all(own.get(name, value) == value for name, value in kept.items()) else "paper, scaled"
+
+
 def differ(one: Scenario, other: Scenario) -> bool:
     """Whether two scenarios fly another law or other gains."""
     kept = ("controller", "observer", "estimator", "sensors")

@@ -71,6 +71,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
         **{name: {"seed": tuning.fresh_seed, **group} for name, group in groups.items() if name != "tuned"},
         "paper_refused": tuning.paper_refused,
+        "paper_is": gain_names.paper_is(tuning.tuned),
         "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
         "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
         "judged_on": judged_on(tuning.tuned),
@@ -147,8 +148,9 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
         return f"on its bound {bound:g}; what lies beyond it was not flown"
     if seen.better:
         return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
-    why = "a requirement is broken" if not seen.met else f"{seen.times:.3g} times the error"
-    return f"no better beyond its bound: {why} at {seen.value:g}"
+    if seen.broken is not None:
+        return f"no better beyond its bound: at {seen.value:g} {seen.broken}"
+    return f"no better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}"
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:

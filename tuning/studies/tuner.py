@@ -48,12 +48,12 @@ class Beyond:
 
     value: float
     times: float | None  # RMS window error there over that of the tuned gains; None: it has none
-    met: bool  # every requirement met there, and no trial failed
+    broken: str | None  # what is broken there, in words; None: every requirement met, and no trial failed
 
     @property
     def better(self) -> bool:
         """More accurate there by more than what counts as nothing, with every requirement kept."""
-        return self.met and self.times is not None and self.times < 1.0 - trust.FLAT
+        return self.broken is None and self.times is not None and self.times < 1.0 - trust.FLAT
 
 
 @dataclass(frozen=True)
@@ -252,9 +252,18 @@ def _beyond(
         trials = judging.judge(other, fresh_seed, study(judging.as_flown(other)).requirements)
         both = trials.finished & judged.finished
         there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged))
-        met = all(v.met for v in judging.verdicts_of(other, trials, fresh_seed)) and bool(np.all(trials.ok))
-        found[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, met)
+        broken = _broken(judging.verdicts_of(other, trials, fresh_seed), trials)
+        found[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, broken)
     return found
+
+
+def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
+    """The first requirement that is broken, or how many trials fail, in words."""
+    for one in verdicts:
+        if not one.met:
+            return str(one)
+    lost = int(np.count_nonzero(~trials.ok))
+    return f"{lost} of {trials.status.size} fresh trials do not arrive" if lost else None
 
 
 def _prepare(scenario: Scenario) -> None:
