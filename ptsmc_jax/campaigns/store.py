@@ -95,9 +95,9 @@ def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, 
     try:
         known = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
-        return "something else"
+        return "files, but no scenario.toml of a run that can be read"
     if not there or not all(isinstance(table, dict) for table in known.values()):
-        return "something else"
+        return "files, but no versions.json of a run that can be read"
     wanted = json.loads(json.dumps(_named(scenario)))
     for name, value in made_by.items():
         if there.get(name) != value:

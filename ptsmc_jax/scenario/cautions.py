@@ -1,4 +1,4 @@
-"""What is odd about a scenario though it flies: bounds far off its disturbance, an estimate that is mostly noise."""
+"""What is odd about a scenario though it flies: bounds far off its disturbance, a mostly noisy estimate, no gyro."""
 
 from typing import Any
 
@@ -13,7 +13,21 @@ FAR = 10.0  # times off, from which on a stated bound is said to be
 def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
     found = disturbance_bounds.of(scenario, scenario.inputs)
-    return [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
+    bounded = [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
+    return [*bounded, *_perfect_rate(scenario)]
+
+
+def _perfect_rate(scenario: Scenario) -> list[str]:
+    """A star tracker with noise beside a gyro of which nothing is said: its rate is the true one."""
+    device: Any = scenario.hardware
+    star = getattr(device, "attitude_noise", None)
+    gyro = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
+    if not star or scenario.sensors is not None or any(getattr(device, name) is not None for name in gyro):
+        return []
+    return [
+        f"hardware.attitude_noise is {star:g}, but no error of the gyro is given: the law knows the body's rate "
+        "perfectly; give hardware.rate_noise or rate_noise_density, or rate_noise = 0 if that is meant"
+    ]
 
 
 def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:

@@ -1,5 +1,6 @@
 """What parts of one's own do where a run begins: that they fit, in one sentence, before anything is flown."""
 
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -96,6 +97,29 @@ def _kind(value: Any) -> str:
     return f"{value.dtype.name.replace('float', 'f')}{value.shape}"
 
 
+def _described(returned: Any) -> str:
+    """What a method returned, in words."""
+    if returned is None:
+        return "nothing"
+    if isinstance(returned, jax.Array):
+        return f"an array of shape {returned.shape}"
+    count = f"{len(returned)} values" if isinstance(returned, tuple | list) else None
+    return count or f"a {type(returned).__name__}"
+
+
+def _changed(parts: Parts, drawn: Parts) -> str:
+    """Which of the parts has another structure than it had."""
+    for field in dataclasses.fields(parts):
+        was, now = (getattr(one, field.name) for one in (parts, drawn))
+        if jax.tree.structure(was) != jax.tree.structure(now):
+            return f"{field.name} {_kind_of(now)} in place of {_kind_of(was)}"
+    return "other parts in them"
+
+
+def _kind_of(part: Any) -> str:
+    return "absent" if part is None else _described(part)
+
+
 def _disturbance(parts: Parts, signal: Any, ask: _Asked) -> None:
     d = ask("__call__", signal, jnp.zeros_like(parts.t_end), parts.initial)
     ask.check("__call__", "a disturbance", d, (parts.plant.inputs,))
@@ -117,7 +141,7 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
     period = jnp.asarray(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
     returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
     if not isinstance(returned, tuple) or len(returned) != 2:
-        raise ask.refused("see", "something else", "the state as seen and its memory")
+        raise ask.refused("see", _described(returned), "the state as seen and its memory")
     was, now = (jax.tree.map(_kind, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
     if was != now:
         raise ask.refused("see", f"a state {now}", f"one as the plant's, {was}")
@@ -133,7 +157,8 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
     drawn = ask("at", own.at, c, parts)
     was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))
     if jax.tree.structure(was) != jax.tree.structure(now):
-        raise ask.refused("at", "something else", "the parts with other numbers, by dataclasses.replace")
+        what = f"parts with {_changed(parts, drawn)}" if isinstance(drawn, Parts) else _described(drawn)
+        raise ask.refused("at", what, "the parts with other numbers, by dataclasses.replace")
     for one, other, value in zip(*map(jax.tree.leaves, (was, now, drawn)), strict=True):
         if one != other:
             raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
@@ -174,7 +199,7 @@ def _law(parts: Parts, ask: _Asked) -> None:
     wanted = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
     wanted = wanted[: 2 if method == "acceleration" else 3]
     if not isinstance(returned, tuple) or len(returned) != len(wanted):
-        raise ask.refused(method, "something else", ", ".join(wanted))
+        raise ask.refused(method, _described(returned), ", ".join(wanted))
     ask.check(method, wanted[0], returned[0], (m,))
     ask.check(method, wanted[1], returned[1], (m,))
     if method != "acceleration":

@@ -244,3 +244,21 @@ def test_the_disturbance_that_is_built_keeps_within_its_bounds():
     found = disturbance_bounds.along_the_run(said, signal, 3)
     assert 0.2 * size < found.size.max() <= size
     assert found.rate.max() <= rate
+
+
+@pytest.mark.parametrize(
+    ("hardware", "said"),
+    [
+        ({"attitude_noise": 2e-5}, True),
+        ({"attitude_noise": 2e-5, "torque_limit": 0.5}, True),
+        ({"attitude_noise": 2e-5, "rate_noise": 0.0}, False),  # said, and meant
+        ({"attitude_noise": 2e-5, "rate_noise_density": 1e-6}, False),
+        ({"attitude_noise": 2e-5, "rate_bias": 1e-6}, False),
+        ({"attitude_noise": 0.0}, False),
+        ({"torque_limit": 0.5}, False),
+    ],
+)
+def test_a_star_tracker_without_a_gyro_is_said(hardware, said):
+    found = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
+    assert [one for one in found if "hardware.attitude_noise is 2e-05" in one and "perfectly" in one] == found
+    assert bool(found) == said

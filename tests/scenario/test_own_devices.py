@@ -192,7 +192,7 @@ def test_keys_of_both_are_read_written_and_known_as_programs(command, here):
 
 SEES = [
     ("def see", "def seen", "the class Noisy has no method see"),
-    ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen", "see returns something else at t = 0"),
+    ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen", "see returns an array of shape"),
     ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
@@ -201,8 +201,9 @@ SEES = [
 DRAWS = [
     ("std: float = 0.1", "std: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
     ("def at", "def be", "the class Drift has no method at"),
-    ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns something else"),
+    ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns a dict at t = 0"),
     ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
+    ("initial=parts.initial + 0.01 * c[1]", "initial=None", "parts with initial absent in place of an array of shape"),
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),

@@ -218,8 +218,9 @@ BAD = [
     (changed("return 0.5 * wanted, s", "return jnp.zeros(2), s"), {}, "acceleration", "shape"),
     (
         changed("return 0.5 * wanted, s", "return 0.5 * wanted"), {},
-        "acceleration returns something", "an acceleration, a sliding variable",
+        "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
     ),
+    (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
     (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or step"),
     (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
     (
@@ -258,7 +259,7 @@ BAD = [
     (LAW, {"code": "gone.py:Mine"}, "the file gone.py is not there", "gone.py"),
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
-    (REMEMBERS, {}, "step returns something", "a sliding variable, its memory"),
+    (REMEMBERS, {}, "step returns 2 values", "a sliding variable, its memory"),
     (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "step returns a memory f64(2,)", "f64(1,)"),
 ]
 # fmt: on
