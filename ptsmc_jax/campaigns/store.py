@@ -74,8 +74,7 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
     if fresh:
         end(folder)
         (folder / "summary.json").unlink(missing_ok=True)  # it would pass for this run's
-    write_toml(folder / "scenario.toml", scenario)
-    write_json(folder / "versions.json", versions(**made_by))
+    record(folder, scenario, made_by)
     (folder / JOURNAL).touch()
     return folder / JOURNAL
 
@@ -152,6 +151,16 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
                 os.replace(path, target)
     finally:
         shutil.rmtree(making, ignore_errors=True)
+
+
+def record(
+    folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any], summary: Mapping[str, Any] | None = None
+) -> None:
+    """Write what every result folder has: the scenario's tables, what made it (`versions`), and its summary if any."""
+    write_toml(folder / "scenario.toml", scenario)
+    write_json(folder / "versions.json", versions(**made_by))
+    if summary is not None:
+        write_json(folder / "summary.json", summary)
 
 
 def write_toml(path: Path, tables: Mapping[str, Any]) -> None:

@@ -108,8 +108,8 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
     header, rows = table(made, seed, trials)
     write_program(folder, made)
     store.write_csv(folder / "vectors.csv", header, rows)
-    store.write_toml(folder / "scenario.toml", parsing.dump(made.scenario))
-    store.write_json(folder / "versions.json", store.versions("export", seed, **own.digests(made.scenario)))
+    made_by = {"command": "export", "seed": seed, **own.digests(made.scenario)}
+    store.record(folder, parsing.dump(made.scenario), made_by)
 
 
 def write_program(folder: Path, made: Controller) -> None:

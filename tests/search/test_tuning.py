@@ -276,6 +276,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert [step.start for step in found.history] == sorted(step.start for step in found.history)
     assert {step.start for step in found.history} == set(range(3))
     assert sum(told[0] == "searching" for told in seen) == 2 * 3  # three starts on two rungs
+    assert not any(np.isinf(told[3:]).any() for told in seen)  # where nothing is found yet there is no goal to tell
     # 64 points are swept, and 16 trials screened twice
     assert evaluate.rollouts == 64 * found.problem.trials.size + 2 * 16
     # twice half of the steps from the scenario's gains, and the limits there; twice half of them from each start, all

@@ -38,6 +38,11 @@ class Best:
         """The less, the better."""
         return self.over, self.f
 
+    @property
+    def so_far(self) -> tuple[float, float]:
+        """Its goal, and how far it is beyond a limit; not numbers where none has been offered."""
+        return (self.value, self.over) if np.isfinite(self.f) else (np.nan, np.nan)
+
     def offer(self, share: np.ndarray, seen: Measured) -> None:
         """Keep the best of these points, (points, gains), if it is better; admissible is what keeps the margin."""
         worst = largest(seen.c, self.margin)

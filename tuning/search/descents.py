@@ -106,7 +106,7 @@ class Descents:
     @property
     def best_so_far(self) -> tuple[float, float]:
         """The goal of the best point, and how far it is beyond a limit."""
-        return (np.nan, np.nan) if self._best is None else (self._best.value, self._best.over)
+        return (np.nan, np.nan) if self._best is None else self._best.so_far
 
     @property
     def best(self) -> Best:
@@ -214,7 +214,7 @@ class Descents:
             known = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
             best = min(known, key=lambda best: best.rank)
             while told < len(bests):  # once for each that has begun
-                self._report(what, told, len(starts), best.value, best.over)
+                self._report(what, told, len(starts), *best.so_far)
                 told += 1
 
         def flown(points: list[np.ndarray]) -> list[Sloped]:
@@ -257,7 +257,7 @@ class Descents:
         best.offer(share[None], self._evaluate.fly(tightened, share[None]))
         try:
             evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
-                   lambda done, steps: self._report(EVOLVING, done, steps, best.value, best.over),
+                   lambda done, steps: self._report(EVOLVING, done, steps, *best.so_far),
                    partial(self._keep, 0), size)  # fmt: skip
         finally:  # interrupted too
             self._take(best, tightened, 0, afresh=True)

@@ -301,10 +301,8 @@ def summary(made: Comparison) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    store.write_json(folder / "versions.json", store.versions(**known_by))
     said = summary(made)
-    store.write_json(folder / "summary.json", said)
+    store.record(folder, parsing.dump(scenario), known_by, said)
     (folder / "scenarios").mkdir()
     for law, one in made.contenders.items():
         named = own_parts.carry(parsing.dump(one.flown), folder / "scenarios")

@@ -226,10 +226,9 @@ def spillover(scenario: Scenario, x: Axis, y: Axis, cells: list[Cell]) -> dict[s
 
 def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
     trials = max((cell.trials for cell in cells), default=0)
-    source = own.digests(scenario)
-    store.write_json(folder / "versions.json", store.versions("map", seed, x=x.text, y=y.text, trials=trials, **source))
+    made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **own.digests(scenario)}
+    store.record(folder, parsing.dump(scenario), made_by)
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)
     rows = [["" if value != value else value for value in row] for row in cells_of]

@@ -290,9 +290,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_by: dict[str, Any]) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    store.write_json(folder / "versions.json", store.versions(**known_by))
-    store.write_json(folder / "summary.json", summary(front, scenario))
+    store.record(folder, parsing.dump(scenario), known_by, summary(front, scenario))
     names = gains.named(scenario)
     header = ["limit", *names, "rms_window_error", "rms_low", "rms_high", "peak_torque", "mean_peak_torque",
               "failures", "meets", "dominated", "knee", "trained_goal"]  # fmt: skip

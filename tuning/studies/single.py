@@ -32,10 +32,8 @@ def write(
     folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool, **computer: Any
 ) -> None:
     """Fill a result folder; computer: what is known of the program that decided, where that is not the parts' own."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    source = own.digests(scenario)
-    store.write_json(folder / "versions.json", store.versions("simulate", seed, trial=trial, **source))
-    store.write_json(folder / "summary.json", {**summary(run, scenario), **computer})
+    made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
+    store.record(folder, parsing.dump(scenario), made_by, {**summary(run, scenario), **computer})
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:

@@ -190,9 +190,7 @@ def summary(found: Slews, scenario: Scenario) -> dict[str, Any]:
 
 def write(folder: Path, scenario: Scenario, found: Slews, figures: bool, known_by: dict[str, Any]) -> None:
     """Fill a result folder."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    store.write_json(folder / "versions.json", store.versions(**known_by))
-    store.write_json(folder / "summary.json", summary(found, scenario))
+    store.record(folder, parsing.dump(scenario), known_by, summary(found, scenario))
     names, costs = gains.named(scenario), _costs(scenario)
     header = ["t_f", *names, "rms_window_error", "rms_low", "rms_high", *costs, "failures", "meets"]
     rows = [

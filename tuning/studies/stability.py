@@ -116,10 +116,8 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
 def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     """Fill a result folder."""
     scenario = ready.scenario
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
-    source = own.digests(scenario)
-    store.write_json(folder / "versions.json", store.versions("margins", None, **source))
-    store.write_json(folder / "summary.json", summary(ready, course))
+    made_by = {"command": "margins", "seed": None, **own.digests(scenario)}
+    store.record(folder, parsing.dump(scenario), made_by, summary(ready, course))
     inputs, _ = names(ready)
     t_f = float(ready.parts.controller.t_f)
     rows = [

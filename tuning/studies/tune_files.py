@@ -155,10 +155,8 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
     """Fill a result folder; known_by: see `identity`."""
-    store.write_toml(folder / "scenario.toml", parsing.dump(scenario))
+    store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
     store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
-    store.write_json(folder / "versions.json", store.versions(**known_by))
-    store.write_json(folder / "summary.json", summary(tuning))
     assert scenario.tune is not None
     objective = scenario.tune.objective
     goal = objective if objective == "t_f" else f"{objective}_window_error"
