@@ -1,9 +1,12 @@
 """Progress where the output is redirected."""
 
+import time
+
 import numpy as np
+import pytest
 
 from ptsmc_jax.numerics import statistics
-from tuning.output import law_sentences, sentences
+from tuning.output import campaign_terminal, law_sentences, progress_lines, sentences, terminal
 from tuning.output.progress_lines import Lines
 
 
@@ -15,6 +18,21 @@ def test_a_line_every_ten_seconds_where_no_terminal_shows_a_bar(capsys):
     assert capsys.readouterr().err.splitlines() == ["ptsmc: searching, 1 of 7, 10 s", "ptsmc: searching, 3 of 7, 21 s"]
     at = iter([0.0, 99.0])
     Lines(silent=True, clock=lambda: next(at))("searching", 1, 7)
+    assert not capsys.readouterr().err
+
+
+def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
+    """As where a law is compiled for minutes: what was said last, and how long ago the command began."""
+    monkeypatch.setattr(progress_lines, "EVERY", 0.05)
+    with terminal.Progress(quiet=False) as tell:  # the tests' output is no terminal
+        tell("pd: compiling", 0, 0)
+        time.sleep(0.4)
+    said = capsys.readouterr().err.splitlines()
+    assert 3 <= said.count("ptsmc: pd: compiling, 0 s") <= 8
+    time.sleep(0.2)
+    assert not capsys.readouterr().err
+    with terminal.Progress(quiet=True):
+        time.sleep(0.2)
     assert not capsys.readouterr().err
 
 
@@ -61,3 +79,20 @@ def test_of_inputs_that_rank_the_trials_alike_only_the_first_is_a_driver():
     angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)
     inputs = {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "other": other}
     assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]
+
+
+@pytest.mark.parametrize(
+    ("off", "rounding", "said", "unsaid"),
+    [
+        (0.0, 0.0, ["equal to its row, to the last digit", "same flight to round-off"], "NOT"),
+        (7e-16, 3e-15, ["the same as its row to round-off: 7.0e-16 off at most", "differ by 3e-15 at most"], "NOT"),
+        (2e-3, 3e-15, ["NOT the same as its row: 2.0e-03 off", "versions.json"], "its row to round-off"),
+        (np.inf, 0.1, ["NOT the same as its row: it ends another way", "1.0e-01 off at most, relative; a loop"], "inf"),
+        (None, 0.0, ["no row of this trial yet"], "NOT"),
+    ],
+)
+def test_round_off_of_a_replay_does_not_read_as_a_fault(capsys, off, rounding, said, unsaid):
+    campaign_terminal.replayed(off, rounding, 1e-12)
+    out = capsys.readouterr().out
+    assert all(words in out for words in said)
+    assert unsaid not in out

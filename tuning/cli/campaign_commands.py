@@ -242,7 +242,7 @@ def replay(
     store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, trial, figures))
     if not quiet:
         terminal.run(single.summary(found.run, opened.scenario), opened.scenario.plant.kind, place)
-        campaign_terminal.replayed(found.off, found.rounding)
+        campaign_terminal.replayed(found.off, found.rounding, campaign_summary.SAME)
     return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
 
 

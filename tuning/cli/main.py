@@ -102,7 +102,9 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     configure(keep_programs=True)
     from tuning.studies import reproduction
 
-    made = reproduction.reproduce()
+    with terminal.Progress(quiet) as report:
+        report("flying the paper's figures", 0, 0)
+        made = reproduction.reproduce()
     store.write(folder, lambda making: reproduction.write(making, made, figures))
     if not quiet:
         terminal.reproduction(reproduction.summary(made), folder)
@@ -172,7 +174,9 @@ def margins(
     store.check(folder, force)
     from tuning.studies import stability
 
-    ready, course = stability.find(loaded)
+    with terminal.Progress(quiet) as report:
+        report("linearising the loop", 0, 0)
+        ready, course = stability.find(loaded)
     store.write(folder, lambda making: stability.write(making, ready, course, figures))
     found = stability.summary(ready, course)
     if not quiet:

@@ -30,11 +30,13 @@ class Progress:
         self._started: tuple[float, int] | None = None
 
     def __enter__(self) -> "Progress":
+        self._lines.__enter__()
         self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+        self._lines.__exit__()
 
     def __call__(self, standing: Any) -> None:
         """standing: a `campaign.Tally`."""
@@ -102,10 +104,32 @@ def why(told: list[dict[str, Any]]) -> None:
         terminal.say(f"{metric} {mine[0]['value']:.4g} in trial {trial}: {', '.join(said)}")
 
 
-def replayed(off: float | None, rounding: float) -> None:
-    """How far a trial flown again is off its row, and the run with its history off both."""
+ROUND_OFF = 1e-9  # relative: of another program's metrics, where the loop magnifies it as loops do
+
+
+def replayed(off: float | None, rounding: float, same: float) -> None:
+    """How far a trial flown again is off its row, and the run with its history off both; same: what counts as equal."""
     if off is None:
         print("the campaign has no row of this trial yet")
+    elif off == 0.0:
+        print("the trial flown again is equal to its row, to the last digit")
+    elif off <= same:
+        print(f"the trial flown again is the same as its row to round-off: {off:.1e} off at most, relative")
     else:
-        print("equal to its row, to the last digit" if off == 0.0 else f"off its row by {off:.1e} at most, relative")
-    print(f"the history is another program's: its metrics differ by {rounding:.0e} at most, relative, by rounding")
+        print(
+            f"the trial flown again is NOT the same as its row: {_apart(off)}; versions.json says which versions "
+            "and which machine the row is of"
+        )
+    if rounding <= ROUND_OFF:
+        print(f"the history is the same flight to round-off: its metrics differ by {rounding:.0e} at most, relative")
+    else:
+        print(
+            f"the history is flown by a program of its own, and its metrics differ: {_apart(rounding)}; a loop that "
+            "chatters or breaks off magnifies round-off so"
+        )
+
+
+def _apart(off: float) -> str:
+    if off == float("inf"):
+        return "it ends another way, or has other values missing"
+    return f"{off:.1e} off at most, relative"

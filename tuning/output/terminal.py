@@ -38,11 +38,13 @@ class Progress:
         self._total, self._task = 0, self._bar.add_task("compiling", total=None)
 
     def __enter__(self) -> "Progress":
+        self._lines.__enter__()
         self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+        self._lines.__exit__()
 
     def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
         """What is being done, steps done and in all; the best goal so far, how far it is beyond a limit."""

@@ -202,6 +202,7 @@ def compare(
     others, refused = judging.beside(scenario)
     made = {}
     if "paper" in others:
+        tell("the paper's gains: judging on fresh trials", 0, 0, np.nan, 0.0)
         made["paper"] = _with_more(_papers(judging.as_flown(others["paper"]), fresh_seed), fresh_seed)
     stopped = False
     for law, posed in rivals.items():
@@ -215,7 +216,7 @@ def compare(
         stopped = tuned.search.interrupted
         if stopped:
             break
-        report("flying with what it is not told", 0, 0, np.nan, 0.0)
+        report("judging with another inertia and delay than it knows", 0, 0, np.nan, 0.0)
         made[law] = _with_more(made[law], fresh_seed)
     return Comparison(made, fresh_seed, stopped, refused)
 
