@@ -375,6 +375,27 @@ def test_a_law_flies_what_its_step_remembers():
     assert dataclasses.is_dataclass(Integral)
 
 
+@pytest.mark.parametrize("clock", ["anchored", "flight"])
+def test_a_law_finds_the_first_error_in_its_first_sample(clock):
+    """On the anchored clock periods without a length, which remember nothing, come before it."""
+
+    class First(ptsmc.AccelerationLaw):
+        k: float = ptsmc.gain(1.0, (0.1, 2.0))
+
+        def begin(self):
+            return jnp.full(self.model.inputs, jnp.nan)
+
+        def step(self, memory, now, error, error_rate, bound):
+            start = jnp.where(now.t == 0.0, error, memory)
+            return -self.k * error - 2.0 * error_rate, start, start
+
+    table = {"kind": "own", "code": First, "t_f": 5.03, "delta": 0.5}  # no whole number of periods
+    log = flown({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
+    kept = np.asarray(log.has_length)
+    assert kept.any()
+    np.testing.assert_array_equal(np.asarray(log.s)[kept], np.asarray(log.x)[kept][0, 0])
+
+
 def test_a_commented_scenario_keeps_keys_of_ones_own(command, here):
     (here / "s.toml").write_text(f"{(ROOT / 'scenarios' / 'own_parts.toml').read_text()}")
     for name in ("own_parts.py",):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
@@ -341,3 +342,30 @@ def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):
     assert (status, err.count("\n")) == (2, 1)
     assert "gone.py is not there" in err
     assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_law_is_built_once_before_the_search(command, tmp_path, monkeypatch):
+    """And one that cannot fly is refused before a folder is begun, a built-in one too."""
+    built = []
+
+    def built_and(posed):
+        built.append(posed.controller.kind)
+        if posed.controller.kind == refused:
+            raise scenario.ScenarioError("no such luck")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compare, "study", built_and)
+    monkeypatch.setattr(compare.judging, "beside", lambda _: ({}, None))
+    monkeypatch.setattr(compare.tuner, "tune", interrupted)
+    shutil.copy(ROOT / "scenarios" / "own_parts.py", tmp_path)
+    asked = "compare", "s.toml", "--law", "own_parts.py:Scaling", "--against", "pd"
+    refused = "pd"
+    status, _, err = command(*asked)
+    assert (status, "the law pd cannot fly this: no such luck" in err) == (2, True)
+    assert not (tmp_path / "out").exists()
+    refused, built[:] = None, []
+    assert command(*asked)[0] == 130
+    assert built == ["prescribed_time", "pd", "own"]

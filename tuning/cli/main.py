@@ -1,5 +1,6 @@
 """The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -288,12 +289,12 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = _with_tune(loaded)
-    if law:  # before a folder is begun
-        comparing.that_fly(loaded, comparing.Rivals((), law))
+    posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals)
     return _search(
         loaded, folder, known_by, force, quiet, "",
-        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, rivals),
+        check=posed,
+        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
         summary=comparing.summary,
         shown=terminal.comparison,
@@ -370,8 +371,12 @@ def _search(
     write: Callable[[Path, Any], None],
     summary: Callable[[Any], dict[str, Any]],
     shown: Callable[[dict[str, Any], Path, str], None],
+    check: Callable[[], Any] = lambda: None,
 ) -> int:
-    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
+    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status.
+
+    check: what it refuses besides the scenario, before a folder is begun.
+    """
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing, study
 
@@ -385,6 +390,7 @@ def _search(
     if not going_on:
         store.check(folder, force)
     study(loaded)  # what it refuses, it refuses before the search
+    check()
     from tuning.search.journal import Journal
 
     journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))

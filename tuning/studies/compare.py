@@ -194,11 +194,18 @@ def _with_more(one: Contender, fresh_seed: int) -> Contender:
 
 
 def compare(
-    scenario: Scenario, seed: int, tell: Report, journal: Journal | None = None, against: Rivals = Rivals()
+    scenario: Scenario,
+    seed: int,
+    tell: Report,
+    journal: Journal | None = None,
+    rivals: Mapping[str, Scenario] | None = None,
 ) -> Comparison:
-    """Tune every law, and judge them and the paper's gains on trials that none of them saw."""
+    """Tune every law, and judge them and the paper's gains on trials that none of them saw.
+
+    rivals: the scenario under each law, as `that_fly` gives them; None: all of them.
+    """
     fresh_seed = judging.seed_of_judge(seed)
-    rivals = that_fly(scenario, against)
+    rivals = that_fly(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
     made = {}
     if "paper" in others:
