@@ -106,7 +106,7 @@ HOUSE = {
             page terminal
             campaign_terminal
         """,
-        "cli": "options | campaign_commands flight_commands convert new | writing_commands | main",
+        "cli": "options | campaign_commands flight_commands convert new searches | writing_commands | main",
     },
 }
 

@@ -2,14 +2,13 @@
 
 import functools
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
 import ptsmc_jax
-from tuning.cli import campaign_commands, flight_commands, writing_commands
+from tuning.cli import campaign_commands, flight_commands, searches, writing_commands
 from tuning.cli.options import (
     INTERRUPTED,
     Against,
@@ -34,7 +33,7 @@ from tuning.errors import UsageError
 from tuning.output import terminal
 
 if TYPE_CHECKING:
-    from ptsmc_jax.scenario.tables import Scenario
+    pass
 
 app = App(
     name="ptsmc",
@@ -45,7 +44,6 @@ app = App(
 )
 
 LONG = 20_000  # integration steps of a run that takes more than a moment
-_STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
 
 
 @app.command
@@ -211,10 +209,10 @@ def tune(
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from tuning.studies import tune_files, tuner
 
-    loaded = _with_tune(loaded)
+    loaded = searches.with_tune(loaded)
     goal = tuner.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
     known_by = tune_files.identity(loaded, seed, globally=global_check)
-    return _search(
+    return searches.run(
         loaded, folder, known_by, force, quiet, goal,
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, found: tune_files.write(making, loaded, found, figures, known_by),
@@ -250,9 +248,9 @@ def pareto(
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
     from tuning.studies import fronts
 
-    loaded = _with_tune(loaded)
+    loaded = searches.with_tune(loaded)
     front = fronts.KINDS[against](loaded, seed, points or 20, chosen)
-    return _search(
+    return searches.run(
         loaded, folder, front.known_by, force, quiet, "window error", work=front.trace,
         write=lambda making, found: front.write(making, found, figures),
         summary=front.summary,
@@ -288,10 +286,10 @@ def compare(
     rivals = comparing.Rivals(against, law)
     rivals.check()
     comparing.check(loaded)
-    loaded = _with_tune(loaded)
+    loaded = searches.with_tune(loaded)
     posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals)
-    return _search(
+    return searches.run(
         loaded, folder, known_by, force, quiet, "",
         check=posed,
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
@@ -350,59 +348,3 @@ def _expected(error: ValueError) -> bool:
 def _fail(sentence: str) -> None:
     print(f"ptsmc: {sentence}", file=sys.stderr)
     sys.exit(2)
-
-
-def _with_tune(scenario: "Scenario") -> "Scenario":
-    """The scenario with a `tune` table, the default one where it has none."""
-    from ptsmc_jax.scenario import replace
-
-    return scenario if scenario.tune is not None else replace(scenario, tune={})
-
-
-def _search(
-    loaded: "Scenario",
-    folder: Path,
-    known_by: dict[str, Any],
-    force: bool,
-    quiet: bool,
-    goal: str,
-    *,
-    work: Callable[..., Any],
-    write: Callable[[Path, Any], None],
-    summary: Callable[[Any], dict[str, Any]],
-    shown: Callable[[dict[str, Any], Path, str], None],
-    check: Callable[[], Any] = lambda: None,
-) -> int:
-    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status.
-
-    check: what it refuses besides the scenario, before a folder is begun.
-    """
-    from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import parsing, study
-
-    tables = parsing.dump(loaded)
-    done = None if force else store.previous(folder, tables, known_by)
-    if done is not None and done["status"] != "interrupted":
-        if not quiet:
-            shown(done, folder, "already done")
-        return _STATUS[done["status"]]
-    going_on = not force and store.begun(folder, tables, known_by)
-    if not going_on:
-        store.check(folder, force)
-    study(loaded)  # what it refuses, it refuses before the search
-    check()
-    from tuning.search.journal import Journal
-
-    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
-    try:
-        with terminal.Progress(quiet, goal) as report:
-            found = work(report, journal)
-    except KeyboardInterrupt:
-        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
-        return _STATUS["interrupted"]
-    store.write(folder, lambda making: write(making, found))
-    if found.status != "interrupted":
-        store.end(folder)
-    if not quiet:
-        shown(summary(found), folder, "interrupted" if found.status == "interrupted" else "done")
-    return _STATUS[found.status]
