@@ -99,11 +99,15 @@ def profiles(gains: Mapping[str, tuple[str, np.ndarray, np.ndarray, np.ndarray, 
 
 
 def tradeoff(
-    sets: Mapping[str, tuple[ArrayLike, ArrayLike]], limit: float | None = None, kind: str = "spacecraft"
+    sets: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    limit: float | None = None,
+    kind: str = "spacecraft",
+    floor: float | None = None,
 ) -> Figure:
     """Accuracy against torque, a point a trial, in the units of this kind of plant.
 
-    sets: label -> (window errors (trials,) [-], peak torques (trials,) [N m]).
+    sets: label -> (window errors (trials,) [-], peak torques (trials,) [N m]); limit: of the torque; floor: RMS error
+    that no controller can beat.
     """
     error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
@@ -115,8 +119,10 @@ def tradeoff(
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
     if limit is not None:
         axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
+    if floor:
+        axes.axvline(floor, color="0.3", lw=1.0, ls=":", label=f"floor {floor:.2g}")
     axes.set_xlabel(f"window error [{error_unit}]")
-    _legend_below(figure, len(arrays) + 1, columns=1)
+    _legend_below(figure, len(arrays) + 2, columns=1)
     return figure
 
 

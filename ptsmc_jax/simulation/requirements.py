@@ -127,7 +127,8 @@ def time_text(
     met: bool,
 ) -> str:
     """The verdict on a limit that is to be kept for a share of the time, in one line; see `Verdict`."""
-    wanted = f"{metric} at most {limit:g} {unit} in {100 * probability:g} % of {INTERPRETATIONS[interpretation]}"
+    most = f"{limit:g} {unit}{_in_degrees(limit, unit)}"
+    wanted = f"{metric} at most {most} in {100 * probability:g} % of {INTERPRETATIONS[interpretation]}"
     if interpretation == "temporal":
         seen = f"the least of a run is {100 * share_of_time:.6g} %"
         beyond = "" if met or trials == 1 else f", {failures} of {trials} runs have less"
@@ -151,7 +152,7 @@ def verdict_text(
     at_least: bool = False,
 ) -> str:
     """A verdict in one line; worst: None or NaN where a trial failed or has no value, or is infinite."""
-    wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -")
+    wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -") + _in_degrees(limit, unit)
     if quantile is not None:
         wanted += f" in {100 * quantile:g} % of trials"
         wanted += f" with {100 * confidence:g} % confidence" if confidence is not None else ""
@@ -160,7 +161,7 @@ def verdict_text(
     elif worst is None or worst != worst:
         seen = "no value" if trials == 1 else "no worst value"
     else:
-        seen = f"worst {worst:.4g}" if trials > 1 else f"{worst:.4g}"
+        seen = ("worst " if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, unit)
     least = must_keep(trials, quantile, confidence)
     if least is None:
         assert quantile is not None
@@ -170,6 +171,11 @@ def verdict_text(
         return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} trials" if failures else "")
     allowed = f", at most {trials - least} allowed" if trials > least else ""
     return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} trials{allowed}" if trials > 1 else "")
+
+
+def _in_degrees(value: float, unit: str) -> str:
+    """What an angle is in the unit that engineers state it in, or a rate; nothing of what is neither."""
+    return f" ({math.degrees(value):.4g} {unit.replace('rad', 'deg')})" if unit in ("rad", "rad/s") else ""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     for place in (said, checked(tmp_path / FOLDER).text):
         assert "pointing from 0.5 s after t_f to t_end, boresight 1, 0, 0" in place
         assert "shown by 1109 runs without a failure; with 90 % confidence 852 would do" in place
-        assert "ape_boresight at most 0.01 rad in 50 % of the time of all runs" in place
+        assert "ape_boresight at most 0.01 rad (0.573 deg) in 50 % of the time of all runs" in place
     table = pointing_sentences.compliance(found)
     assert table is not None
     assert [row[:7] for row in table.rows] == [
@@ -99,4 +99,4 @@ def test_a_single_run_knows_the_indices(command, flown, tmp_path):
     for name in ("ape_x", "rpe_boresight", "mke_z", "within_ape_boresight"):
         assert made[name] == pytest.approx(row[name], rel=1e-9), name
     assert code == (0 if all(told["met"] for told in made["verdicts"].values()) else 1)
-    assert "ake_x at most 0.0001 rad in 99.73 % of the time, in every run" in said
+    assert "ake_x at most 0.0001 rad (0.00573 deg) in 99.73 % of the time, in every run" in said

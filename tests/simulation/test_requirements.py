@@ -70,6 +70,13 @@ def test_a_verdict_in_words():
     assert str(verdict([0.1], metric="saturated")) == "saturated at most 0.5: 0.1: met"
 
 
+def test_angles_are_in_degrees_too():
+    turned = Requirement("hold_angle", np.deg2rad(0.1)).verdict(np.deg2rad([0.05, 0.02]), np.array([True, True]))
+    assert str(turned) == "hold_angle at most 0.00174533 rad (0.1 deg): worst 0.0008727 (0.05 deg): met"
+    turning = Requirement("peak_rate", np.deg2rad(2.0)).verdict(np.deg2rad(3.0), np.array(True))
+    assert str(turning) == "peak_rate at most 0.0349066 rad/s (2 deg/s): 0.05236 (3 deg/s): NOT met"
+
+
 @pytest.mark.parametrize("quantile", [0.5, 0.9, 0.99, 0.9973])
 @pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
 @pytest.mark.parametrize("trials", [10, 100, 1000, 5000])

@@ -5,7 +5,7 @@ import tomllib
 import numpy as np
 
 from ptsmc_jax import scenario
-from tests.helpers import SHORT, small_search
+from tests.helpers import ROOT, SHORT, small_search
 from tuning.output import search_sentences
 from tuning.search import worst
 from tuning.studies import judging, tune_files, tuner
@@ -40,3 +40,11 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
     once = tuner.tune(loaded, 0, trusted=False, tries=1)
     assert once.gains == first.gains
     assert not once.met
+
+
+def test_a_default_is_what_it_stands_for():
+    """The filter's bandwidth is not stated: the paper's gains with the number that stands for it are the same gains."""
+    own = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
+    assert list(judging.beside(own)[0]) == ["paper"]
+    other = scenario.replace(own, filter__bandwidth=0.2)
+    assert list(judging.beside(other)[0]) == ["paper", "before"]

@@ -213,6 +213,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
             },
             limit,
             kind,
+            tuning.floors["tuned"],
         ),
     }
     if tuning.trust is not None:
