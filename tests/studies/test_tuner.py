@@ -43,8 +43,8 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
 
 
 def test_a_default_is_what_it_stands_for():
-    """The filter's bandwidth is not stated: the paper's gains with the number that stands for it are the same gains."""
+    """The bandwidth of the filter is not stated: with the number that stands for it, gains are the same."""
     own = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
     assert list(judging.beside(own)[0]) == ["paper"]
-    other = scenario.replace(own, filter__bandwidth=0.2)
+    other = scenario.replace(own, controller__eta=4.0)
     assert list(judging.beside(other)[0]) == ["paper", "before"]
