@@ -32,7 +32,7 @@ least one control period, is said when a scenario is refused."""
 METRICS = """\
 What a run is judged by: in `summary.json`, in the rows of a campaign and in `[requirements]`. Over trials
 `window_error` pools as RMS and stands beside its `floor`, what no controller can beat ([the
-method](method.md#the-floor) says what that takes as known); of the others mean, largest and quantiles are told. A run
+method](method.md#the-floor) says what that takes as known); of the others mean, largest and quantiles are given. A run
 that never settles has no `settling_time` (null). A trial that diverged or met a singularity has a status, a reason and
 its first bad time, and breaks every requirement; so does one that never settles a limit on `settling_time`. A run that
 ends with another metric infinite or without a value (an error whose square no number holds) counts as diverged at
@@ -49,8 +49,9 @@ component of the rotation vector from the reference to the body, in body axes; a
 the boresight points and where it should, and what is a mean or a difference of such is one of arcs on the sphere, laid
 flat. They are taken at the ends of control periods, at the observation's begin and at the ends of windows, means over
 all of the time; half-cones of RPE, PDE and RKE are known to 0.5 %, and said so much too large. PDE is the largest
-difference between the means of any two windows. What the law is told (AKE, MKE, RKE: with noise or a filter only) holds
-from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of the time."""
+difference between the means of any two windows. What the law is given (AKE, MKE, RKE: with noise or a filter only)
+holds from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of the
+time."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing

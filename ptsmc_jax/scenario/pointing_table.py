@@ -14,7 +14,7 @@ class Pointing(Table, frozen=True):
     """What pointing error indices (ECSS-E-ST-60-10C) are taken of: from `after` t_f to t_end, in windows.
 
     Attributes:
-        boresight: direction of an instrument in body axes, of any length; its half-cones are told beside the axes
+        boresight: direction of an instrument in body axes, of any length; its half-cones are given beside the axes
         window: time over which means are taken (MPE, RPE, PDE), one window after the other [s]
         after: from t_f to when the observation begins [s]
     """

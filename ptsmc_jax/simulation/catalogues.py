@@ -21,7 +21,7 @@ INDICES = {
     "mpe": "MPE, the error's mean over a window",
     "rpe": "RPE, the error less its window's mean",
     "pde": "PDE, the difference of the means of two windows",
-    "ake": "AKE, the error of what the law is told",
+    "ake": "AKE, the error of the attitude that the law is given",
     "mke": "MKE, its mean over a window",
     "rke": "RKE, that error less its window's mean",
 }

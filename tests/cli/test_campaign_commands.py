@@ -10,6 +10,7 @@ import pytest
 from ptsmc_jax.campaigns import campaign
 from tests.helpers import same, short
 from tests.output.pages import checked
+from tuning.output import sentences
 
 FOLDER = "out/montecarlo-s"
 MANY = 70  # trials, so many that the program of hundreds flies them
@@ -68,7 +69,10 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     least = found["floor"]
     assert 0.0 < least < told["rms"]
     for place in (said, read.text):
-        assert f"RMS window error {told['rms']:.3e}, {told['rms'] / least:.3g} times the floor {least:.2e}" in place
+        assert (
+            f"RMS window error {told['rms']:.3e}, {sentences.ratio(told['rms'] / least)} times the floor {least:.2e}"
+            in place
+        )
     np.testing.assert_allclose([told["mean"], told["rms"], told["max"]],
                                [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
     assert told["0.9"]["value"] == np.sort(errors)[224]

@@ -20,6 +20,7 @@ from tests.output.pages import checked
 from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.scenario.bad_scenarios import check_sentence
 from tuning.cli import main
+from tuning.output import sentences
 from tuning.studies import single, stability
 
 
@@ -41,7 +42,9 @@ def test_simulate_leaves_what_the_contract_says(command, tmp_path):
     assert summary["status"] == "ok"
     assert {name for name, entry in catalogues.CATALOGUE.items() if entry.table is None} <= set(summary)
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
-    assert f"{summary['window_error'] / summary['floor']:.3g} times the floor {summary['floor']:.2e}" in out
+    assert (
+        f"{sentences.ratio(summary['window_error'] / summary['floor'])} times the floor {summary['floor']:.2e}" in out
+    )
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
     made = json.loads((folder / "versions.json").read_text())
     assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)
@@ -130,9 +133,15 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
 
     read = checked(tmp_path / "t")
-    assert f"margins in hold: gain {summary['trust']['margins']['hold']['gain_margin']:.3g} dB" in read.text
+    assert (
+        f"margins that the tuned gains leave in hold: gain {summary['trust']['margins']['hold']['gain_margin']:.3g} dB"
+        in read.text
+    )
     assert set(read.charts) == {"search"}
-    assert f"{summary['fresh']['window_error']['rms'] / summary['fresh']['floor']:.3g} times the floor" in read.text
+    assert (
+        f"{sentences.ratio(summary['fresh']['window_error']['rms'] / summary['fresh']['floor'])} times the floor"
+        in read.text
+    )
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict
@@ -404,7 +413,7 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     assert ratio > 1.0
     assert (
         "no gains found within the bounds keep every limit: with the best ones, "
-        f"peak_torque reaches {ratio:.3g} times its limit on the training trials" in told
+        f"peak_torque reaches {ratio:.3g} times its limit, 0.01 N m, on the training trials" in told
     )
     assert "peak_torque at most 0.01 N m: worst" in told
     # the best compromise: the smallest torque within the bounds is that of the smallest eta
@@ -517,7 +526,7 @@ def test_a_chain_is_tuned(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, _ = command("tune", "c.toml", "--seed", 2)
     assert status in (0, 1)
-    assert "shortest t_f for a limit of 20" in out
+    assert "the tuned gains keep peak_torque below 20 from t_f = " in out
     assert "observer_gain" not in out
     folder = tmp_path / "out" / "tune-c"
     summary = json.loads((folder / "summary.json").read_text())

@@ -38,7 +38,7 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     folder = tmp_path / "out" / "montecarlo-s-corners"
     assert code == 0
     assert "3 trials of the plan corners.csv and seed 1000: 3 ok" in said
-    assert "of trials drawn at random: of the plan as far as its rows are" in said
+    assert "for trials drawn at random: of the plan as far as its rows are" in said
     rows = rows_of(folder)
     assert rows["trial"].to_list() == [0, 1, 2]
     assert rows["initial_w3"].to_list() == [0.0, 0.0, -0.02]

@@ -61,7 +61,7 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert budget["ape"]["x"] is None  # 150 runs show nothing of 99.73 %
     for place in (said, checked(tmp_path / FOLDER).text):
         assert "pointing from 0.5 s after t_f to t_end, boresight 1, 0, 0" in place
-        assert "shown by 1109 runs without a failure; with 90 % confidence 852 would do" in place
+        assert "1109 runs without a failure show a value, and 852 with 90 % confidence" in place
         assert "ape_boresight at most 0.01 rad (0.573 deg) in 50 % of the time of all runs" in place
     table = pointing_sentences.compliance(found)
     assert table is not None

@@ -40,7 +40,7 @@ def test_shortest_time_is_where_flown_trials_cross_the_limit():
     assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance and noise: 1e-3 and 1 % of 0.6 N m
     assert largest(FLOWN, found.simulated, trials) <= limit
     assert largest(FLOWN, 0.995 * found.simulated, trials) > limit
-    assert str(found).startswith("shortest t_f for a limit of 0.6 with these gains: ")
+    assert str(found).startswith("the tuned gains keep peak_torque below 0.6 from t_f = ")
     assert str(found).endswith(" s as flown")
 
 
@@ -60,13 +60,13 @@ def test_shortest_time_from_rest_is_the_rule():
 def test_a_limit_below_the_disturbance_cannot_be_kept():
     found = design.shortest_time(scenario.from_tables({}), 0.009, 0, np.arange(1))
     assert (found.theory, found.simulated) == (None, None)
-    assert str(found) == "no t_f up to 100 times the scenario's keeps these gains below the limit of 0.009"
+    assert str(found) == "no t_f up to 100 times the scenario's keeps peak_torque below 0.009 with the tuned gains"
 
 
 def test_the_sentence_says_what_simulation_found():
-    said = "shortest t_f for a limit of 0.5 with these gains: 20.12 s by theory"
+    said = "the tuned gains keep peak_torque below 0.5 from t_f = 20.12 s on by theory"
     assert design.text(0.5, 20.1234, 20.5) == f"{said}, 20.5 s as flown"
-    assert design.text(0.5, 20.1234, None) == f"{said}; none found by simulation"
+    assert design.text(0.5, 20.1234, None) == f"{said}; none was found by simulation"
 
 
 def test_shortest_time_of_a_chain():

@@ -80,11 +80,12 @@ def test_few_margins_are_warned_of():
     assert not [line for line in margin_sentences.tuned({"hold": enough, "before": unlimited}) if "less than" in line]
     lines = list(margin_sentences.tuned({"hold": few, "before": enough}))
     assert lines[:2] == [
-        "margins in hold: gain 5.9 dB, phase 0 deg, delay 0.1 s, modulus 7 dB",
-        "less than 6 dB of gain and 30 deg of phase in hold: what the model leaves out may cost the stability",
+        "margins that the tuned gains leave in hold: gain 5.9 dB, phase 0 deg, delay 0.1 s, modulus 7 dB",
+        "the loop has less than 6 dB of gain and 30 deg of phase in hold: "
+        "what the model leaves out may cost the stability",
     ]
     said = list(margin_sentences.tuned({"hold": enough, "before": few}))
-    assert any(line.startswith("less than 6 dB of gain") and "hand-over" in line for line in said)
+    assert any(line.startswith("the loop has less than 6 dB of gain") and "hand-over" in line for line in said)
     lost = {**few, "gain_margin": -1.2, "stable": False}
     assert "the frozen loop is NOT stable in hold" in next(margin_sentences.tuned({"hold": lost}))
 

@@ -148,7 +148,7 @@ def map_(
         cells = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
     store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, seed, figures))
     if not quiet:
-        terminal.grid(cells, folder)
+        terminal.grid(cells, (across.key, up.key), folder)
     return 0
 
 

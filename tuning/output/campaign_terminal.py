@@ -46,7 +46,7 @@ class Progress:
         since, before = self._started
         rate = (standing.done - before) / (now - since) if standing.done > before else 0.0
         text = f"{standing.done} of {standing.total} trials"
-        text += f", {rate:,.0f} a second" if rate else ""
+        text += f", {rate:,.0f} a second" if rate else ", compiling" if standing.done < standing.total else ""
         text += f", {standing.failed} failed or missed" if standing.failed else ""
         self._bar.update(self._task, completed=standing.done, total=standing.total, description=text)
         self._lines(text, 0, 0)

@@ -64,7 +64,13 @@ def _hold(name: str) -> Value:
 ERROR = Value("RMS window error", "-", lambda law: law["window_error"], ".2e", lambda law: law["window_error_interval"])
 FLOOR = Value("times the floor", "", lambda law: sentences.over_floor(law["window_error"], law.get("floor")))
 QUESTIONS = (
-    Question("How accurate?", (ERROR, FLOOR), 1, judged=True, note="Bars: 95 %; dotted: what no controller can beat."),
+    Question(
+        "How accurate?",
+        (ERROR, FLOOR),
+        1,
+        judged=True,
+        note="Bars are 95 % intervals; no controller can beat the dotted floor.",
+    ),
     Question(
         "How much torque?",
         (
@@ -78,7 +84,7 @@ QUESTIONS = (
     Question("How much is spent?", (Value("mean effort", "N m s", lambda law: law["effort"]),), 1),
     Question("How much does it chatter?", (Value("mean chattering", "N m/s", lambda law: law["chattering"]),), 1),
     Question(
-        "When is it there?",
+        "When has it settled?",
         (
             Value("median", "s", lambda law: (law["settling_time"] or {}).get("0.5"), ".1f"),
             Value("nearest fifth", "s", lambda law: (law["settling_near_far"] or [None])[0], ".1f"),
@@ -88,7 +94,7 @@ QUESTIONS = (
         3,
         logarithmic=False,
         what="settling time",
-        note="Medians over all starts, and over the fifths of them that begin nearest and farthest.",
+        note="Medians over all trials, and over the fifths of them that begin nearest and farthest from the reference.",
     ),
     Question(
         "What margins are left?",
@@ -96,19 +102,20 @@ QUESTIONS = (
         1,
         logarithmic=False,
         limit="gain_margin",
-        note="Drawn: gain, of the worst axis in hold; one asked for: the worst that was judged. Below 0: unstable.",
+        note="The chart shows the gain margin of the worst axis in hold, or the worst judged where one is required. "
+        "Below 0 the loop is unstable; at 0 it swings by itself.",
     ),
     Question(
         "What if the model is wrong?",
         (
-            dataclasses.replace(ERROR, name="as told"),
+            dataclasses.replace(ERROR, name="as modelled"),
             _untold("inertia + 10 %", "heavier"),
             _untold("inertia - 10 %", "lighter"),
             _untold("a period later", "later"),
         ),
         4,
         what="RMS window error",
-        note="The same gains and trials, with what the law is not told of; bars: 95 %.",
+        note="The same gains and trials, with another inertia or delay than the law knows; bars: 95 %.",
     ),
 )
 
@@ -187,7 +194,7 @@ def lines(summary: Summary) -> Iterator[str]:
     for law, found in summary["laws"].items():
         gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
         bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
-        yield f"{law}: {gains}{bound}"
+        yield f"gains of {law}: {gains}{bound}"
         missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
         if missed:
             yield f"  of {summary['trials']} trials {', '.join(missed)}"
@@ -195,13 +202,13 @@ def lines(summary: Summary) -> Iterator[str]:
         for which, other in found["untold"].items():
             if other["lost"]:
                 yield f"  {WORDS[which]} {other['lost']} of {summary['trials']} trials fail or miss t_f"
-    yield f"settles: from when the angle stays below {summary['settling_angle']:g} rad"
+    yield f"a trial has settled from when on its angle stays below {summary['settling_angle']:g} rad"
 
 
 WORDS = {
-    "heavier": "with an inertia 10 % larger than it is told",
-    "lighter": "with an inertia 10 % smaller than it is told",
-    "later": "with a control period of delay more than it is told",
+    "heavier": "with an inertia 10 % larger than the law knows",
+    "lighter": "with an inertia 10 % smaller than the law knows",
+    "later": "with a control period of delay more than the law knows",
 }
 
 
@@ -213,7 +220,7 @@ def winner(summary: Summary) -> str:
         return "no law meets every requirement"
     best, ours = min(known, key=lambda law: known[law]), "prescribed_time"
     behind = f"; {_name(ours)} has {known[ours] / known[best]:.3g} times that" if best != ours and ours in known else ""
-    return f"smallest error of those that meet every requirement: {_name(best)}, {known[best]:.2e}{behind}"
+    return f"of the laws that meet every requirement {_name(best)} has the smallest error, {known[best]:.2e}{behind}"
 
 
 def _name(law: str) -> str:

@@ -40,11 +40,11 @@ def lines(summary: Summary) -> Iterator[str]:
         if not times:
             continue
         when = f"at {times[0]:.3g}" if len(times) == 1 else f"at {len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
-        yield f"frozen before the hand-over it is unstable {when} s to go" + (
+        yield f"before the hand-over the loop with its gains frozen is unstable {when} s to go" + (
             "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
         )
     if summary["stable"]:
-        yield f"worst in hold and where judged before the hand-over: {_shown(summary['worst'])}"
+        yield f"the worst margins in hold, and before the hand-over where judged: {_shown(summary['worst'])}"
     if summary["said"]:
         yield summary["said"]
 
@@ -60,16 +60,17 @@ def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
             yield _swings(known["swing"])
             continue
         if not known["stable"]:
-            yield f"the frozen loop is NOT stable {place}: what the model leaves out may cost the stability"
+            yield f"with the tuned gains the frozen loop is NOT stable {place}"
             continue
-        yield f"margins {place}: {_shown(known)}"
+        yield f"margins that the tuned gains leave {place}: {_shown(known)}"
         few = [
             f"{least:g} {MARGINS[name][0]} of {_short(name)}"
             for name, least in ENOUGH.items()
             if known[name] is not None and known[name] < least
         ]
         if few:
-            yield f"less than {' and '.join(few)} {place}: what the model leaves out may cost the stability"
+            least = " and ".join(few)
+            yield f"the loop has less than {least} {place}: what the model leaves out may cost the stability"
 
 
 def _swings(swing: Mapping[str, Any]) -> str:

@@ -204,7 +204,12 @@ def _simulate(result: Result) -> tuple[Heading, list[Section]]:
         del marks["t_f - delta"]
     drawn = page_charts.history(columns, spacecraft, marks)
     charts = [
-        result.chart("history", drawn, "Drag to zoom, double-click to see all; dotted: the hand-over and t_f.", "tall")
+        result.chart(
+            "history",
+            drawn,
+            "Drag to zoom, double-click to see all; dotted are the hand-over and t_f.",
+            "tall",
+        )
     ]
     if spacecraft:
         q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
@@ -224,7 +229,7 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "history.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     goal = list(rows[0])[2]
-    caption = "The way of every start to the optimum next to it, by the slopes of what flies; hollow: beyond a limit."
+    caption = "The way of every start to the optimum next to it, by slopes; a hollow point breaks a limit."
     sections = [
         *_limits(summary["verdicts"]),
         Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
@@ -277,7 +282,7 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
         return _verdict(summary, lines, wanted), [Section("What a faster slew costs", blocks)]
     known = result.scenario.get("requirements", {}).get("peak_torque")
     limit = known.get("limit") if isinstance(known, dict) else known
-    caption = "Smaller is better in both. Point at one for its gains; bars are 95 % intervals, dashed is the limit."
+    caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."
     sections = [
         Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
         Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
@@ -292,7 +297,7 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
-    lines = [f"each law tuned alike, all of its gains free, judged on {judged}"]
+    lines = [f"each law is tuned alike, with all of its gains free, and judged on {judged}"]
     lines.append(law_sentences.winner(summary))
     meets = {"met": "The paper's law, tuned, meets every requirement",
              "not met": "The paper's law, tuned, does NOT meet every requirement"}  # fmt: skip
@@ -308,7 +313,7 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
 
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    note = "Quantiles between order statistics, 95 % intervals; a failed trial stands beyond every quantile."
+    note = "Quantiles lie between order statistics, with 95 % intervals; a failed trial is beyond every quantile."
     sections = [
         *_limits(summary["verdicts"]),
         Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),
@@ -325,7 +330,7 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     table = sentences.Table(tuple(rows[0]), [tuple(_short(cell) for cell in row) for row in rows[1:]])
-    heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs"])
+    heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs of values"])
     return heading, [Section("Pairs", [_table(table)])]
 
 
@@ -349,7 +354,7 @@ def _reproduce(result: Result) -> tuple[Heading, list[Section]]:
     counted = ", ".join(f"{count} {word}" for word, count in summary["verdicts"].items())
     sections = [
         Section("Claims of the paper", [_table(sentences.claims(summary))]),
-        Section("Its slips, and what shows them", [_table(sentences.slips(summary))]),
+        Section("Slips of the paper, and what shows them", [_table(sentences.slips(summary))]),
     ]
     return Heading("calm", "The paper's claims beside what was measured", [counted]), sections
 

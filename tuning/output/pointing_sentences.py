@@ -56,11 +56,11 @@ def heading(summary: Summary) -> Iterator[str]:
         begins = f"{told['after']:g} s after t_f" if told["after"] else "t_f"
         yield (
             f"pointing from {begins} to t_end, boresight {boresight}: {100 * told['probability']:g} % of the runs keep "
-            f"to these, with {100 * told['confidence']:g} % confidence"
+            f"to the angles of this budget, with {100 * told['confidence']:g} % confidence"
         )
         if any(value is None for axes in told["budget"].values() for value in axes.values()):
             few, more = (fewest_trials(told["probability"], confidence) for confidence in USUAL)
-            yield f"-: shown by {more} runs without a failure; with 90 % confidence {few} would do"
+            yield f"where the budget has -, {more} runs without a failure show a value, and {few} with 90 % confidence"
 
 
 def compliance(summary: Summary) -> Table | None:

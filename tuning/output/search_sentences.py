@@ -46,20 +46,20 @@ def search(summary: Summary) -> Iterator[str]:
         yield f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
     if "rollouts" in found:
         yield (
-            f"search: {found['rollouts']} rollouts without and {found['gradients']} with gradients, "
+            f"the search flew {found['rollouts']} trials without and {found['gradients']} with gradients in "
             f"{found['seconds']:.0f} s"
             + "".join(
-                f", {what} {spent:.0f}" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
+                f", {what} {spent:.0f} s" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
             )
         )
     checked = summary.get("differential_evolution")
     if checked is not None:
         kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
         beside = {
-            (True, True): f"from which the gains of this search are {100 * checked['distance']:+.2f} %",
-            (True, False): "whose gains break a limit, which those of this search keep",
-            (False, True): "whose gains keep every limit, unlike those of this search",
-            (False, False): "whose gains do not keep every limit either",
+            (True, True): f"and the goal of the tuned gains is {100 * checked['distance']:+.2f} % off that",
+            (True, False): "with gains that break a limit, which the tuned gains keep",
+            (False, True): "with gains that keep every limit, unlike the tuned ones",
+            (False, False): "with gains that do not keep every limit, as the tuned ones do not",
         }[kept, checked["kept"]]
         found = f"{checked['value']:.4e}, {beside}"
         yield f"differential evolution, a global search with {checked['rollouts']} rollouts, found {found}"

@@ -107,7 +107,7 @@ def tuning(summary: Summary) -> Table:
 def tuning_heading(summary: Summary) -> str:
     """On what the gains were judged."""
     judged = summary.get("judged_on", "flight clock")
-    return f"judged on {summary['fresh']['trials']} fresh trials, {judged}"
+    return f"the gains are judged on {summary['fresh']['trials']} fresh trials, {judged}"
 
 
 PAPER = {  # columns of the paper's gains in words
@@ -139,7 +139,7 @@ def accuracy(summary: Summary) -> Iterator[str]:
     trained, fresh = summary["training"]["window_error"], fresh["window_error"]
     before = summary.get("before")
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
-        yield "the scenario's own gains are more accurate than these: see tune.bounds and the requirements"
+        yield "the scenario's own gains are more accurate than the tuned ones: see tune.bounds and the requirements"
     if trained and fresh:
         both = [f"{one['rms']:.3e} on the {where} trials" + _between(one.get("rms_interval"), ".3e")
                 for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
@@ -155,7 +155,12 @@ def cautions(summary: Summary) -> Iterator[str]:
 def floor(error: float | None, least: float | None) -> str:
     """How many times the error is what no controller can beat; nothing where there is no such floor."""
     times = over_floor(error, least)
-    return "" if times is None else f", {times:.3g} times the floor {least:.2e}"
+    return "" if times is None else f", {ratio(times)} times the floor {least:.2e} that no controller can beat"
+
+
+def ratio(times: float) -> str:
+    """How many times, in three digits, without an exponent below a million."""
+    return f"{times:.0f}" if 1000.0 <= times < 1e6 else f"{times:.3g}"
 
 
 def over_floor(error: float | None, least: float | None) -> float | None:
@@ -171,7 +176,7 @@ def _times(group: Summary) -> str:
 def paper_refused(summary: Summary) -> Iterator[str]:
     """Why nothing is set beside the paper's gains, if so."""
     if summary.get("paper_refused"):
-        yield f"the paper's gains cannot fly this, and are left out: {summary['paper_refused']}"
+        yield f"the paper's gains cannot fly this scenario, and are left out: {summary['paper_refused']}"
 
 
 def _between(interval: Sequence[float] | None, digits: str) -> str:
@@ -208,11 +213,11 @@ def front_lines(summary: Summary) -> Iterator[str]:
     """What is left out of a front, and whether anything on it will do."""
     yield from paper_refused(summary)
     if summary.get("floor"):
-        yield f"floor {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
+        yield f"the floor is {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
     kept = [point for point in summary["points"] if not point["dominated"]]
     lost = len(summary["points"]) - len(kept)
     if lost:
-        yield f"{lost} more left out: others are better in both, beyond the interval"
+        yield f"points left out: {lost}, each beaten by another in error and torque by more than its interval"
     if summary["requirements"] and not any(point["meets"] for point in kept):
         yield "no gains on the front meet every requirement"
 
@@ -303,7 +308,7 @@ def campaign_counts(summary: Summary) -> Iterator[str]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
     if summary.get("plan"):
-        yield "shares, quantiles and their intervals are of trials drawn at random: of the plan as far as its rows are"
+        yield "shares, quantiles and intervals hold for trials drawn at random: of the plan as far as its rows are"
 
 
 def campaign_error(summary: Summary) -> Iterator[str]:
@@ -338,7 +343,7 @@ def campaign_drivers(summary: Summary) -> Iterator[str]:
         driven = sorted(driven, key=lambda item: -max(map(abs, item[1].values())))[:3]
         if driven:
             said = (f"{key} {d['rank_correlation']:+.2f} ({100 * d['first_order']:.0f} %)" for key, d in driven)
-            yield f"{name} goes with {', '.join(said)}: rank correlation (share of the variance)"
+            yield f"{name} hangs on {', '.join(said)}: rank correlation (share of its variance)"
 
 
 def claims(summary: Summary) -> Table:

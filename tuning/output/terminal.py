@@ -64,19 +64,20 @@ def reproduction(summary: dict[str, Any], folder: Path) -> None:
     box: Any = {"box": SIMPLE, "title_justify": "left"}
     table(sentences.claims(summary), title="Claims", **box)
     table(sentences.slips(summary), title="Slips", **box)
-    say("why, and the slips as printed: claims.md", f"results in {folder}")
+    say("claims.md says why, and gives the slips as printed", f"results in {folder}")
 
 
-def grid(cells: list[Any], folder: Path) -> None:
-    """What was flown over two keys."""
+def grid(cells: list[Any], keys: tuple[str, str], folder: Path) -> None:
+    """What was flown over two keys, across and up."""
     flown = [cell for cell in cells if cell.status == "flown"]
     print(f"{len(flown)} of {len(cells)} pairs flown, {sum(cell.failures > 0 for cell in flown)} with failed trials")
     known = [cell for cell in flown if cell.window_error == cell.window_error]
     if known:
         best = min(known, key=lambda cell: (cell.failures, cell.window_error))
-        where = f"{best.x:.4g} (across) and {best.y:.4g} (up)"
+        where = f"{keys[0]} = {best.x:.4g} and {keys[1]} = {best.y:.4g}"
         failed = f", where {best.failures} trials failed" if best.failures else ""
-        print(f"smallest RMS window error {best.window_error:.3g} at {where}, mean peak {best.peak_torque:.3g}{failed}")
+        peak = f"where the mean peak of the input is {best.peak_torque:.3g}"
+        print(f"the smallest RMS window error is {best.window_error:.3g}, at {where}, {peak}{failed}")
     print(f"results in {folder}")
 
 
@@ -116,7 +117,7 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
     from tuning.output import law_sentences
 
-    alike = f"each law tuned alike, judged on {summary['trials']} fresh trials, {summary['judged_on']}"
+    alike = f"each law is tuned alike and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
     for one in law_sentences.answers(summary):
         table(one.table, title=one.title, title_justify="left")

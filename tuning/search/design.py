@@ -36,9 +36,9 @@ class ShortestTime:
 def text(limit: float, by_theory: float | None, simulated: float | None) -> str:
     """A `ShortestTime` in one line."""
     if by_theory is None:
-        return f"no t_f up to {FARTHEST:g} times the scenario's keeps these gains below the limit of {limit:g}"
-    said = f"shortest t_f for a limit of {limit:g} with these gains: {by_theory:.4g} s by theory"
-    return said + (f", {simulated:.4g} s as flown" if simulated is not None else "; none found by simulation")
+        return f"no t_f up to {FARTHEST:g} times the scenario's keeps peak_torque below {limit:g} with the tuned gains"
+    said = f"the tuned gains keep peak_torque below {limit:g} from t_f = {by_theory:.4g} s on by theory"
+    return said + (f", {simulated:.4g} s as flown" if simulated is not None else "; none was found by simulation")
 
 
 def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) -> ShortestTime:

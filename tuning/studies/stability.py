@@ -15,7 +15,7 @@ from ptsmc_jax.theory import margins, rest
 from ptsmc_jax.theory.margins import FIELDS, Course
 from ptsmc_jax.theory.rest import Swing
 
-_NO_SIGN = "the exact sign has no slope: it counts as if it were not there"
+_NO_SIGN = "the exact sign has no slope: these margins are those of the loop without its switching term"
 
 
 def find(scenario: Scenario) -> tuple[Study, Course]:

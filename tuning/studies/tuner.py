@@ -172,6 +172,7 @@ def tune(
     believed, beyond = None, {}
     at_bound = evaluate.bounds.at_bound(found.gains)
     if trusted and not found.interrupted:
+        report("profiles, sensitivities and margins of the gains found", 0, 0, found.value, 0.0)
         wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
         believed = Trust(
             slope_error=(
