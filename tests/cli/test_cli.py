@@ -411,8 +411,9 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     assert (status, summary["status"]) == (1, "not met")
     ratio = summary["search"]["largest_over_limit"]["peak_torque"]
     assert ratio > 1.0
+    assert summary["search"]["rounds_with_harder_trials"] == 0  # they would bring these gains no nearer
     assert (
-        "no gains found within the bounds keep every limit: with the best ones, "
+        "no gains found within the bounds keep every limit: with the best ones "
         f"peak_torque reaches {ratio:.3g} times its limit, 0.01 N m, on the training trials" in told
     )
     assert "peak_torque at most 0.01 N m: worst" in told

@@ -21,6 +21,8 @@ from tuning.search.rounds import MARGIN, Rounds
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 
+HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would bring them no nearer
+
 
 @dataclass(frozen=True)
 class Search:
@@ -63,9 +65,8 @@ def search(
     harder ones join, and the search goes on. own: (gains,) the scenario's gains, the first start. steps: points that
     may be looked at from each start. sloped: F has slopes to go by. robust: what joins is the worst case inside the
     dispersions' support. judged: say how hard the worst case is. margin: to keep from the limits, where it is more than
-    the search's own. report is called after every step; prepare once the
-    search's own programs are being compiled, for those of what comes after it. Interrupted, it returns the best so far
-    once there is one.
+    the search's own. report is called after every step; prepare once the search's own programs are being compiled, for
+    those of what comes after it. Interrupted, it returns the best so far once there is one.
     """
     rounds = Rounds(evaluate, problem, requirements, robust=robust)
     margin = max(margin, rounds.margin)
@@ -88,7 +89,7 @@ def search(
             run.descend(rounds.problem, run.explore(rounds.problem, starts, seed) if starts > 1 else {0: run.share})
         else:
             run.evolve(rounds.problem, run.share)
-        while rounds.harder(run.gains, tell):
+        while np.all(run.best.worst <= HOPELESS) and rounds.harder(run.gains, tell):
             tell(f"{ROUND}, round {rounds.count}")
             if sloped:
                 run.again(rounds.problem)
