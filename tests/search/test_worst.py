@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -21,12 +20,25 @@ T_F, ETA = 20.0, 3.0
 LIMIT = 0.5
 
 
-def posed(dispersion, requirement=None, **others):
-    """A problem without noise or disturbance, from rest to the identity."""
-    run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)), **others)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0))
-    wanted = [requirement or Requirement("peak_torque", LIMIT)]
+FAR = dict.fromkeys(("peak_torque", "peak_rate", "effort", "settling_time"), 1e9)  # limits that nothing comes near
+
+
+def posed(dispersion, requirement=None, settling_angle=4.0, **others):
+    """A problem without noise or disturbance, from rest to the identity; settled, unless asked for, from the start.
+
+    Beside what a test asks stand all of `FAR`, so that its programs are those of other tests.
+    """
+    run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=sine(0.0), **others)
+    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), settling_angle=vector(settling_angle))
+    asked = requirement or Requirement("peak_torque", LIMIT)
+    wanted = [asked if asked.metric == name else Requirement(name, limit) for name, limit in FAR.items()]
+    wanted += [asked] if asked.metric not in FAR else []
     return objective.problem(run, dispersion, 5, np.arange(8), ("eta", "delta"), wanted), wanted
+
+
+def sine(amplitude):
+    zero = [0.0] * 3
+    return disturbances.Sinusoid(*(vector(v) for v in ([amplitude] * 3, [0.1] * 3, zero, zero)))
 
 
 def first_torque(inertia, theta, eta=ETA):
@@ -64,17 +76,23 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
 HALF_TURNS = [attitudes.UniformAttitude(), attitudes.AxisAngle(vector(np.pi / 2), vector(np.pi))]
 
 
-@pytest.mark.parametrize("kind", short(HALF_TURNS, HALF_TURNS[:1]))
+@pytest.mark.parametrize("kind", short(HALF_TURNS, HALF_TURNS[1:]))
 def test_attitudes_up_to_180_degrees_have_no_worst_case(kind):
     problem, wanted = posed(variation.Dispersion(kind))
     assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
 
 
+def everything(smallest, largest, rate):
+    """All that moves a body: attitudes between two angles, rates, phases of the disturbance."""
+    angles = attitudes.AxisAngle(vector(smallest), vector(largest))
+    return variation.Dispersion(angles, rate=numbers.Normal(vector([rate] * 3)), phase=numbers.UniformPhase(3))
+
+
 def test_rates_are_searched_too_and_normal_ones_where_nearly_all_of_them_lie():
     from scipy.stats import chi2
 
-    spread = variation.Dispersion(rate=numbers.Normal(vector([1e-3, 1e-3, 1e-3])))
-    problem, wanted = posed(spread, Requirement("peak_rate", 0.05), q=[0.0, 0.0, 0.0, 1.0])
+    spread = everything(0.0, 1e-12, 1e-3)
+    problem, wanted = posed(spread, Requirement("peak_rate", 0.05))
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     size = np.linalg.norm(found.coordinates["initial_rate"])
     np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 3)), rtol=1e-3)  # on the edge of the ball
@@ -108,15 +126,9 @@ def test_the_worst_misfits_are_found_by_their_slopes():
 
 
 def test_slopes_of_the_ascent_agree_with_central_differences():
-    spread = variation.Dispersion(
-        attitudes.AxisAngle(vector(0.4), vector(2.0)),
-        rate=numbers.Uniform(vector([1e-2, 1e-2, 1e-2])),
-        phase=numbers.UniformPhase(3),
-    )
-    problem, _ = posed(spread, Requirement("effort", 3.0))
-    sine = disturbances.Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
-    problem = replace(problem, parts=replace(problem.parts, disturbance=sine))
-    fleet = problem.others(np.arange(3))
+    problem, _ = posed(everything(0.4, 2.0, 1e-2))
+    problem = replace(problem, parts=replace(problem.parts, disturbance=sine(0.01)))
+    fleet = problem.others(np.arange(4, 7))
     y = np.concatenate([worst._charted(problem, name, v) for name, v in fleet.coordinates.items()], axis=1)
     at, limits = np.array([ETA, 1.0]), {"peak_torque": 0.5, "effort": 3.0}
 
@@ -156,7 +168,8 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
 def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     """With a quantile no single trial counts: `robust` finds nothing to do."""
     spread = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0)))
-    problem, wanted = posed(spread, Requirement("peak_torque", 1.9, quantile=0.9))
+    problem, wanted = posed(spread)
+    wanted = [replace(one, quantile=0.9) for one in wanted]
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 1, 1, 0, robust=True)
@@ -215,8 +228,7 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
 def test_a_trial_without_a_value_is_the_hardest():
     """Nearer ones settle, farther ones not before the end."""
     spread = variation.Dispersion(attitudes.AxisAngle(vector(0.01), vector(2.0)))
-    problem, wanted = posed(spread, Requirement("settling_time", 19.0))
-    problem = replace(problem, parts=replace(problem.parts, settling_angle=vector(1e-4)))
+    problem, wanted = posed(spread, Requirement("settling_time", 19.0), settling_angle=1e-4)
     at = np.array([ETA, 1.0])
     _, ratio = worst.screen(problem, wanted, at)
     assert 0 < np.isinf(ratio).sum() < ratio.size
@@ -224,11 +236,7 @@ def test_a_trial_without_a_value_is_the_hardest():
     found = worst.hardest(problem, wanted, at)
     assert found.status in ("ok", "missed")
     assert (found.ratio, found.beyond, found.unbounded) == (np.inf, True, False)
-
-    @jax.jit
-    def both(gains):
-        return jax.jacfwd(lambda gains: objective.measure(problem, gains)[:2])(gains), objective.measure(problem, gains)
-
-    slopes, (value, over, _) = jax.tree.map(np.asarray, both(vector(at)))
-    assert all(np.isfinite(v).all() for v in (value, over, *slopes))
-    assert (over == objective.FAILED - 1.0).any()
+    evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
+    found = evaluate.slopes(problem, evaluate.bounds.share(at)[None])
+    assert all(np.isfinite(v).all() for v in vars(found).values())
+    assert (found.c == objective.FAILED - 1.0).any()
