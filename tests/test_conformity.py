@@ -86,6 +86,24 @@ ROWS: dict[str, dict] = {
         "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
         "dispersion": {"attitude": {"kind": "uniform"}},
     },
+    "wheels, filter, every device, a law that remembers, prescribed-time observer, random walk": {
+        "controller": {"kind": "time_base_sliding", "t_f": 6.0},
+        "observer": {"kind": "prescribed_time", "t_o": 3.0, "delta_o": 0.5},
+        "reference": {"kind": "slew", "to_quat_xyzw": [0.28, 0.0, 0.0, 0.96], "duration": 5.0},
+        "loop": {**SAMPLED, "clock": "flight"},
+        "filter": {"kind": "steady_state"},
+        "hardware": {
+            "attitude_noise": 2e-4, "rate_noise_density": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
+            "star_tracker_every": 3, "torque_limit": 2.0, "torque_rate_limit": 8.0, "torque_lag": 0.05,
+            "torque_step": 1e-3, "delay": 1, "command_filter": {"kind": "second_order", "corner": 6.0},
+        },
+        "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
+        "disturbance": {
+            "kind": "sum",
+            "terms": [{"kind": "random_walk", "density": [1e-4, 1e-4, 2e-4]}, {"kind": "sinusoid"}],
+        },
+        "dispersion": SPREAD,
+    },
     "multiplicative error, prescribed-time observer": {
         "spacecraft": {"inertia": FULL_INERTIA},
         "controller": {**SLEW, "error": "multiplicative"},
@@ -177,9 +195,7 @@ ROWS: dict[str, dict] = {
 
 # one of each kind of plant, loop, device and observer; the others are `long`
 KINDS = (
-    "filter, every axis device, random walk",
-    "wheels, a law that remembers, flight clock, uniform attitudes",
-    "multiplicative error, prescribed-time observer",
+    "wheels, filter, every device, a law that remembers, prescribed-time observer, random walk",
     "sampled system with noise",
     "chain, finite-time observer",
 )

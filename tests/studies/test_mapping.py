@@ -53,7 +53,7 @@ def test_bad_axes_are_refused_in_a_sentence(text):
 
 @pytest.fixture(scope="module")
 def mapped():
-    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.9:3")
+    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2")
 
 
 def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped):
