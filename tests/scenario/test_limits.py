@@ -65,4 +65,4 @@ def test_a_page_says_the_share_of_what_decides():
         return page._distance({name: getattr(one, name) for name in one.__dataclass_fields__})
 
     assert told(0.75) == "; the trial that decides is at 0.45, 90 % of the limit"
-    assert told(None) == ", 140 % of the limit"
+    assert told(None) == "; the worst is 140 % of the limit"

@@ -223,7 +223,7 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     farthest = max(summary["verdicts"], key=lambda v: np.nan_to_num(_value(v["margin"]), nan=np.inf), default=None)
-    lines = [f"gains: {gains}", *sentences.accuracy(summary)]
+    lines = [f"tuned gains: {gains}", *sentences.accuracy(summary)]
     if farthest is not None:
         lines.insert(1, sentences.verdict(farthest) + _distance(farthest))
     with (result.folder / "history.csv").open(newline="", encoding="utf-8") as file:
@@ -234,7 +234,7 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
         *_limits(summary["verdicts"]),
         Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
         Section(
-            "Can it be trusted?",
+            "Can the result be trusted?",
             [
                 _text(
                     [
@@ -260,9 +260,10 @@ def _distance(verdict: dict[str, Any]) -> str:
     margin = _value(verdict["margin"])
     if np.isnan(margin) or verdict.get("at_least") or verdict["limit"] == 0.0:
         return ""
+    share = f"{sentences.ratio(100 * margin)} % of the limit"
     if verdict.get("quantile") is None or verdict["trials"] == 1:
-        return f", {100 * margin:.3g} % of the limit"
-    return f"; the trial that decides is at {margin * verdict['limit']:.4g}, {100 * margin:.3g} % of the limit"
+        return f"; {'the worst' if verdict['trials'] > 1 else 'that'} is {share}"
+    return f"; the trial that decides is at {margin * verdict['limit']:.4g}, {share}"
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -313,7 +314,10 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
 
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    note = "Quantiles lie between order statistics, with 95 % intervals; a failed trial is beyond every quantile."
+    note = (
+        "Quantiles lie between order statistics, with 95 % intervals (-: so few trials bound them on one side only); a "
+        "failed trial is beyond every quantile."
+    )
     sections = [
         *_limits(summary["verdicts"]),
         Section("Metrics", [_table(sentences.campaign(summary), note), _text(sentences.campaign_drivers(summary))]),

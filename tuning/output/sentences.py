@@ -25,7 +25,7 @@ def verdict(told: Summary) -> str:
     if "share_interval" not in told:
         return text
     low, high = told["share_interval"]
-    text += f"; within it {100 * told['share']:.6g} % (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
+    text += f"; {100 * told['share']:.6g} % of trials keep the limit (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
     if told["quantile"] is not None and told["confidence"] is not None:
         text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
         if told["share"] > told["quantile"]:
@@ -107,7 +107,7 @@ def tuning(summary: Summary) -> Table:
 def tuning_heading(summary: Summary) -> str:
     """On what the gains were judged."""
     judged = summary.get("judged_on", "flight clock")
-    return f"the gains are judged on {summary['fresh']['trials']} fresh trials, {judged}"
+    return f"the gains are judged on {summary['fresh']['trials']} fresh trials ({judged})"
 
 
 PAPER = {  # columns of the paper's gains in words
@@ -206,7 +206,7 @@ def front(summary: Summary) -> Table:
         rows.append((name, *numbers, within, *cells, ", ".join(marks)))
     torque, error = units["peak_torque"][0], units["window_error"][0]
     beside = ("times the floor",) if summary.get("floor") else ()
-    return Table(("", f"peak {torque}", "mean", f"error {error}", "+-", *beside, *names, ""), rows)
+    return Table(("", f"largest peak {torque}", "mean peak", f"RMS error {error}", "+-", *beside, *names, ""), rows)
 
 
 def front_lines(summary: Summary) -> Iterator[str]:
@@ -244,7 +244,7 @@ def slew_times(summary: Summary) -> Table:
         numbers += tuple(_digits(slew["costs"][name], ".4g") for name in costs)
         rows.append((*numbers, *(f"{slew['gains'][name]:.4g}" for name in names), ", ".join(marks)))
     head = (f"{name.replace('_', ' ')} {units[name][0]}" for name in costs)
-    return Table(("t_f s", f"error {units['window_error'][0]}", "+-", *head, *names, ""), rows)
+    return Table(("t_f s", f"RMS error {units['window_error'][0]}", "+-", *head, *names, ""), rows)
 
 
 def slew_times_lines(summary: Summary) -> Iterator[str]:
@@ -286,7 +286,7 @@ def campaign(summary: Summary) -> Table:
         cells = (told["0.5"]["value"], far["value"])
         unit = CATALOGUES[summary["plant"]].get(name, ("",))[0]
         rows.append((name, *(_number(v) for v in cells), between, _number(told.get("max")), unit))
-    return Table(("", "median", "99.73 %", "95 % interval", "largest", "unit"), rows)
+    return Table(("", "median", "99.73 %", "its 95 % interval", "largest", "unit"), rows)
 
 
 def _number(value: float | None) -> str:
