@@ -65,8 +65,9 @@ HOUSE = {
         "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
         "onboard": """
             expressions
-            control origins rules
+            control derived origins rules
             board fields printing translate
+            parameters
             generate vectors
             templates
             library readme

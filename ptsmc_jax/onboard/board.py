@@ -18,6 +18,7 @@ from ptsmc_jax.devices.actuators import Actuators, ActuatorState
 from ptsmc_jax.devices.attitude_filter import Estimate
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.onboard import derived
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE
@@ -48,6 +49,7 @@ class Board:
     state: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
     stages: list[Stage] = field(default_factory=list)
+    rules: list[derived.Rule] = field(default_factory=list)  # by which parameters follow from others
     about: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -97,7 +99,9 @@ def board(parts: Parts) -> Board:
         "actuators": device,
         "period": period,
     }
-    made = Board(parameters, observer.model.attitude)
+    made = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
+    if parameters["filter"] is not None:
+        _filter_parameters(made, parts.sensors, period)
     made.about["period"] = "of the control loop [s]"
     made.about["observer_matrix"] = _said(type(observer).update_matrix)
     if not made.spacecraft:
@@ -112,6 +116,15 @@ def board(parts: Parts) -> Board:
     if device is not None:
         _acting(made, device, observer.model.inputs)
     return made
+
+
+def _filter_parameters(made: Board, sensors: Any, period: Any) -> None:
+    """What the filter's gains follow from."""
+    made.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
+    made.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
+    if sensors.own_times is not None:
+        made.parameters["star_tracker_interval"] = sensors.own_times.interval
+        made.about["star_tracker_interval"] = "between its samples [s]"
 
 
 def _said(function: Any) -> str:

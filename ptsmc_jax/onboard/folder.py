@@ -80,7 +80,12 @@ def identifier(text: str) -> str:
 def table(made: Controller, seed: int, trials: int) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of vectors.csv: of so many usable trials."""
     lists = templates.columns(made.code)
-    header = ["trial", "sample", "status", *(f"{kind}.{name}" for kind, names in lists.items() for name in names)]
+    header = [
+        "trial",
+        "sample",
+        "status",
+        *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in lists[kind]),
+    ]
     dispersion = vectors.known_alike(made.ready.dispersion)
     rows: list[list[Any]] = []
     numbers = np.arange(trials, dtype=np.uint32)

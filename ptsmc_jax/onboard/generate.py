@@ -13,14 +13,15 @@ import numpy as np
 from ptsmc_jax.laws.base import Law
 from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.observers.base import Observer
-from ptsmc_jax.onboard import fields, origins, printing
+from ptsmc_jax.onboard import origins, parameters, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
 from ptsmc_jax.onboard.expressions import Node, Pool, Title
 from ptsmc_jax.onboard.fields import Field, Struct
 from ptsmc_jax.onboard.translate import Translator
 
-POINTERS = {"p": "const ptsmc_params *p", "in": "const ptsmc_in *in", "before": "const ptsmc_state *before",
-            "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
+POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
+            "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
+PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # what a step has of these names
 ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
 COMMON = (object, Law, ErrorMotion, Observer)  # what of a part's classes says nothing about it
 
@@ -38,22 +39,51 @@ class Code:
     calls: dict[str, str] = field(default_factory=dict)  # by stage
     about: dict[str, str] = field(default_factory=dict)  # what each stage does, of those of a sample
     counts: dict[str, int] = field(default_factory=dict)  # operations of a step at most
+    derived: list[Field] = field(default_factory=list)  # what follows from parameters
+    basis: list[Field] = field(default_factory=list)  # the parameters that it follows from
+    derivation: str = ""  # the text of the function that does
+    follows: dict[str, list[str]] = field(default_factory=dict)  # of each the names of those
+    fixed: dict[str, str] = field(default_factory=dict)  # parameters that follow from others, but not in C: why
+    deriving: dict[str, int] = field(default_factory=dict)  # operations of that
     variables: int = 0  # at most, of all functions together
 
 
 def generate(board: Board) -> Code:
     """The C of a flight computer; raises NoRuleError where something in it has no rule."""
-    leaves, names, values = _parameters(board)
+    known = parameters.parameters(board)
     structs, trees = _structs(board)
-    used: set[str] = {"period"}
+    known.used.add("period")
     code = Code([], {}, list(structs["in"].fields.values()), list(structs["before"].fields.values()),
                 list(structs["out"].fields.values()))  # fmt: skip
     for stage in board.stages:
-        _function(code, board, stage, structs, trees, (leaves, names), used)
-    wanted = [f for f in values if f[0].name in used]
-    code.parameters = [made for made, _ in wanted]
-    code.values = {made.name: value for made, value in wanted}
+        _function(code, board, stage, structs, trees, known)
+    _derivation(code, known)
+    code.parameters = known.listed("p")
+    code.values = {made.name: known.values[made.name] for made in code.parameters}
     return code
+
+
+def _derivation(code: Code, known: parameters.Parameters) -> None:
+    """The function that computes what follows from parameters, of what is used."""
+    code.derived = known.listed("d")
+    follows = {made.name: known.origins[made.name] for made in code.derived}
+    code.fixed = {name: why for name, why in known.fixed.items() if name in known.used}
+    code.follows = follows | {name: known.origins[name] for name in code.fixed}
+    if not code.derived:
+        return
+    printer = printing.Printer()
+    block, results = known.derivation()
+    ends = [(f"d->{element}", node) for made in code.derived
+            for element, node in zip(made.elements(), results[made.name].flat, strict=True)]  # fmt: skip
+    body = printer.body(block, ends)
+    known.use(printer)
+    code.basis = [made for made in known.listed("p") if any(made.name in names for names in follows.values())]
+    copies = [f"    d->of_{element} = p->{element};" for made in code.basis for element in made.elements()]
+    about = printing.comment("What follows from the parameters, and the parameters that it follows from.")
+    head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
+    code.derivation = "\n".join([*head, *_shortened(body), "", *copies, "}"])
+    code.deriving = dict(printer.counts)
+    code.variables = max(code.variables, len(printer.names))
 
 
 def _structs(board: Board) -> tuple[dict[str, Struct], dict[str, Any]]:
@@ -86,46 +116,19 @@ def names_of(board: Board) -> dict[str, list[str]]:
     return columns(*(list(structs[name].fields.values()) for name in ("in", "before", "out")))
 
 
-def _parameters(board: Board) -> tuple[list[Any], list[Field], list[tuple[Field, np.ndarray]]]:
-    """Leaves of the parameters, for each its field, and the fields with their values; what is shared is one field."""
-    found: dict[int, Field] = {}
-    taken: set[str] = set()
-    leaves, of_leaf, values = [], [], []
-    for path, leaf in jax.tree_util.tree_flatten_with_path(board.parameters)[0]:
-        leaves.append(leaf)
-        if id(leaf) not in found:
-            parts, meaning = fields.spoken(path, board.parameters)
-            short = parts[parts.index("model") + 1 :] if "model" in parts[:-1] else parts
-            name = "_".join(short).lower()
-            name = name if name not in taken else "_".join(parts).lower()
-            while name in taken:
-                name += "_"
-            taken.add(name)
-            array = np.asarray(leaf)
-            made = Field(name, array.shape, fields.kind_of(array.dtype), meaning or board.about.get(parts[0], ""))
-            found[id(leaf)] = made
-            values.append((made, array))
-        of_leaf.append(found[id(leaf)])
-    return leaves, of_leaf, values
-
-
 def _function(
     code: Code, board: Board, stage: Stage, structs: dict[str, Struct], trees: dict[str, Any],
-    parameters: tuple[list[Any], list[Field]], used: set[str],
+    known: parameters.Parameters,
 ) -> None:  # fmt: skip
     pool = Pool()
-    leaves, of_leaf = parameters
     read = [_shape_of(board, name) for name in stage.reads]
-    tree = jax.tree.structure(board.parameters)
 
     def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
-        return stage.run(jax.tree.unflatten(tree, leaves), *read)
+        return stage.run(known.tree(leaves), *read)
 
-    closed, shape = jax.make_jaxpr(run, return_shape=True)(leaves, read)
+    closed, shape = jax.make_jaxpr(run, return_shape=True)(known.leaves, read)
     places: dict[str, str] = {}  # of what C reads: the pointer or argument
-    args = []
-    for made in of_leaf:
-        args.append(_array(pool, "p->", made, places, "p"))
+    args = known.nodes(pool, places)
     for name in stage.reads:
         prefix, _, key = name.partition(".")
         if name in SCALARS:
@@ -138,7 +141,7 @@ def _function(
         struct = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}[prefix]
         pointer = "before" if prefix == "last" else prefix
         for leaf in jax.tree.leaves(trees[f"{struct}.{key}"]):
-            args.append(_array(pool, text, structs[struct].fields[leaf], places, pointer))
+            args.append(parameters.nodes_of(pool, text, structs[struct].fields[leaf], places, pointer))
     results = Translator(pool).evaluate(closed, args)
     outputs: list[tuple[str, Node]] = []
     writes: set[str] = set()
@@ -160,14 +163,10 @@ def _function(
     ends = [*outputs, *([("return", returned)] if returned is not None else [])]
     body = printer.body(pool.block, ends)
     needed = {places[node.value] for node in printer.nodes.values() if node.op == "place"} | writes
-    for made in of_leaf:
-        if any(node.op == "place" and node.value.startswith(f"p->{made.name}") and
-               node.value[3 + len(made.name) :][:1] in ("", "[") for node in printer.nodes.values()):  # fmt: skip
-            used.add(made.name)
+    known.use(printer)
     signature = [POINTERS[name] for name in POINTERS if name in needed]
     signature += [ARGUMENTS[name] for name in ARGUMENTS if name in needed]
-    passed = [{"p": "p", "in": "in", "before": "state", "now": "&now", "out": "&found"}.get(name, name)
-              for name in (*POINTERS, *ARGUMENTS) if name in needed]  # fmt: skip
+    passed = [PASSED.get(name, name) for name in (*POINTERS, *ARGUMENTS) if name in needed]
     body = [line.replace("return = ", "return ") for line in body]
     kind = "int" if returned is not None else "void"
     head = printing.wrapped(f"static {kind} {stage.name}({', '.join(signature)})", "")
@@ -204,15 +203,6 @@ def _shape_of(board: Board, name: str) -> Any:
         return jax.ShapeDtypeStruct((), jnp.int32 if name in ("regular", "tracking") else jnp.result_type(float))
     return {"in": board.inputs, "before": board.state, "now": board.state, "last": board.outputs,
             "out": board.outputs}[prefix][key]  # fmt: skip
-
-
-def _array(pool: Pool, text: str, made: Field, places: dict[str, str], pointer: str) -> np.ndarray:
-    array = np.empty(made.shape, dtype=object)
-    for index in np.ndindex(*made.shape):
-        place = f"{text}{made.element(index)}"
-        places[place] = pointer
-        array[index] = pool.place(place, made.kind)
-    return array
 
 
 def _named(shape: dict[str, Any]) -> list[tuple[str, int]]:

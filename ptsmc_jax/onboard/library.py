@@ -23,32 +23,46 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
 
-# many steps, a row each: states, inputs -> states, outputs, statuses
+# many steps with the same parameters, a row each: states, inputs -> states, outputs, statuses
 GLUE = """
 #include "ptsmc_@name@_flat.h"
 
-void ptsmc_many(long count, const double *state, const double *in, double *after, double *out, int *status);
-void ptsmc_first(double *state);
+void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
+                int *status);
+void ptsmc_first(const double *params, double *state);
+void ptsmc_set(double *params);
 
-void ptsmc_many(long count, const double *state, const double *in, double *after, double *out, int *status)
+void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
+                int *status)
 {
+    ptsmc_params p;
+    ptsmc_state first;
+    params_from(params, &p);
+    ptsmc_init(&p, &first);
     for (long k = 0; k < count; k++) {
-        ptsmc_state x;
+        ptsmc_state x = first; /* with what is derived, which is not among the columns */
         ptsmc_in given;
         ptsmc_out found;
         state_from(state + k * PTSMC_STATE_SIZE, &x);
         in_from(in + k * PTSMC_IN_SIZE, &given);
-        status[k] = ptsmc_step(&ptsmc_parameters, &x, &given, &found);
+        status[k] = ptsmc_step(&p, &x, &given, &found);
         state_to(&x, after + k * PTSMC_STATE_SIZE);
         out_to(&found, out + k * PTSMC_OUT_SIZE);
     }
 }
 
-void ptsmc_first(double *state)
+void ptsmc_first(const double *params, double *state)
 {
+    ptsmc_params p;
     ptsmc_state x;
-    ptsmc_init(&ptsmc_parameters, &x);
+    params_from(params, &p);
+    ptsmc_init(&p, &x);
     state_to(&x, state);
+}
+
+void ptsmc_set(double *params)
+{
+    params_to(&ptsmc_parameters, params);
 }
 """
 OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC")
@@ -66,7 +80,7 @@ def compiler() -> list[str]:
 
 
 class Library:
-    """A controller's folder, compiled."""
+    """A controller's folder, compiled; `parameters` are those of the folder, and may be set otherwise."""
 
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
         """Compiles it; raises ScenarioError where it is no controller, or does not compile."""
@@ -75,6 +89,7 @@ class Library:
             layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
+            self.parameters = np.zeros(len(self.columns["params"]))  # (columns,) in the order of columns["params"]
         except (OSError, ValueError, KeyError, TypeError):
             raise ScenarioError(
                 f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
@@ -82,6 +97,7 @@ class Library:
         self.statuses: Counter[str] = Counter()
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
             self._made = ctypes.CDLL(str(self._compiled(Path(place), real, options)))
+        self._made.ptsmc_set(_at(self.parameters))
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, made = place / "glue.c", place / "controller.so"
@@ -99,7 +115,7 @@ class Library:
     def first(self) -> np.ndarray:
         """The state that `ptsmc_init` leaves."""
         state = np.zeros(len(self.columns["state"]))
-        self._made.ptsmc_first(_at(state))
+        self._made.ptsmc_first(_at(self.parameters), _at(state))
         return state
 
     def many(self, state: Any, given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,7 +125,7 @@ class Library:
         after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
         status = np.empty(shape, dtype=np.int32)
         count = ctypes.c_long(int(np.prod(shape, dtype=int)))
-        self._made.ptsmc_many(count, *map(_at, (state, given, after, out, status)))
+        self._made.ptsmc_many(count, *map(_at, (self.parameters, state, given, after, out, status)))
         names = list(STATUS)
         self.statuses.update({names[k].lower(): int(n) for k, n in enumerate(np.bincount(status.ravel())) if n})
         return after, out, status

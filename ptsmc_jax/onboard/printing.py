@@ -174,6 +174,7 @@ class Printer:
             lines += self._block(region.blocks[0], inner)
             lines += wrapped(f"if (!({self.text(region.outputs[0][0])})) {{", inner)
             lines += [f"{inner}    break;", f"{inner}}}"]
+        once = Counter(self.counts)
         lines += self._block(region.blocks[-1], inner)
         after = []
         for node, output in zip(region.carried, region.outputs[-1], strict=False):
@@ -186,6 +187,8 @@ class Printer:
             k = self._name(region.index) if region.index is not None else ""
             lines += wrapped(f"{self._name(table)}[{k}] = {self.text(region.outputs[-1][which])};", inner)
         self.section = None
+        for op in self.counts:  # of a loop until something is so, one pass is counted
+            self.counts[op] += (self.counts[op] - once[op]) * max(region.length - 1, 0)
         return [*lines, *after, f"{indent}}}"]
 
     # names

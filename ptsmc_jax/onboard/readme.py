@@ -1,27 +1,15 @@
 """README.md of a controller's folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
 from ptsmc_jax.onboard.templates import STATUS, About, filled, operations, stack
 
-DERIVED = {
-    "observer_matrix": "(I - e^(-A h)) / h, A = diag(l) J^-1, of the observer's gain l, `inertia` and `period`",
-    "bound_rate": "with the other `bound_` fields K2(t), which the law switches against, of the observer's gain, "
-    "`inertia` and the bounds on the disturbance",
-    "inertia_inverse": "the inverse of `inertia`",
-    "filter_attitude_gain": "1 - p^2, p = e^(-bandwidth interval), interval that between star tracker samples",
-    "filter_bias_gain": "(1 - p)^2 / interval",
-    "actuators_wheels_allocation": "the pseudo-inverse of `actuators_wheels_axes`",
-}
-
 
 def readme(code: Code, about: About) -> str:
     """What it is, what it takes, how it is linked."""
-    names = [made.name for made in code.parameters]
-    derived = [f"| `{name}` | {said} |" for name, said in DERIVED.items() if name in names]
-    follow = ["These follow from others, and change with them:", "", "| field | is |", "|---|---|", *derived]
+    deriving = _listed(code.deriving)
     delay = (
         f"\n\nThe scenario has a delay of {about.delay} control periods between measuring and acting. `command` is "
         "what the law asks for now, `torque` and the wheels' torques are what acts from this sample on, by the "
@@ -40,11 +28,35 @@ def readme(code: Code, about: About) -> str:
         outputs=_rows(code.outputs),
         statuses="\n".join(f"| `PTSMC_{key}` = {k} | {said} |" for k, (key, said) in enumerate(STATUS.items())),
         delay=delay if about.delay else "",
-        costs=", ".join(f"{n} {what}" for what, n in operations(code).items() if n),
+        costs=_listed(code.counts),
+        deriving=f" Where parameters have changed, and in `ptsmc_init`, {deriving} more." if deriving else "",
         stack=str(stack(code)),
-        derived="\n".join(follow) if derived else "",
+        derived=_derived(code),
         motors=motors if about.wheels else "",
     )
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} {what}" for what, n in operations(counts).items() if n)
+
+
+def _derived(code: Code) -> str:
+    """What follows from parameters, and what of that C leaves to the export."""
+
+    def table(names: Sequence[str]) -> list[str]:
+        return [f"| `{name}` | {', '.join(f'`{other}`' for other in code.follows[name]) or 'constant'} |"
+                for name in names]  # fmt: skip
+
+    said: list[str] = []
+    if code.derived:
+        said += ["What follows from them is no parameter: `ptsmc_init` derives it as the library does, and "
+                 "`ptsmc_step` again where one of the parameters has changed.", "", "| derived | from |", "|---|---|",
+                 *table([made.name for made in code.derived])]  # fmt: skip
+    if code.fixed:
+        said += ["", "These follow from others, too, but C cannot derive them: they are those of the scenario, and "
+                 "where the others change, export again.", "", "| parameter | from |", "|---|---|",
+                 *table(list(code.fixed)), "", *(f"{why}." for why in dict.fromkeys(code.fixed.values()))]  # fmt: skip
+    return "\n".join(said)
 
 
 def _rows(members: Sequence[Field]) -> str:

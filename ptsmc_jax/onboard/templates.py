@@ -1,7 +1,8 @@
 """The text around the generated functions: header, parameters, step, the program that checks it, Makefile."""
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +81,13 @@ def header(code: Code, about: About) -> str:
             " A filter that has run before the manoeuvre: set attitude and bias after that, else it starts from the "
             "first star tracker sample."
         )
-    parameters = "Gains, body, devices: numbers that may change without another export. Derived ones: see README.md."
+    parameters = "Gains, body, devices: numbers that may change without another export."
+    derived = (
+        "What follows from the parameters, and the parameters that it was computed from: ptsmc_init computes it, and "
+        "ptsmc_step anew where they have changed."
+    )
+    basis = [dataclasses.replace(made, name=f"of_{made.name}", about="") for made in code.basis]
+    last = ["    ptsmc_out last; /* good one */", *(["    ptsmc_derived derived;"] if code.derived else [])]
     return "\n\n".join([
         "\n".join(comment(f"ptsmc_{about.name}.h: {about.law}, from {about.scenario}.\nMade by ptsmc export; scenario "
                           f"SHA-256 {about.digest}.")),
@@ -94,7 +101,8 @@ def header(code: Code, about: About) -> str:
         struct("ptsmc_params", parameters, code.parameters),
         struct("ptsmc_in", "What is measured at a sample.", code.inputs, time),
         struct("ptsmc_out", "What comes of it.", code.outputs),
-        struct("ptsmc_state", remembered, code.state, flags, ["    ptsmc_out last; /* good one */"]),
+        *([struct("ptsmc_derived", derived, [*code.derived, *basis])] if code.derived else []),
+        struct("ptsmc_state", remembered, code.state, flags, last),
         "/* The parameters of the scenario. */\nextern const ptsmc_params ptsmc_parameters;",
         "/* Before the first sample. */\nvoid ptsmc_init(const ptsmc_params *p, ptsmc_state *state);",
         "\n".join(comment("One sample, once a period: reads in, sets out, which is finite whatever happens, and "
@@ -145,12 +153,15 @@ typedef ptsmc_real real;
 #endif
 """
     body = "\n\n".join(code.functions)
-    helpers = [text for name, text in HELPERS.items() if f"{name}(" in body]
+    helpers = [text for name, text in HELPERS.items() if f"{name}(" in body + code.derivation]
     doc = comment(f"ptsmc_{about.name}.c: {about.law}, from {about.scenario}.\nMade by ptsmc export; scenario SHA-256 "
                   f"{about.digest}. Headings name the functions of the source that this is traced from, with "
                   "the equations of Chen, Ju, Wang, Li, The prescribed time sliding mode control for attitude tracking "
                   "of spacecraft.")  # fmt: skip
-    return "\n".join([*doc, "", head, *helpers, body, "", *_checks(code, about), "", *_step(code, about), ""])
+    ahead = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);", ""] if code.derived else []
+    last = ["", code.derivation] if code.derived else []  # long, and not what a reader looks for
+    body = [*ahead, body, "", *_checks(code, about), "", *_step(code, about), *last, ""]
+    return "\n".join([*doc, "", head, *helpers, *body])
 
 
 HELPERS = {
@@ -219,17 +230,39 @@ def _checks(code: Code, about: About) -> list[str]:
     lines += [*_all(terms, "        "), "}", "", "/* Whether everything that is kept, and goes out, is finite. */",
               "static int sound(const ptsmc_state *now, const ptsmc_out *out)", "{"]  # fmt: skip
     kept = [_finite(made, "now->") for made in code.state if made.kind == REAL]
-    return [*lines, *_all([*kept, *(_finite(made, "out->") for made in code.outputs)], "        "), "}"]
+    lines += [*_all([*kept, *(_finite(made, "out->") for made in code.outputs)], "        "), "}"]
+    return [*lines, *_current(code)] if code.derived else lines
+
+
+def _current(code: Code) -> list[str]:
+    """Whether what is derived is derived from these parameters."""
+
+    def same(made: Field) -> str:
+        first = made.name + "[0]" * len(made.shape)
+        if made.kind != REAL:
+            return f"p->{first} == d->of_{first}"
+        return f"same(&p->{first}, &d->of_{first}, {made.size})"
+
+    return ["", "static int same(const real *v, const real *w, int count)", "{",
+            "    for (int k = 0; k < count; k++) {", "        if (!(v[k] <= w[k] && v[k] >= w[k])) {",
+            "            return 0;", "        }", "    }", "    return 1;", "}", "",
+            "/* Whether what is derived follows from these parameters. */",
+            "static int current(const ptsmc_params *p, const ptsmc_derived *d)", "{",
+            *_all([same(made) for made in code.basis], "        "), "}"]  # fmt: skip
 
 
 def _step(code: Code, about: About) -> list[str]:
     call = code.calls
     singular = any(made.name == "clearance" for made in code.state)
+    derived = ["    derive(p, &state->derived);"] if code.derived else []
+    again = (
+        ["    if (!current(p, &state->derived)) {", *(f"    {line}" for line in derived), "    }"] if derived else []
+    )
     lines = [
         "void ptsmc_init(const ptsmc_params *p, ptsmc_state *state)", "{",
         "    static const ptsmc_state none = {0};", "",
-        "    *state = none;", f"    {call['begin'].replace('&now', 'state')};",
-        *([] if "p" in _arguments(call["begin"]) else ["    (void)p;"]), "}", "",
+        "    *state = none;", *derived, f"    {call['begin'].replace('&now', 'state')};",
+        *([] if code.derived or "p" in _arguments(call["begin"]) else ["    (void)p;"]), "}", "",
         "int ptsmc_step(const ptsmc_params *p, ptsmc_state *state, const ptsmc_in *in, ptsmc_out *out)", "{",
         "    const real t = (real)in->t;",
         "    const real dt = state->started ? (real)(in->t - state->t) : R(0);",
@@ -239,6 +272,7 @@ def _step(code: Code, about: About) -> list[str]:
         "    ptsmc_state now;", "    ptsmc_out found;", "",
         f"    if (!usable({'p, ' if about.spacecraft else ''}state, in)) {{", "        *out = state->last;",
         "        return PTSMC_INPUT;", "    }",
+        *again,
         "    now = *state;", "    found = state->last;", f"    {call['sense']};", f"    {call['observe']};",
         f"    {call['command']};",
     ]  # fmt: skip
@@ -269,13 +303,18 @@ def _arguments(call: str) -> list[str]:
 
 
 def columns(code: Code) -> dict[str, list[str]]:
-    """See `generate.columns`."""
-    return generate.columns(code.inputs, code.state, code.outputs)
+    """See `generate.columns`; and the parameters."""
+    found = generate.columns(code.inputs, code.state, code.outputs)
+    return {**found, "params": [element for made in code.parameters for element in made.elements()]}
 
 
 def flat(code: Code, about: About) -> str:
-    """ptsmc_NAME_flat.h: the structs as rows of doubles, for check.c and for other programs that call it."""
+    """ptsmc_NAME_flat.h: the structs as rows of doubles, for check.c and for other programs that call it.
+
+    What is derived is not among them: it is the parameters' to say.
+    """
     kinds = {made.name: made.kind for made in (*code.inputs, *code.state, *code.outputs)}
+    kinds |= {made.name: made.kind for made in code.parameters}
     lists = columns(code)
 
     def kind(column: str) -> str:
@@ -284,14 +323,15 @@ def flat(code: Code, about: About) -> str:
             name, declared(kinds.get(name, REAL)).replace("real", "ptsmc_real")
         )
 
-    lines = [f"/* Structs of ptsmc_{about.name}.h from and to rows of doubles, in the order of vectors.csv. */",
+    lines = [f"/* Structs of ptsmc_{about.name}.h from and to rows of doubles, in the order of vectors.csv and "
+             "controller.json. */",
              f'#include "ptsmc_{about.name}.h"', ""]  # fmt: skip
-    lines += ["enum {", *(f"    PTSMC_{name.upper()}_SIZE = {len(found)}{',' if name != 'state' else ''}"
+    lines += ["enum {", *(f"    PTSMC_{name.upper()}_SIZE = {len(found)}{',' if name != 'params' else ''}"
                           for name, found in lists.items()), "};", ""]  # fmt: skip
-    for name in ("in", "state"):
+    for name in ("in", "state", "params"):
         lines += [f"static inline void {name}_from(const double *v, ptsmc_{name} *x)", "{"]
         lines += [f"    x->{column} = ({kind(column)})v[{k}];" for k, column in enumerate(lists[name])] + ["}", ""]
-    for name in ("out", "state"):
+    for name in ("out", "state", "params"):
         lines += [f"static inline void {name}_to(const ptsmc_{name} *x, double *v)", "{"]
         lines += [f"    v[{k}] = (double)x->{column};" for k, column in enumerate(lists[name])] + ["}", ""]
     return "\n".join(lines)
@@ -329,9 +369,8 @@ def _compared(column: str) -> str:
     return TORQUES[0] if name.startswith(TORQUES) else RATES[0] if name in RATES else name
 
 
-def operations(code: Code) -> dict[str, int]:
-    """Operations of a step at most, by sort."""
-    count = code.counts
+def operations(count: Mapping[str, int]) -> dict[str, int]:
+    """Operations of a step at most, or of another function, by sort."""
     sums = sum(count.get(op, 0) for op in ("add", "sub", "neg"))
     others = {"sums": sums, "products": count.get("mul", 0), "quotients": count.get("div", 0),
               "roots": count.get("sqrt", 0) + count.get("cbrt", 0)}  # fmt: skip
@@ -344,5 +383,6 @@ def operations(code: Code) -> dict[str, int]:
 
 def stack(code: Code, real: int = 8) -> int:
     """Bytes of stack of a step at most, if no variable shared a place with another."""
-    fields = sum(made.size * (real if made.kind == REAL else 4) for made in (*code.state, *code.outputs, *code.outputs))
+    held = (*code.state, *code.outputs, *code.outputs, *code.derived, *code.basis)
+    fields = sum(made.size * (real if made.kind == REAL else 4) for made in held)
     return int(math.ceil((fields + code.variables * real + 256) / 16) * 16)

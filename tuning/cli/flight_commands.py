@@ -49,7 +49,7 @@ def export(
     made = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
     store.write(folder, lambda making: controllers.write(making, made, seed, trials))
     if not quiet:
-        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code).items() if n)
+        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code.counts).items() if n)
         terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")
     return 0
 

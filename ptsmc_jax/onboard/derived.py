@@ -1,0 +1,86 @@
+"""Which parameters of a flight computer follow from others, and how.
+
+The same functions as the library's own give them here; traced, they are what C does where gains or the body change.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ptsmc_jax.devices.attitude_filter import filter_gains
+from ptsmc_jax.numerics import matrices
+from ptsmc_jax.simulation.assembly import Parts
+
+Given = dict[str, Any]  # the parameters, see `board.board`
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How some of the parameters follow from the others."""
+
+    run: Callable[[Given], Given]  # of all parameters: all of them, those that follow computed anew
+
+
+def rules(parts: Parts) -> list[Rule]:
+    """The rules for the flight computer of these parts, each for what the ones before it give."""
+    found = [_inverses, _estimation]
+    device = parts.actuators
+    if getattr(parts.sensors, "filter", None) is not None:
+        found.append(_filtering(parts.sensors))
+    if device is not None and device.wheels is not None:
+        found.append(_allocation)
+    return [Rule(run) for run in found]
+
+
+def _inverse(model: Any) -> Any:
+    """A plant's model with the inverse of its inertia, where it keeps one."""
+    if all(field.name != "inertia_inverse" for field in fields(model)):
+        return model
+    return replace(model, inertia_inverse=matrices.solve(model.inertia, jnp.eye(model.inputs)))
+
+
+def _inverses(given: Given) -> Given:
+    known = {name: given[name] for name in ("law", "observer")}
+    return given | {name: replace(part, model=_inverse(part.model)) for name, part in known.items()}
+
+
+def _estimation(given: Given) -> Given:
+    """The observer's matrix for a period, and K2, the bound on its error."""
+    observer = given["observer"]
+    return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
+
+
+def _filtering(sensors: Any) -> Callable[[Given], Given]:
+    every = sensors.every
+
+    def run(given: Given) -> Given:
+        """`attitude_filter.filter_gains` without a difference of two near ones, which single precision cannot take."""
+        interval = given.get("star_tracker_interval", given["period"] * every)
+        gone = -jnp.expm1(-given["filter_bandwidth"] * interval)  # 1 - p
+        known = replace(given["filter"], attitude_gain=gone * (2.0 - gone), bias_gain=gone**2 / interval)
+        return given | {"filter": known}
+
+    return run
+
+
+def _allocation(given: Given) -> Given:
+    """The pseudo-inverse of the wheels' axes, A' (A A')^-1: they span all directions."""
+    device = given["actuators"]
+    axes = device.wheels.axes
+    allocation = axes.T @ matrices.solve(axes @ axes.T, jnp.eye(len(axes)))
+    return given | {"actuators": replace(device, wheels=replace(device.wheels, allocation=allocation))}
+
+
+def bandwidth(sensors: Any, period: Any) -> np.ndarray:
+    """Bandwidth of an attitude filter [rad/s] behind these sensors: the shortest number that gives its gains."""
+    exact = float(sensors.bandwidth(period))
+    interval = float(period) * sensors.every if sensors.own_times is None else float(sensors.own_times.interval)
+    wanted = float(sensors.filter.attitude_gain)
+    for digits in range(3, 17):
+        short = float(f"{exact:.{digits}g}")
+        if abs(float(filter_gains(short, interval)[0]) - wanted) < 1e-15:
+            return np.asarray(short)
+    return np.asarray(exact)

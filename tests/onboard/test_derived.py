@@ -1,0 +1,209 @@
+"""Other parameters in the struct, without another export, fly what the library flies with them."""
+
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.observers.base import ErrorBound
+from ptsmc_jax.onboard import folder, vectors
+from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.library import Library
+from ptsmc_jax.onboard.readme import readme
+from scenarios.own_parts import LowPass
+from tests.helpers import short
+from tests.onboard.compiled import CC, STRICT, needs_compiler
+from tests.onboard.flights import FILTER, FLIGHTS, FULL, flight
+
+OTHER = np.diag([8.0, 13.0, 12.0]) + np.array([[0.0, 0.4, 0.3], [0.4, 0.0, -0.5], [0.3, -0.5, 0.0]])
+
+# of a scenario's key: the parameter of the C that it is, and another value
+PAPERS = {
+    "spacecraft__inertia": ("inertia", OTHER),
+    "controller__t_f": ("law_t_f", 4.6),
+    "controller__eta": ("law_eta", 3.7),
+    "controller__delta": ("law_delta", 0.4),
+    "controller__k1": ("law_k1", 1.7),
+    "controller__sign_width": ("law_sign_width", 4e-3),
+    "controller__surface_rate": ("law_surface_rate", 1.3),
+    "controller__disturbance_rate_bound": ("observer_disturbance_rate_bound", 3e-3),
+    "controller__initial_estimate_error": ("observer_initial_error", 2e-3),
+    "observer__gain": ("observer_gain", [7.0, 11.0, 9.0]),
+}
+FILTERS = {"filter__bandwidth": ("filter_bandwidth", 0.13)}
+AXES = np.array([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, -1.0, 0.0]])  # unit vectors
+GAIN = {"gain": [10.0, 10.0, 10.0]}  # whose default follows from the inertia
+FLOWN = {
+    "raw": (flight(observer=GAIN), PAPERS),
+    "filter": (flight(observer=GAIN, **FILTER), PAPERS | FILTERS),
+    "star tracker out of step": ({**FLIGHTS["star tracker out of step"], "observer": GAIN}, PAPERS | FILTERS),
+    "wheels": (
+        flight(observer=GAIN, **FILTER, spacecraft={"inertia": FULL},
+               wheels={"kind": "axes", "axes": np.eye(3)[[0, 1, 2, 2]].tolist(), "torque_limit": 2.0}),
+        PAPERS | FILTERS | {"wheels__axes": ("actuators_wheels_axes", AXES.T)}),
+    "multiplicative": ({**FLIGHTS["multiplicative"], "observer": GAIN}, PAPERS),
+    "own law": (FLIGHTS["own law"], {
+        "spacecraft__inertia": ("inertia", OTHER),
+        "controller__t_f": ("law_t_f", 4.6),
+        "controller__delta": ("law_delta", 0.8),
+        "controller__m": ("law_m", 1.4),
+        "controller__k1": ("law_k1", 0.8),
+        "controller__k": ("law_k", 3e-3),
+        "observer__rate": ("observer_rate", 0.7),
+        "reference__angle": ("reference_angle", 0.07)}),
+    "no observer": (FLIGHTS["no observer"], {
+        "spacecraft__inertia": ("inertia", OTHER),
+        "controller__disturbance_bound": ("observer_disturbance_bound", 0.02)}),
+    "finite time observer": (FLIGHTS["finite time observer"], {
+        "observer__gain": ("observer_gain", [0.2, 0.15, 0.1]),
+        "controller__disturbance_rate_bound": ("observer_disturbance_rate_bound", 5e-3),
+        "controller__initial_estimate_error": ("observer_initial_error", 2e-3)}),
+    "prescribed time observer": (
+        flight(observer={"kind": "prescribed_time", "t_o": 2.0, "gain": [10.0, 10.0, 10.0]}), PAPERS | {
+        "observer__mu": ("observer_mu", 2.6),
+        "observer__t_o": ("observer_t_o", 1.5)}),
+}  # fmt: skip
+
+
+def off(known, library):
+    """Largest difference of a command by C from one by the library, of the largest one; two trials."""
+    ready = scenario.study(folder.flown(known))
+    computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
+    flown = vectors.fly_many(ready.parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
+    flown = jax.tree.map(np.asarray, flown)
+    at, worst = library.columns["out"].index("command[0]"), 0.0
+    for k in range(len(trials)):
+        samples = vectors.one(flown, k)
+        assert vectors.usable(samples)
+        given, out, _ = vectors.rows(computer, samples)
+        state, commands = vectors.first_state(computer, samples), slice(at, at + samples.command.shape[1])
+        found = np.empty_like(out)
+        for n, row in enumerate(given):
+            state, found[n], _ = library.many(state, row)
+        apart = np.abs(found[:, commands] - out[:, commands])
+        worst = max(worst, float(np.max(apart) / np.max(np.abs(out[:, commands]))))
+    return worst
+
+
+def put(library, name, value):
+    """Sets a parameter."""
+    columns = library.columns["params"]
+    at = [k for k, column in enumerate(columns) if column.partition("[")[0] == name]
+    assert at, (name, columns)
+    library.parameters[at] = np.ravel(value)
+
+
+def exported(tables, place):
+    """A complete scenario, and its controller compiled."""
+    known = scenario.reading.complete(scenario.from_tables(tables))
+    made = folder.Controller(known, "flight", "flight")
+    store.write(place, lambda making: folder.write_program(making, made))
+    return known, Library(place)
+
+
+def changed(known, changes):
+    """The scenario with these changes."""
+    plain = {key: np.asarray(value).T.tolist() if key == "wheels__axes" else np.asarray(value).tolist()
+             for key, (_, value) in changes.items()}  # fmt: skip
+    return scenario.replace(known, **plain)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", short(list(FLOWN), ["wheels"]))
+def test_changed_parameters_fly_what_the_library_flies_with_them(name, tmp_path):
+    """Rounding leaves 1e-16 of the largest command, behind the filter 1e-14; 1e-12 is what is promised."""
+    tables, changes = FLOWN[name]
+    known, library = exported(tables, tmp_path / "controller")
+    assert off(known, library) < 1e-12
+    assert off(changed(known, changes), library) > 1e-3
+    for parameter, value in changes.values():
+        put(library, parameter, value)
+    assert off(changed(known, changes), library) < 1e-12
+
+
+@needs_compiler
+@pytest.mark.long
+@pytest.mark.parametrize("name", list(FLOWN))
+def test_each_parameter_alone(name, tmp_path):
+    tables, changes = FLOWN[name]
+    known, library = exported(tables, tmp_path / "controller")
+    first = library.parameters.copy()
+    for key, (parameter, value) in changes.items():
+        library.parameters = first.copy()
+        other = changed(known, {key: changes[key]})
+        before = off(other, library)
+        put(library, parameter, value)
+        after = off(other, library)
+        print(f"{name}, {parameter}: {after:.1e} of the largest command, {before:.1e} if it were not set")
+        assert after < 1e-12 < before, parameter
+
+
+MAIN = """
+#include <string.h>
+#include "ptsmc_flight_flat.h"
+
+/* Parameters that change between two samples: as if they had always been these, but for what is remembered. */
+int main(void)
+{
+    const double first[] = {@first@}, second[] = {@second@};
+    double row[PTSMC_STATE_SIZE];
+    ptsmc_params other = ptsmc_parameters;
+    ptsmc_state x, y;
+    ptsmc_in in;
+    ptsmc_out out, expected, before;
+
+    other.inertia[0][0] = (ptsmc_real)11;
+    other.observer_gain[1] = (ptsmc_real)7;
+    ptsmc_init(&ptsmc_parameters, &x);
+    in_from(first, &in);
+    ptsmc_step(&ptsmc_parameters, &x, &in, &out);
+    ptsmc_init(&other, &y);
+    state_to(&x, row);
+    state_from(row, &y);
+    in_from(second, &in);
+    ptsmc_step(&other, &y, &in, &expected);
+    y = x;
+    ptsmc_step(&ptsmc_parameters, &y, &in, &before);
+    ptsmc_step(&other, &x, &in, &out);
+    return memcmp(&out, &expected, sizeof out) != 0 || memcmp(&out, &before, sizeof out) == 0;
+}
+"""
+
+
+@needs_compiler
+def test_parameters_may_change_between_samples(tmp_path):
+    tables, _ = FLOWN["raw"]
+    known, library = exported(tables, tmp_path)
+    half, rows = 0.25, np.zeros((2, len(library.columns["in"])))
+    rows[:, 0] = 0.0, known.loop.period
+    rows[:, 1:5] = np.sin(half), 0.0, 0.0, np.cos(half)
+    rows[1, 5] = 0.02
+    said = [", ".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "main.c").write_text(MAIN.replace("@first@", said[0]).replace("@second@", said[1]))
+    sources = [tmp_path / name for name in ("ptsmc_flight.c", "ptsmc_flight_parameters.c", "main.c")]
+    assert CC is not None
+    subprocess.run([CC, *STRICT, *map(str, sources), "-o", str(tmp_path / "main"), "-lm"], check=True)
+    assert subprocess.run([str(tmp_path / "main")], check=False).returncode == 0
+
+
+class Steepest(LowPass):
+    """A K2 that C has no rule for."""
+
+    def error_bound(self):
+        return ErrorBound(*[self.disturbance_bound * jnp.linalg.eigvalsh(self.model.inertia)[-1]] * 3)
+
+
+def test_what_c_cannot_derive_stays_a_parameter_and_is_said():
+    tables = {**FLIGHTS["raw"], "observer": {"kind": "own", "code": f"{__file__}:Steepest"}}
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "flight")
+    names = [field.name for field in made.code.parameters]
+    assert [name for name in made.code.fixed if name in names] == ["bound_rate"]  # one number, three times
+    assert {"inertia", "observer_disturbance_bound"} == set(made.code.follows["bound_rate"])
+    assert [field.name for field in made.code.derived] == ["inertia_inverse"]
+    said = readme(made.code, made.about)
+    assert "| `bound_rate` | `inertia`, `observer_disturbance_bound` |" in said
+    assert "`eigh` (" in said
