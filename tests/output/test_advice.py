@@ -3,6 +3,7 @@
 import inspect
 
 import numpy as np
+import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation.requirements import Requirement
@@ -87,3 +88,14 @@ def test_a_column_is_called_after_whose_gains_it_holds():
     assert gains.paper_is(scenario.replace(paper, loop__period=0.5)) == "paper, scaled"  # a hand-over of a period
     assert gains.paper_is(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "paper, scaled"
     assert gains.paper_is(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
+
+
+@pytest.mark.parametrize("kind", ["chain", "spacecraft"])
+def test_the_papers_law_flies_in_place_of_another_on_every_plant(kind):
+    order = {"order": 2} if kind == "chain" else {}
+    flown = scenario.from_tables(
+        {"plant": {"kind": kind, **order}, "loop": {"mode": "sampled"}, "controller": {"kind": "pd", "t_f": 12.0}}
+    )
+    papers = gains.papers(flown)
+    assert (papers.controller.kind, papers.controller.t_f, papers.controller.eta) == ("prescribed_time", 12.0, 3.0)
+    assert getattr(papers.controller, "error", "multiplicative") == "multiplicative"

@@ -1,10 +1,14 @@
 """What a tuning run does with what fresh trials say."""
 
 import tomllib
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ROOT, SHORT, small_search
 from tuning.output import search_sentences
 from tuning.search import worst
@@ -40,6 +44,23 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
     once = tuner.tune(loaded, 0, trusted=False, tries=1)
     assert once.gains == first.gains
     assert not once.met
+
+
+@pytest.mark.parametrize(
+    ("metric", "values", "reached", "over"),
+    [
+        ("peak_torque", [0.4, 0.6], 0.9, {"peak_torque": 1.2}),
+        ("peak_torque", [0.4, 0.6], 1.1, {}),  # not kept in the search either
+        ("peak_torque", [0.4, 0.6], 0.0, {}),  # nothing to keep more distance from
+        ("gain_margin", [5.0, 7.0], 0.9, {"gain_margin": 2.0 - 5.0 / 6.0}),
+        ("gain_margin", [0.0, 7.0], 0.9, {}),  # the loop swings by itself
+    ],
+)
+def test_what_more_distance_from_a_limit_cannot_mend_is_left(metric, values, reached, over):
+    wanted = Requirement(metric, 0.5 if metric == "peak_torque" else 6.0, "", at_least=metric == "gain_margin")
+    verdict = wanted.verdict(np.asarray(values), np.ones(2, bool))
+    found = SimpleNamespace(worst=np.asarray([reached]), problem=SimpleNamespace(rows=[metric]))
+    assert tuner._over(cast("Any", found), [verdict]) == pytest.approx(over)
 
 
 def test_a_default_is_what_it_stands_for():

@@ -101,7 +101,8 @@ def papers(scenario: Scenario) -> Scenario:
     table, own = scenario.controller, of_paper(scenario)
     if not table.prescribed:
         kept = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
-        law = {"kind": "prescribed_time", "error": "multiplicative", **kept, "delta": own["delta"]}
+        error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
+        law = {"kind": "prescribed_time", **error, **kept, "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)
 

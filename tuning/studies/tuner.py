@@ -214,13 +214,16 @@ def tune(
 def _over(found: Search, verdicts: list[Verdict]) -> dict[str, float]:
     """How many times its limit each metric reached that broke it on fresh trials; empty: more distance is no help.
 
-    It is one where the search kept every limit, and every value is a number.
+    It is one where the search kept every limit, came near those that are broken, and every value is a number.
     """
     # what is asked for a share of the time is searched for as a limit
     over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
             for one in verdicts if not one.met and one.limit}  # fmt: skip
     helped = bool(np.all(found.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
-    return over if helped else {}
+    reached = dict(zip(found.problem.rows, found.worst, strict=True))  # 0: trials of the search saw nothing of it
+    # a loop that swings by itself has no margin left, see `theory.rest`, whatever the search keeps
+    swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
+    return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
 
 
 def _after(history: list[Step], more: list[Step]) -> list[Step]:
