@@ -69,6 +69,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         return None if asked is None else asked.build(*how)
 
     levels = {key: drawn(key) for key in variation.LEVELS}
+    asked = {key: getattr(table, key, None) for key in MISFITS}
     return variation.Dispersion(
         **scenario.spread(parts),
         phase=None if table.disturbance_phase is None else numbers.UniformPhase(phases),
@@ -76,9 +77,10 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         bias=drawn("disturbance_bias", parts.plant.inputs),
         own=drawn("own"),
         levels={key: level for key, level in levels.items() if level is not None},
+        # one of no width is none, so that the program is the same, and every digit
         misfits={
-            key: made(getattr(table, key), parts)
-            for key, made in MISFITS.items()
-            if getattr(table, key, None) is not None
+            key: MISFITS[key](how, parts)
+            for key, how in asked.items()
+            if how is not None and not getattr(how, "nothing", False)
         },
     )

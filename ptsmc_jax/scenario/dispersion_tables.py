@@ -21,6 +21,11 @@ class Numbers(Table, frozen=True):
         width = np.ones(count) * getattr(self, self.width)
         return np.deg2rad(width) if self.degrees else width
 
+    @property
+    def nothing(self) -> bool:
+        """Whether it leaves everything as it is."""
+        return not np.any(self.of())
+
     def physics(self) -> Any:
         """A class of `dispersions.numbers`."""
         raise NotImplementedError
