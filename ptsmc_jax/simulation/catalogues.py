@@ -22,8 +22,8 @@ INDICES = {
     "rpe": "RPE, the error less its window's mean",
     "pde": "PDE, the difference of the means of two windows",
     "ake": "AKE, the error of the attitude that the law is given",
-    "mke": "MKE, its mean over a window",
-    "rke": "RKE, that error less its window's mean",
+    "mke": "MKE, the mean over a window of the error of the attitude that the law is given",
+    "rke": "RKE, the error of the attitude that the law is given less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
 TIMED = ("ape", "mpe", "ake", "mke")  # of which there are shares of time
@@ -34,8 +34,8 @@ WITHIN = "within_"  # how the metric begins that says for what share of the time
 CATALOGUE = {
     "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),
     "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
-    "window_error": Entry("-", "RMS of that 2-norm over the window after t_f"),
-    "hold_error": Entry("-", "largest of that 2-norm from t_f to t_end"),
+    "window_error": Entry("-", "RMS of the attitude error vector's 2-norm over the window after t_f"),
+    "hold_error": Entry("-", "largest 2-norm of the attitude error vector from t_f to t_end"),
     "window_angle": Entry("rad", "RMS of the angle to the reference attitude over the window after t_f"),
     "hold_angle": Entry("rad", "largest angle to the reference attitude from t_f to t_end"),
     "peak_torque": Entry("N m", "largest commanded torque about one axis, before the actuator"),

@@ -34,6 +34,8 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert "times that at 8 s" in out
     page = checked(tmp_path / "cost")
     assert "What a faster slew costs" in page.text
+    met = sum(slew["meets"] for slew in told["slews"])
+    assert f"At {met} of 2 prescribed times gains meet every requirement" in page.text
     assert "--against t_f --times 4,8" in page.text
     assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
     assert "already done" in command("pareto", "s.toml", "--against", "t_f", "--times", "8,4", "--out", "cost")[1]
@@ -110,6 +112,7 @@ def test_times_without_gains_are_told():
     assert sentences.slew_times(told).rows == [
         ("8", "1.000e-05", "10.0 %", "0.2", "3", "2 failed or missed"),
     ]
+    assert sentences.slew_times_heading(told) == "gains tuned for 1 prescribed time, judged on 1000 fresh trials"
     nothing = {**told, "slews": [], "requirements": []}
     assert sentences.slew_times(nothing).rows == []
     assert np.isfinite(len(list(sentences.slew_times_lines(nothing))))

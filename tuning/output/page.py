@@ -197,7 +197,7 @@ def _simulate(result: Result) -> tuple[Heading, list[Section]]:
     if summary["status"] == "ok" and verdicts:
         summary = {**summary, "status": "met" if all(v["met"] for v in verdicts) else "not met"}
     lines = [*sentences.run_lines(result.summary), *map(sentences.verdict, verdicts)]
-    columns = _columns(result.folder / "trajectory.csv")
+    columns = page_charts.read(result.folder / "trajectory.csv")
     law = result.scenario["controller"]
     marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
     if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would lie on each other
@@ -266,13 +266,6 @@ def _distance(verdict: dict[str, Any]) -> str:
     return f"; the trial that decides is at {margin * verdict['limit']:.4g}, {share}"
 
 
-def _columns(path: Path) -> dict[str, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        head, *rows = csv.reader(file)
-    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
-    return dict(zip(head, values.T, strict=True))
-
-
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     from ptsmc_jax.simulation.catalogues import CATALOGUES
 
@@ -280,7 +273,10 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     if "slews" in summary:
         blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
         lines, wanted = [sentences.slew_times_heading(summary)], bool(summary["requirements"])
-        return _verdict(summary, lines, wanted), [Section("What a faster slew costs", blocks)]
+        heading = _verdict(summary, lines, wanted)
+        met, asked = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
+        said = f"At {met} of {asked} prescribed times gains meet every requirement" if wanted else heading.headline
+        return Heading(heading.mood, said, heading.lines), [Section("What a faster slew costs", blocks)]
     known = result.scenario.get("requirements", {}).get("peak_torque")
     limit = known.get("limit") if isinstance(known, dict) else known
     caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."
@@ -335,7 +331,7 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
         rows = list(csv.reader(file))
     table = sentences.Table(tuple(rows[0]), [tuple(_short(cell) for cell in row) for row in rows[1:]])
     heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs of values"])
-    return heading, [Section("Pairs", [_table(table)])]
+    return heading, [Section("Pairs", [_table(table, page_captions.MAP)])]
 
 
 def _margins(result: Result) -> tuple[Heading, list[Section]]:

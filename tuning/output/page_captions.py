@@ -1,5 +1,10 @@
 """What stands under each figure on a page."""
 
+MAP = (
+    "linear_window_error and linear_torque are what linear theory predicts of the noise alone; radius, gain_margin (a "
+    "factor up to which the loop is stable) and delay_margin [s] are those of the frozen loop at the hand-over, stable "
+    "where the radius of its poles is below 1, and hold_radius, .. those in hold."
+)
 CAPTIONS = {
     "history": "Gains and goal of every start over the steps of the descent.",
     "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",

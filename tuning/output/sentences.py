@@ -270,7 +270,9 @@ def slew_times_lines(summary: Summary) -> Iterator[str]:
 
 def slew_times_heading(summary: Summary) -> str:
     """How many times, and on what they were judged."""
-    return f"gains tuned for {len(summary['slews'])} prescribed times, each judged on {summary['trials']} fresh trials"
+    many = len(summary["slews"]) != 1
+    times = f"{len(summary['slews'])} prescribed time{'s' if many else ''}"
+    return f"gains tuned for {times}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
 
 
 def campaign(summary: Summary) -> Table:
