@@ -35,6 +35,7 @@ def flown(x, y, text=SHORT, trials=6):
     [
         ("loop.period=0.1:0.4:3", [0.1, 0.25, 0.4]),
         ("controller.delta=0.05:5:3", [0.05, 0.5, 5.0]),
+        ("controller.delta=1:2:2", [1.0, 2.0]),
         ("hardware.delay=0:2:5", [0.0, 1.0, 2.0]),
     ],
 )
@@ -44,7 +45,7 @@ def test_axes(text, values):
 
 @pytest.mark.parametrize(
     "text", ["", "delta=1:2:3", "controller.delta", "controller.delta=1:2", "controller.delta=2:1:3", "a.b=1:2:1",
-             "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:1000", "a.b.c=1:2:3"]
+             "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3"]
 )  # fmt: skip
 def test_bad_axes_are_refused_in_a_sentence(text):
     with pytest.raises(mapping.AxisError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):

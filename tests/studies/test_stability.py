@@ -117,3 +117,4 @@ def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(p
     course = margins.along(parts)
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
+    assert np.isnan(course.at_sensors.delay).all()  # what comes late is a command
