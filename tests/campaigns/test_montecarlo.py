@@ -65,6 +65,7 @@ def test_more_trials_than_one_call_takes(flown, monkeypatch):
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:201], rtol=1e-12)
 
 
+@pytest.mark.long  # the loop over them is the same with less; `test_conformity.py` has vmap for each kind
 def test_trials_equal_plain_vmap(flown):
     run, trials = flown
     plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))

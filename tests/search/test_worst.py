@@ -12,7 +12,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, short, small_search, vector
-from tuning.search import objective, optimise, rounds, worst
+from tuning.search import flights, objective, optimise, rounds, worst
 from tuning.search.evaluate import Evaluator
 from tuning.search.shares import Bounds
 
@@ -223,6 +223,11 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     assert found.trial == trials[np.argmax(ratio)]
     np.testing.assert_allclose([found.ratio, found.screened], ratio.max(), rtol=1e-9)
     assert np.ptp(ratio) > 0.0
+    # more trials than a row has: each is flown, and stands in its own place
+    assert trials.size > flights.ROW
+    some = trials[[3, -1, -2]]
+    alone = flights.trials(problem.others(some), at)
+    np.testing.assert_allclose(alone.metrics.peak_rate / 0.1, ratio[[3, -1, -2]], rtol=1e-12)
 
 
 def test_a_trial_without_a_value_is_the_hardest():
