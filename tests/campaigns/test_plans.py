@@ -37,8 +37,6 @@ attitude_noise = 2e-5
 rate_noise = 1e-6
 rate_bias = 1e-5
 torque_limit = 30.0
-[filter]
-kind = "steady_state"
 [dispersion]
 attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 90.0 }
 rate = { kind = "normal" }
