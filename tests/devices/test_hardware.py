@@ -328,17 +328,16 @@ def everything(delta=0.93, **changes):
     return dataclasses.replace(run, sensors=sensing, actuators=device, disturbance=total, walk_rate=vector([1e-4] * 3))
 
 
+@jax.jit
+def error_with_everything(eta, delta, gain):
+    run = with_controller(everything(), eta=eta, delta=delta)
+    run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, gain=jnp.full(3, gain)))
+    return rollout.simulate(run, 3, 5).metrics.window_error
+
+
 def test_gradients_with_every_device_on():
-    every = everything()
-
-    def error(eta, delta, gain):
-        run = with_controller(every, eta=eta, delta=delta)
-        run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, gain=jnp.full(3, gain)))
-        return rollout.simulate(run, 3, 5).metrics.window_error
-
-    point = (vector(3.2), vector(0.93), vector(30.0))
-    forward = jax.jit(jax.jacfwd(error, (0, 1, 2)))(*point)
-    value = jax.jit(error)
+    point, value = (vector(3.2), vector(0.93), vector(30.0)), error_with_everything
+    forward = jax.jit(jax.jacfwd(value, (0, 1, 2)))(*point)
     for k, slope in enumerate(forward):
         # wide enough that the staircase of 1e-13 N m does not show
         h = 2e-5 * float(point[k])
@@ -363,9 +362,8 @@ def test_batches_with_every_device_on():
 
 def test_nothing_jumps_where_delta_is_a_multiple_of_the_period():
     """With delay, filter and walk too: the vanishing first period weighs nothing."""
-    run = everything()
-    value = jax.jit(lambda delta: rollout.simulate(with_controller(run, delta=delta), 3, 5).metrics.window_error)
-    below, above = (float(value(vector(1.0 + shift))) for shift in (-1e-7, 1e-7))
+    eta, gain = vector(3.2), vector(30.0)
+    below, above = (float(error_with_everything(eta, vector(1.0 + shift), gain)) for shift in (-1e-7, 1e-7))
     np.testing.assert_allclose(below, above, rtol=1e-4)
 
 
