@@ -61,6 +61,8 @@ _EXPORTS = {
     "Reach": "scenario.timing",
     "reach_of": "scenario.timing",
     "gains_of": "simulation.gains",
+    "in_scenario": "scenario.tuned",
+    "write": "explore",
     "with_gains": "simulation.gains",
     "one": "campaigns.montecarlo",
     "run": "campaigns.montecarlo",
@@ -77,6 +79,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
+    from ptsmc_jax.explore import write as write
     from ptsmc_jax.laws.acceleration import AccelerationLaw as AccelerationLaw
     from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
@@ -104,6 +107,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario as Scenario
     from ptsmc_jax.scenario.timing import Reach as Reach
     from ptsmc_jax.scenario.timing import reach_of as reach_of
+    from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
     from ptsmc_jax.signals.disturbances import Constant as Constant
     from ptsmc_jax.signals.disturbances import Disturbance as Disturbance
     from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid

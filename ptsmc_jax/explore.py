@@ -10,11 +10,11 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs
+from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
-from ptsmc_jax.scenario import Study
+from ptsmc_jax.scenario import Study, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -45,6 +45,18 @@ class Quantities(Mapping[str, float]):
             for name, value in self.items()
         ]
         return _table(("metric", "value", "unit", "meaning"), rows)
+
+
+def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
+    """Write a scenario as a file that every command takes, with every key; force: over one that is there.
+
+    Raises RefusedError where the file must not be written. What was made in Python is named there, and refused when it
+    is read: only code in files can stand in one.
+
+    >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
+    """
+    store.check_file(Path(file), force)
+    store.write_toml(Path(file), parsing.dump(scenario))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 import re
 import tomllib
 
+import jax
 import numpy as np
 import polars as pl
 import pytest
@@ -8,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import ptsmc_jax
 from ptsmc_jax import explore, scenario
-from ptsmc_jax.campaigns import campaign, runs
+from ptsmc_jax.campaigns import campaign, runs, store
 from ptsmc_jax.figures import animation
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
@@ -44,6 +45,38 @@ def test_a_file_is_read_and_errors_are_those_of_the_command(tmp_path):
         ptsmc_jax.replace(scenario.from_tables(TABLES), controller__eta=1.5)
     # what IPython shows in the place of a traceback
     assert caught.value._render_traceback_() == [f"ScenarioError: {caught.value}"]
+
+
+def test_a_scenario_with_other_gains_is_written_and_read_again(flight, tmp_path):
+    gains = {**ptsmc_jax.gains_of(scenario.study(flight.scenario).parts), "eta": 3.5, "delta": np.float64(0.4)}
+    other = ptsmc_jax.in_scenario(flight.scenario, gains)
+    ptsmc_jax.write(other, tmp_path / "s.toml")
+    again = ptsmc_jax.read(tmp_path / "s.toml")
+    assert ptsmc_jax.gains_of(scenario.study(again).parts) == gains
+    for one, two in zip(*(jax.tree.leaves(scenario.study(s).parts) for s in (other, again)), strict=True):
+        np.testing.assert_array_equal(one, two)
+    with pytest.raises(store.RefusedError, match="is there already"):
+        ptsmc_jax.write(other, tmp_path / "s.toml")
+    ptsmc_jax.write(flight.scenario, tmp_path / "s.toml", force=True)
+    assert ptsmc_jax.read(tmp_path / "s.toml").controller.eta == 3.0
+    with pytest.raises(ScenarioError, match=r"controller\.eta is 1\.5"):
+        ptsmc_jax.in_scenario(flight.scenario, {"eta": 1.5})
+
+
+def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(flight):
+    inertia = np.array([[11.0, 0.5, 0.0], [0.5, 12.0, -0.3], [0.0, -0.3, 9.0]])
+    own = scenario.study(flight.scenario).parts
+    wanted = scenario.study(scenario.replace(flight.scenario, spacecraft__inertia=inertia.tolist())).parts
+    moved, traced = own.with_inertia(inertia), jax.jit(own.with_inertia)(inertia)
+    for part in (lambda p: p.plant, lambda p: p.controller.model, lambda p: p.observer.model):
+        np.testing.assert_array_equal(part(moved).inertia, part(wanted).inertia)
+        np.testing.assert_array_equal(part(moved).inertia_inverse, part(wanted).inertia_inverse)
+        # elimination against LAPACK: some rounding of a matrix whose moments differ by less than 2
+        np.testing.assert_allclose(part(traced).inertia_inverse, np.linalg.inv(inertia), rtol=1e-14, atol=1e-17)
+    unknown = own.with_inertia([9.0, 8.0, 7.0], known=False)
+    np.testing.assert_array_equal(unknown.plant.inertia, np.diag([9.0, 8.0, 7.0]))
+    np.testing.assert_array_equal(unknown.controller.model.inertia, own.controller.model.inertia)
+    np.testing.assert_array_equal(unknown.observer.model.inertia, own.observer.model.inertia)
 
 
 def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():

@@ -60,7 +60,7 @@ HOUSE = {
             checks parsing
             free_gains timing
             build cautions own_checks reading
-            flyable
+            flyable tuned
         """,
         "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
         "onboard": """

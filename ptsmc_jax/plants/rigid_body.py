@@ -5,10 +5,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ptsmc_jax.formulas import check_inertia
-from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.numerics import attitude, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 
@@ -92,7 +93,10 @@ def spacecraft(inertia: object) -> Spacecraft:
     """Spacecraft from three principal moments or a symmetric (3, 3) tensor [kg m^2].
 
     Raises ValueError where no rigid body can have it: not symmetric, not positive definite, or one principal moment
-    larger than the sum of the other two.
+    larger than the sum of the other two. A traced one is taken as it is.
     """
+    if isinstance(inertia, Tracer):
+        tensor = jnp.diag(inertia) if inertia.shape == (3,) else inertia
+        return Spacecraft(tensor, matrices.solve(tensor, jnp.eye(3)))
     tensor = check_inertia(inertia)
     return Spacecraft(jnp.asarray(tensor), jnp.asarray(np.linalg.inv(tensor)))

@@ -8,6 +8,7 @@ from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
+from ptsmc_jax.plants.rigid_body import spacecraft
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 from ptsmc_jax.simulation.pointing import Pointing
 
@@ -46,6 +47,19 @@ class Setup:
         """The parts with another prescribed time [s]; the time after it is kept."""
         t_end = t_f + (self.t_end - self.controller.t_f)
         return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
+
+    def with_inertia(self: _Setup, inertia: Any, *, known: bool = True) -> _Setup:
+        """The parts of a spacecraft with another inertia [kg m^2], see `spacecraft`; traced ones too.
+
+        known: the law and the observer know it; else it is that of the truth alone.
+        """
+        body, moved = spacecraft(inertia), {"plant": self.plant}
+        if known:
+            both = {"controller": self.controller, "observer": self.observer}
+            moved |= {name: part.model for name, part in both.items() if hasattr(part, "model")}
+        changed = {name: plant.with_inertia(body.inertia, body.inertia_inverse) for name, plant in moved.items()}
+        models = {name: replace(getattr(self, name), model=model) for name, model in changed.items() if name != "plant"}
+        return replace(self, plant=changed["plant"], **models)
 
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """The parts of a run by this clock."""

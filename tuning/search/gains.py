@@ -3,19 +3,18 @@
 A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax.scenario import disturbance_bounds, keys, reading
+from ptsmc_jax.scenario import disturbance_bounds, keys
 from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.layouts import SCENARIOS
-from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
 from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.gains import AXIS, SENSORS, of_law, of_observer, of_sensors, on_every_axis
+from ptsmc_jax.simulation.gains import AXIS, SENSORS
 from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
 from ptsmc_jax.simulation.gains import own as own
@@ -60,26 +59,6 @@ def named(scenario: Scenario) -> tuple[str, ...]:
         each = tune.per_axis and name == "observer_gain"
         names += [f"{AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))] if each else [name]
     return tuple(names)
-
-
-def in_scenario(scenario: Scenario, gains: Mapping[str, float]) -> Scenario:
-    """The scenario with other gains, checked; all else stays, defaults too, and with another t_f the time after it."""
-    changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
-    changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
-    changes |= {f"sensors__{name}": value for name, value in of_sensors(gains).items()}
-    each = on_every_axis(gains, list(getattr(scenario.observer, "gain", ())))
-    if each is not None:
-        changes["observer__gain"] = each
-    if "filter_bandwidth" in gains:
-        changes["filter__bandwidth"] = gains["filter_bandwidth"]
-    if "command_corner" in gains:
-        table = scenario.devices.command_filter
-        assert table is not None
-        changes["hardware__command_filter"] = {**plain(table), "corner": gains["command_corner"]}
-    if "t_f" in gains:
-        assert scenario.loop.t_end is not None
-        changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)
-    return scenarios.replace(reading.settled(scenario), **changes)
 
 
 def of_paper(scenario: Scenario) -> dict[str, float]:
