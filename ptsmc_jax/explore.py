@@ -174,7 +174,7 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
     """One for each requirement of the scenario over these rows; a failed trial breaks every one of its runs.
 
-    Margins are those of its loop, see `margin_verdicts`; where inertias are drawn, of the loops of this seed's trials.
+    Margins are those of its loop, see `margin_verdicts`; where loops differ, of those of this seed's trials.
     """
     _check_whole_number("seed", seed)
     asked = scenario.margin_requirements(what)

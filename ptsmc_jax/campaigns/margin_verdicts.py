@@ -1,4 +1,4 @@
-"""Whether loops have the margins that a scenario asks for: nominal, or over the inertias that are drawn."""
+"""Whether loops have the margins that a scenario asks for: nominal, or over what is drawn and changes them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import INERTIA, OWN
+from ptsmc_jax.dispersions.base import INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -20,7 +20,9 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.theory import linear, margins, rest
 
-TRIALS = 256  # whose loops are looked at, where inertias are drawn
+TRIALS = 256  # whose loops are looked at, where they differ
+# what a loop hangs on besides misfits: body, and where on its way it is
+OF_LOOPS = {INERTIA, OWN, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
 CALL = 32  # of them that are flown and linearised at once
 JUDGED = 16  # loops judged in full at a time
 # how far off what `margins.roughly` reads may be, with room: in dB, deg, periods, dB
@@ -47,7 +49,7 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
 
     rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one.
     """
-    given = isinstance(rows, Row) and bool({INERTIA, *OF_MISFITS} & set(rows.given))
+    given = isinstance(rows, Row) and bool({*OF_LOOPS, *OF_MISFITS} & set(rows.given))
     if not ready.margins or not (given or differ(ready.dispersion)):
         return of_loop(ready.parts, ready.margins)
     if rest.swing(ready.parts) is not None:
@@ -65,7 +67,7 @@ def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Ve
 
 def differ(dispersion: Dispersion) -> bool:
     """Whether loops differ from trial to trial."""
-    return not {INERTIA, OWN}.isdisjoint(dispersion.kinds) or bool(dispersion.misfits)
+    return not OF_LOOPS.isdisjoint(dispersion.kinds) or bool(dispersion.misfits)
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:

@@ -35,6 +35,11 @@ def lines(summary: Summary) -> Iterator[str]:
         yield _swings(summary["swing"])
     else:
         yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
+    if "start_deg" in summary:
+        yield (
+            f"they are those along the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
+            "(another start: [initial])"
+        )
     for counts in (True, False):
         times = sorted(one["time_to_go"] for one in summary["before"] if not one["stable"] and one["judged"] == counts)
         if not times:

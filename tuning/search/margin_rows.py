@@ -24,7 +24,7 @@ from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.shares import Bounds
 
-CASES = 2  # loops with drawn inertias, those that come nearest to a limit
+CASES = 2  # loops of drawn trials, those that come nearest to a limit
 WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
 
 
@@ -48,7 +48,7 @@ class Asked:
 
 
 def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
-    """The margins that a scenario asks for, or None; where inertias are drawn, of the trials hardest by its gains."""
+    """The margins that a scenario asks for, or None; where loops differ, of the trials hardest by its gains."""
     if not ready.margins:
         return None
     asked = Asked(
@@ -67,7 +67,7 @@ def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
 def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
     """With the `CASES` trials whose loops come nearest to a limit by these gains, and how near the nearest comes.
 
-    As it is where no inertia is drawn: all loops are one, which is among the rows.
+    As it is where nothing is drawn that changes them: all loops are one, which is among the rows.
     """
     if not margin_verdicts.differ(asked.dispersion):
         return asked, 0.0

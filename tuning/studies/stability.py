@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import store
@@ -109,8 +110,15 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
         "said": _NO_SIGN if exact else None,
+        **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }
+
+
+def _start(ready: Study) -> float:
+    """How far the nominal run starts from its reference [deg]."""
+    along = abs(float(np.dot(ready.parts.initial.q, ready.parts.reference(jnp.zeros(())).q)))
+    return float(np.rad2deg(2.0 * np.arccos(min(along, 1.0))))
 
 
 def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
