@@ -219,16 +219,13 @@ def test_requirements_and_objective_of_a_scenario_reach_the_problem():
 
 def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite():
     near = variation.Dispersion(attitudes.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))
-
     some = problem(dispersion=near, peak_torque=0.7)
-
-    def f(at):
-        return measure(some, at)[:2]
-
-    (value, over), (slope, _) = f(vector([3.0, 0.7])), jax.jit(jax.jacfwd(f))(vector([3.0, 0.7]))
-    np.testing.assert_allclose(value, (1 + 8) * np.log(objective.FAILED))
-    assert np.all(np.asarray(over) == objective.FAILED - 1)
-    assert np.all(np.isfinite(slope))
+    evaluate = Evaluator(shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    found = evaluate.slopes(some, evaluate.bounds.share(np.array([3.0, 0.7]))[None])
+    np.testing.assert_allclose(found.f, (1 + 8) * np.log(objective.FAILED))
+    assert np.all(found.c == objective.FAILED - 1)
+    assert np.all(np.isfinite(found.f_slope))
+    assert np.all(np.isfinite(found.c_slope))
 
 
 @pytest.mark.long
