@@ -85,6 +85,7 @@ def test_wheels_end_a_period_at_their_limit_of_momentum(lag, way):
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=wheels)
     v = None if lag is None else [0.3 * way] * 3
     drive, end = commanded(device, [50.0 * way] * 3, v=v, h=[0.2, -0.3, 0.0])
+    assert end.h is not None
     np.testing.assert_allclose(end.h, [-0.5 * way] * 3, rtol=1e-13)
     assert drive.limited
 
