@@ -13,7 +13,7 @@ from tuning.search import gains
 from tuning.studies import tune_files, tuner
 
 
-def summary(over, *, searched=0.97):
+def summary(over, *, searched: float | None = 0.97):
     verdict = {"metric": "peak_torque", "limit": 0.5, "margin": over, "met": over is not None and over <= 1.0}
     found = {"largest_over_limit": {"peak_torque": searched}, "averaged": 256}
     return {"verdicts": [verdict], "search": found}
@@ -48,8 +48,8 @@ def tuned(times, counts, *, met=True, **more):
 
 def test_less_accurate_gains_are_not_praised():
     """The interval of a ratio turns over with it: from 0.05..0.1 to 10..20."""
-    interval = {"accuracy_gain_interval": [0.05, 0.1]}
-    (said,) = sentences.accuracy(tuned(0.08, {"ok": 64}, paper_is="paper, scaled", **interval))
+    less = tuned(0.08, {"ok": 64}, paper_is="paper, scaled", accuracy_gain_interval=[0.05, 0.1])
+    (said,) = sentences.accuracy(less)
     assert said == (
         "the tuned gains are less accurate than the paper's gains, scaled to this body and period: they leave 12.5 "
         "times the error (95 %: 10 to 20)"
