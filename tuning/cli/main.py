@@ -290,7 +290,8 @@ def compare(
     posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals)
     return searches.run(
-        loaded, folder, known_by, force, quiet, "",
+        loaded, folder, known_by, force, quiet,
+        comparing.tuner.GOALS[loaded.tune.objective],  # pyright: ignore[reportOptionalMemberAccess]
         check=posed,
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
