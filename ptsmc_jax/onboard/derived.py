@@ -26,7 +26,7 @@ class Rule:
 
 def rules(parts: Parts) -> list[Rule]:
     """The rules for the flight computer of these parts, each for what the ones before it give."""
-    found = [_inverses, _estimation]
+    found: list[Callable[[Given], Given]] = [_inverses, _estimation]
     device = parts.actuators
     if getattr(parts.sensors, "filter", None) is not None:
         found.append(_filtering(parts.sensors))
