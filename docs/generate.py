@@ -26,6 +26,9 @@ spacecraft the paper's Case I. `flexible`, `hardware`, `wheels`, `filter`, `poin
 `tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused
 by name. `ptsmc new` writes all this into a file, to be changed.
 
+Numbers are in the unit of their key. One in rad, rad/s, N m, N m s, s or a noise's unit may have another:
+`"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`; in a list each number may.
+
 A table with a `kind` has the keys of that kind. Commands that fly leave the scenario that they flew, every default
 filled in, as `scenario.toml` beside their results. What follows from several keys together, such as `delta` of at
 least one control period, is said when a scenario is refused."""

@@ -85,7 +85,8 @@ class Hardware(Actuators, frozen=True):
     Attributes:
         attitude_noise: of the star tracker, 1 sigma per axis and sample, a small rotation [rad]
         rate_noise: of the gyro, 1 sigma per axis and sample [rad/s]
-        rate_noise_density: instead of rate_noise, which is then this / sqrt(period) [rad/s/sqrt(Hz)]
+        rate_noise_density: instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in
+            "0.02 deg/sqrt(h)" [rad/s/sqrt(Hz)]
         rate_bias: of the gyro, 1 sigma per axis, constant over a run [rad/s]
         rate_bias_walk: random walk of that bias [rad/s/sqrt(s)]
         star_tracker_every: control periods between star tracker samples, with a filter

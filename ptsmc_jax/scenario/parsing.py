@@ -291,19 +291,47 @@ def _requirement(metric: str, value: Any, metrics: Mapping[str, Any]) -> float |
 def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> float:
     """A limit as a number in the metric's unit, also from one in words: "0.05 deg"."""
     allowed = NotNegative if metric in catalogues.MAY_BE_ZERO else Positive
-    if not isinstance(value, str):
-        return _value(key, value, allowed)
-    unit = {**metrics, **catalogues.MARGINS}[metric][0]
+    if isinstance(value, str):
+        value = _in_unit(key, value, {**metrics, **catalogues.MARGINS}[metric][0], keys.allowed(allowed))
+    return _value(key, value, allowed)
+
+
+def _in_unit(key: str, text: str, unit: str, allowed: str) -> float:
+    """A number in words, "0.05 deg", in a unit."""
     units = catalogues.UNITS.get(unit, {})
-    number, _, name = " ".join(value.split()).partition(" ")
+    found = re.fullmatch(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?(.*)", " ".join(text.split()))
+    number, name = found.groups() if found else ("", "")
     try:
         size = float(number)
     except ValueError:
         size = math.nan
     if name not in units or not math.isfinite(size):
-        example = f', or in words such as "0.05 {[*units][:2][-1]}", in {", ".join(units)}' if units else ""
-        raise wrong(key, value, keys.allowed(allowed) + (f" [{unit}]" if unit != "-" else "") + example)
-    return _value(key, size * units[name], allowed)
+        example = f', or with a unit such as "0.05 {[*units][:2][-1]}", in {", ".join(units)}' if units else ""
+        raise wrong(key, text, allowed + (f" [{unit}]" if unit != "-" else "") + example)
+    return size * units[name]
+
+
+def _in_words(name: str, value: Any, struct: type[Table], kind: Any) -> Any:
+    """The value of a key, or the numbers of one, where it is in words and the key has a unit that has others."""
+    said = isinstance(value, str) or (isinstance(value, list) and any(isinstance(one, str) for one in value))
+    if not said or _fits(value, kind):
+        return value
+    unit = next((one.unit for one in keys.of(struct) if one.name == name.rpartition(".")[2]), "")
+    if unit not in catalogues.UNITS:
+        return value
+
+    def number(one: Any) -> Any:
+        return _in_unit(name, one, unit, keys.allowed(kind)) if isinstance(one, str) else one
+
+    return [number(one) for one in value] if isinstance(value, list) else number(value)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    try:
+        msgspec.convert(value, kind, strict=True)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
@@ -312,7 +340,8 @@ def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
     for key in raw:
         if key not in known:
             raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
-    return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in raw.items()})
+    said = {key: _in_words(f"{name}.{key}", value, struct, hints[key]) for key, value in raw.items()}
+    return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in said.items()})
 
 
 def _key(key: str, value: Any, kind: Any) -> Any:

@@ -76,11 +76,13 @@ STATE_CATALOGUE = {
     "peak_rate": Entry("x2", "largest |x_2|"),
 }
 MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
-# what a limit in words may be in, by the unit of its metric: name of the unit -> how much that is
+# what a number in words may be in, by the unit of its metric or key: name of the unit -> how much that is
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
             "arcsec": math.pi / 648_000},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "arcsec/s": math.pi / 648_000},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "deg/h": math.pi / 648_000, "arcsec/s": math.pi / 648_000},
+    "rad/s/sqrt(Hz)": {"rad/s/sqrt(Hz)": 1.0, "deg/s/sqrt(Hz)": math.pi / 180, "deg/sqrt(h)": math.pi / 10_800},
+    "rad/s/sqrt(s)": {"rad/s/sqrt(s)": 1.0, "deg/s/sqrt(s)": math.pi / 180, "deg/h/sqrt(h)": math.pi / 38_880_000},
     "N m": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6},
     "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6},
     "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6},
