@@ -13,7 +13,7 @@
 # Two ideas do it: gains that grow like 1/(t_f - t)² on the way, and an observer that takes the disturbance out. A moment
 # δ before t_f the law is handed over to one with constant gains, since no actuator follows infinite ones.
 #
-# The words of all five notebooks: **t_f** is the prescribed time and **η** (eta) the exponent with which the error falls
+# The words of all notebooks: **t_f** is the prescribed time and **η** (eta) the exponent with which the error falls
 # toward it. **δ** (delta) is how long before t_f the **hand-over** to constant gains comes. The **sliding variable** s is
 # a mix of error and rate that the law drives to zero; its **sign** may be exact or smooth, tanh(s/width). **l** is the
 # gain of the observer, `observer_gain`. The **window error** is the RMS error over the second after t_f: the accuracy.

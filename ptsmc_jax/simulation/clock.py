@@ -35,8 +35,8 @@ class Anchored:
     """Control clock with a sample at the hand-over t_s: t_k = t_s + (k - before) period.
 
     Everything, the noise too, moves with t_s, so a run depends smoothly on delta and t_f. The first period, from t = 0,
-    is a partial one; its noise is blended with the next sample's so that nothing jumps where it vanishes (there the
-    slope may have a small kink, the value none).
+    is a partial one; its noise is blended with the next sample's so that no state jumps where it vanishes. There slopes
+    by delta and t_f are one-sided, and what is summed over samples, the chattering, jumps by one sample's share.
     """
 
     period: Leaf  # h [s]
