@@ -125,7 +125,7 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}
     assert all(float(row["rms_window_error"]) > summary["floor"] > 0.0 for row in rows)
-    assert f"floor {summary['floor']:.2e}: no controller" in told
+    assert f"the floor is {summary['floor']:.2e}: no controller" in told
     drawn = read.charts["front"]["layout"]["shapes"][-1]
     assert drawn["y0"] == drawn["y1"] == summary["floor"]
     assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
