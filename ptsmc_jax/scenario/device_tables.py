@@ -30,7 +30,8 @@ class Actuators(Table, frozen=True):
         torque_rate_limit: largest rate of the torque [N m/s]
         torque_lag: time constant of a first-order lag [s]
         torque_step: quantisation of the torque [N m]
-        delay: control periods from measuring to acting
+        delay: control periods from measuring to acting, the same for all sensors; the observer is told the torque that
+            acts, the law does not look ahead
     """
 
     command_filter: FirstOrderFilter | SecondOrderFilter | NotchFilter | None = None
@@ -329,7 +330,7 @@ class WheelLimits(Table, frozen=True):
 
 
 class PyramidWheels(WheelLimits, frozen=True):
-    """Four reaction wheels, 90 degrees apart about z; lag, step and rate limit of [hardware] are theirs.
+    """Four reaction wheels at 45, 135, 225 and 315 degrees about z; lag, step and rate limit of [hardware] are theirs.
 
     Attributes:
         cant_deg: by which their axes are tilted toward +z; by default equally strong about all axes [deg]

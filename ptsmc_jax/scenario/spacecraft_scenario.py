@@ -40,7 +40,8 @@ class Spacecraft(Table, frozen=True):
     """The rigid body.
 
     Attributes:
-        inertia: three principal moments, or a full symmetric 3x3 tensor; with [wheels] of the whole spacecraft less
+        inertia: three principal moments, or a full symmetric 3x3 tensor, off its diagonal -sum m x y (products of
+            inertia with their sign changed, where these are +sum m x y); with [wheels] of the whole spacecraft less
             each wheel's spin inertia about its axis [kg m^2]
         true_inertia: of the body that flies; default: inertia, which the law knows [kg m^2]
     """

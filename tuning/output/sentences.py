@@ -29,7 +29,8 @@ def verdict(told: Summary) -> str:
     if told["quantile"] is not None and told["confidence"] is not None:
         text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
         if told["share"] > told["quantile"]:
-            text += f"; with so many failures {told['fewest_trials']} trials would do"
+            so_many = "so many failures" if told["failures"] else "no failure"
+            text += f"; with {so_many} {told['fewest_trials']} trials would do"
     return text
 
 
