@@ -53,7 +53,7 @@ class Setup:
 
         known: the law and the observer know it; else it is that of the truth alone.
         """
-        body, moved = spacecraft(inertia), {"plant": self.plant}
+        body, moved = spacecraft(inertia), dict[str, Any](plant=self.plant)
         if known:
             both = {"controller": self.controller, "observer": self.observer}
             moved |= {name: part.model for name, part in both.items() if hasattr(part, "model")}
