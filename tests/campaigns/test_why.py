@@ -5,35 +5,46 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+import pytest
 
 from ptsmc_jax.numerics import statistics
+from tuning.output import campaign_terminal
 from tuning.studies import campaign_summary
 
 
 class Rows:
-    """A campaign of 101 trials, whose torque follows the angle that is drawn."""
+    """A campaign of 401 trials, whose torque follows the angle that is drawn."""
 
     own_names = ()
-    trials = 101
+    trials = 401
     path = "rows"
 
     def whole_parts(self):
         return [self]
 
 
-def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypatch):
-    angle = np.linspace(0.0, 2.0, 101)
-    rate = np.random.default_rng(0).permutation(101) / 100.0
+def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypatch, capsys):
+    angle = np.linspace(0.0, 2.0, 401)
+    rate = np.random.default_rng(0).permutation(401) / 400.0
     table = pl.DataFrame({
-        "trial": np.arange(101), "status": ["ok"] * 101, "peak_torque": angle**2, "initial_angle": angle,
-        "initial_q4": np.cos(angle / 2), "initial_w1": rate, "always": np.ones(101),
+        "trial": np.arange(401), "status": ["ok"] * 401, "peak_torque": angle**2, "initial_angle": angle,
+        "initial_q4": np.cos(angle / 2), "initial_w1": rate, "always": np.ones(401),
     })  # fmt: skip
     monkeypatch.setattr(campaign_summary.pl, "read_parquet_schema", lambda path: dict(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
     why: Any = inspect.unwrap(campaign_summary.why)  # which would refuse these rows by their type
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 says what the angle does
-    assert told[0] == {"metric": "peak_torque", "trial": 100, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
-                       "percentile": 100.0, "median": 1.0}  # fmt: skip
-    assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[100])
+    assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
+                       "percentile": 100.0, "median": 1.0, "rank_correlation": pytest.approx(1.0, rel=1e-12),
+                       "first_order": pytest.approx(1.0, abs=0.05)}  # fmt: skip
+    assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
+    campaign_terminal.why(told)
+    (said,) = capsys.readouterr().out.splitlines()
+    assert (
+        said == "peak_torque 4 in trial 400: initial_angle 2 at 100.0 % (median 1)"
+    )  # the rate is drawn apart from it
+    table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1))
+    assert "goes with nothing that was drawn" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]

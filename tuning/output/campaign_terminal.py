@@ -1,5 +1,6 @@
 """What the commands of a campaign print."""
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -96,14 +97,27 @@ def worst(frame: Any, by: str, folder: Path, *, own_code: bool = False) -> None:
 
 
 def why(told: list[dict[str, Any]]) -> None:
-    """Of each worst trial the inputs that lie farthest from the middle, as percentiles of all trials."""
+    """Of each worst trial the inputs that its metric goes with, as percentiles of all trials.
+
+    Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
+    """
     for metric, trial in dict.fromkeys((one["metric"], one["trial"]) for one in told):
         mine = [one for one in told if (one["metric"], one["trial"]) == (metric, trial)]
-        mine = sorted(mine, key=lambda one: -abs(one["percentile"] - 50.0))[:4]
-        said = (f"{m['input']} {m['drawn']:.4g} at {m['percentile']:.1f} % (median {m['median']:.3g})" for m in mine)
-        terminal.say(f"{metric} {mine[0]['value']:.4g} in trial {trial}: {', '.join(said)}")
+        heading = f"{metric} {mine[0]['value']:.4g} in trial {trial}"
+        shown = [one for one in mine if one["first_order"] is not None]
+        if shown and math.isfinite(mine[0]["value"]):
+            mine = [one for one in shown if max(one["first_order"], one["rank_correlation"] ** 2) >= COUNTS]
+            mine.sort(key=lambda one: -max(one["first_order"], one["rank_correlation"] ** 2))
+        else:
+            mine.sort(key=lambda one: -abs(one["percentile"] - 50.0))
+        said = [
+            f"{m['input']} {m['drawn']:.4g} at {m['percentile']:.1f} % (median {m['median']:.3g})" for m in mine[:4]
+        ]
+        nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
+        terminal.say(f"{heading}: {', '.join(said) or nothing}")
 
 
+COUNTS = 0.05  # of a metric's variance, that an input explains at least to be named as a reason
 ROUND_OFF = 1e-9  # relative: of another program's metrics, where the loop magnifies it as loops do
 
 

@@ -188,7 +188,8 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
 def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
     """What was drawn in the worst trials by each metric: each input as a percentile of all trials, and their median.
 
-    Failed trials first, as in `worst`; of inputs that rank the trials alike only the first.
+    Failed trials first, as in `worst`; of inputs that rank the trials alike only the first. Beside each stands how the
+    metric goes with it over all trials that end, see `statistics.drivers`; None where so few trials do not show it.
     """
     parts = folder.whole_parts()
     names = list(pl.read_parquet_schema(parts[0].path))
@@ -199,6 +200,10 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     failed, told = ~flying.finished(frame), []
     for metric in metrics:
         values = frame[metric].fill_null(float("nan")).to_numpy()
+        known = np.isfinite(values) & ~failed
+        driven = (
+            statistics.drivers({name: inputs[name][known] for name in distinct}, values[known]) if known.any() else {}
+        )
         for at in statistics.most_extreme(values, failed, count):
             told += [
                 {
@@ -209,6 +214,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                     "drawn": float(inputs[name][at]),
                     "percentile": 100.0 * float(np.mean(inputs[name] <= inputs[name][at])),
                     "median": float(np.median(inputs[name])),
+                    **driven.get(name, {"rank_correlation": None, "first_order": None}),
                 }
                 for name in distinct
             ]
