@@ -37,7 +37,7 @@ def lines(summary: Summary) -> Iterator[str]:
         yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
     if "start_deg" in summary:
         yield (
-            f"they are those along the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
+            f"these margins are of the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
             "(another start: [initial])"
         )
     for counts in (True, False):
