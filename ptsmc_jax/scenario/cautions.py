@@ -8,13 +8,25 @@ from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
 
 FAR = 10.0  # times off, from which on a stated bound is said to be
+COARSE = np.deg2rad(5.0)  # of noise [rad], from which on it is likely another unit's number
 
 
 def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
     found = disturbance_bounds.of(scenario, scenario.inputs)
     bounded = [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
-    return [*bounded, *_perfect_rate(scenario)]
+    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario)]
+
+
+def _coarse(scenario: Scenario) -> list[str]:
+    """A star tracker with a noise that none has."""
+    noise = getattr(scenario.hardware, "attitude_noise", None)
+    if not noise or noise < COARSE:
+        return []
+    return [
+        f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg: a number in another unit has it: "
+        f'"{noise:g} arcsec"'
+    ]
 
 
 def _perfect_rate(scenario: Scenario) -> list[str]:

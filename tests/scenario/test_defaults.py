@@ -262,3 +262,11 @@ def test_a_star_tracker_without_a_gyro_is_said(hardware, said):
     found = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
     assert [one for one in found if "hardware.attitude_noise is 2e-05" in one and "perfectly" in one] == found
     assert bool(found) == said
+
+
+@pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
+def test_a_noise_that_no_star_tracker_has_is_said(noise, said):
+    tables = {"loop": {"mode": "sampled"}, "hardware": {"attitude_noise": noise, "rate_noise": 0.0}}
+    found = [one for one in cautions.of(scenario.from_tables(tables)) if "another unit" in one]
+    assert len(found) == said
+    assert not said or f'"{noise:g} arcsec"' in found[0]
