@@ -3,7 +3,7 @@
 import functools
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -31,9 +31,6 @@ from tuning.cli.options import (
 )
 from tuning.errors import UsageError
 from tuning.output import terminal
-
-if TYPE_CHECKING:
-    pass
 
 app = App(
     name="ptsmc",

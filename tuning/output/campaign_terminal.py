@@ -106,8 +106,7 @@ def why(told: list[dict[str, Any]]) -> None:
         heading = f"{metric} {mine[0]['value']:.4g} in trial {trial}"
         shown = [one for one in mine if one["first_order"] is not None]
         if shown and math.isfinite(mine[0]["value"]):
-            mine = [one for one in shown if max(one["first_order"], one["rank_correlation"] ** 2) >= COUNTS]
-            mine.sort(key=lambda one: -max(one["first_order"], one["rank_correlation"] ** 2))
+            mine = sorted((one for one in shown if _explained(one) >= COUNTS), key=_explained, reverse=True)
         else:
             mine.sort(key=lambda one: -abs(one["percentile"] - 50.0))
         said = [
@@ -115,6 +114,11 @@ def why(told: list[dict[str, Any]]) -> None:
         ]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
         terminal.say(f"{heading}: {', '.join(said) or nothing}")
+
+
+def _explained(one: dict[str, Any]) -> float:
+    """The share of its metric's variance that an input explains."""
+    return max(one["first_order"], one["rank_correlation"] ** 2)
 
 
 COUNTS = 0.05  # of a metric's variance, that an input explains at least to be named as a reason
