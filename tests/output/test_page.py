@@ -260,3 +260,10 @@ def test_a_comparison_is_made_again_with_its_laws():
     own = {"controller": {"kind": "own", "code": "/at/mine.py:Growing"}}
     assert made_again.call({"command": "margins"}, own) == "ptsmc margins scenario.toml --trust"
     assert made_again.call({"command": "reproduce", "seed": None}, {}) == "ptsmc reproduce"
+
+
+@pytest.mark.parametrize(("values", "kind"), [([2.7, 3.05], None), ([1e-6, 4e-4], "log"), ([0.0, 5.0], None)])
+def test_an_axis_of_laws_has_numbers_on_it(values, kind):
+    """A logarithmic one names powers of ten: between 2.7 and 3.05 there is none."""
+    made = page_charts.laws(["pd", "own"], {"all": (values, [None, None])}, "effort [N m s]", {}, logarithmic=True)
+    assert made["layout"]["xaxis"].get("type") == kind

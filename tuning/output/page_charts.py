@@ -173,7 +173,10 @@ def laws(
     """Numbers of several laws, one below the other.
 
     series: label -> (a number for each law, its interval); axis: what they are; marks: lines to draw, by what they are.
+    logarithmic: where they span a decade or more, whose ends the axis names.
     """
+    every = [v for values, _ in series.values() for v in values if v is not None and np.isfinite(v)]
+    logarithmic = logarithmic and bool(every) and min(every) > 0.0 and max(every) >= 10.0 * min(every)
     labels, data = [name.replace("_", " ") for name in names], []
     for k, (label, (values, intervals)) in enumerate(series.items()):
         known = [None if v is None or not np.isfinite(v) else v for v in values]
