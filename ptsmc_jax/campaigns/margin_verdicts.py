@@ -47,12 +47,12 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
 def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
     """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops.
 
-    rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one.
+    rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one, which
+    is none of those that the trials' loops are linearised about.
     """
     given = isinstance(rows, Row) and bool({*OF_LOOPS, *OF_MISFITS} & set(rows.given))
-    if not ready.margins or not (given or differ(ready.dispersion)):
-        return of_loop(ready.parts, ready.margins)
-    if rest.swing(ready.parts) is not None:
+    drawn = given or differ(ready.dispersion)
+    if not (ready.margins and drawn) or rest.swing(ready.parts) is not None:
         return of_loop(ready.parts, ready.margins)
     limits = {one.metric: one.limit for one in ready.margins}
     trials = np.arange(TRIALS) if rows is None else rows

@@ -316,16 +316,20 @@ judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 
 def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
-    kept, law = judged_times(parts), parts.controller
+    kept, run = judged_times(parts), linear.nominal_jit(parts)
     period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
-    found = at(parts, jnp.append(kept, jnp.geomspace(period, float(law.t_f), times)))
+    found = at(parts, jnp.append(kept, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
     known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}
     order = np.asarray([k for _, k in sorted(known.items())] + [len(found.t) - 1])
     t, _, loops, margins = jax.tree.map(lambda v: v[order], found)
     count = (order < kept.size) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
-    seen = jax.tree.map(lambda v: np.asarray(v)[0], of_each(last, sensors=True))
-    return Course(t, count, loops, margins, seen, together(jax.tree.map(lambda v: v[0], last)))
+    seen = of_each(last, sensors=True)
+    swing = rest.swing(parts, history(parts, run))
+    at_once = together(jax.tree.map(lambda v: v[0], last)) if swing is None else dict.fromkeys(FIELDS, float("nan"))
+    if swing is not None:
+        margins, seen = rest.none_left(margins, order == order[-1]), rest.none_left(seen, [True])
+    return Course(t, count, loops, margins, jax.tree.map(lambda v: np.asarray(v)[0], seen), at_once, swing)
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -30,15 +30,6 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
             f"margins need slopes of the loop by all that it carries, but with controller.kind = "
             f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
         )
-    swing = rest.swing(ready.parts)
-    if swing is not None:
-        seen = jax.tree.map(lambda v: v[None], course.at_sensors)
-        course = course._replace(
-            at_input=rest.none_left(course.at_input, np.arange(len(course.t)) == len(course.t) - 1),
-            at_sensors=jax.tree.map(lambda v: v[0], rest.none_left(seen, [True])),
-            together=dict.fromkeys(FIELDS, float("nan")),
-            swing=swing,
-        )
     return ready, course
 
 

@@ -24,6 +24,7 @@ from tuning.search.optimise import Search, search
 from tuning.search.progress import Report
 from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
+from tuning.studies.posing import Posed
 
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
@@ -102,6 +103,19 @@ class Tuning:
         return "interrupted" if self.search.interrupted else "met" if self.met else "not met"
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """Gains that a search found, and what fresh trials say of them."""
+
+    search: Search
+    gains: dict[str, float]  # rounded as they are handed over
+    scenario: Scenario  # with these gains, as it is flown
+    seed: int  # of the fresh trials
+    trials: Trials
+    verdicts: list[Verdict]
+    begun: float  # when judging them began, by the monotonic clock
+
+
 def tune(
     scenario: Scenario,
     seed: int,
@@ -120,76 +134,31 @@ def tune(
     journal: of evaluations, from which an interrupted run goes on; globally: compare with differential evolution;
     trusted: find out what makes the result believable too.
     """
-    table = scenario.tune
-    assert table is not None
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
     posed = posing.pose(scenario, seed, journal)
-    ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
+    evaluate = posed.evaluate
     others, refused = judging.beside(scenario)
-    look = partial(
-        search,
-        evaluate,
-        problem,
-        posed.asked,
-        steps=table.steps,
-        seed=seed,
-        sloped=posed.sloped,
-        robust=table.worst_case,
-        report=report,
-    )
-    found, earlier = look(own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
-    while True:
-        seconds, rollouts, gradients = time.monotonic() - started, evaluate.rollouts, evaluate.gradients
-        report("judging on fresh trials", 0, 0, found.value, 0.0)
-        named = evaluate.bounds.rounded(found.gains, DIGITS)
-        tuned = judging.as_flown(gains.in_scenario(scenario, named))
-        fresh_seed = judging.seed_of_judge(seed, len(earlier))
-        fresh = {"tuned": judging.judge(tuned, fresh_seed, ready.requirements)}
-        verdicts = judging.verdicts_of(tuned, fresh["tuned"], fresh_seed)
-        over = _over(found, verdicts)
-        if not over or found.interrupted or len(earlier) + 1 >= tries:
-            break
-        earlier.append(Try(fresh_seed, named, found.margin, over))
-        reached = dict(zip(found.problem.rows, found.worst, strict=True))  # on the trials of the search
-        more = look(found.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
-        found = replace(more, history=[*found.history, *_after(found.history, more.history)])
+    judged, earlier = _search_and_judge(scenario, posed, seed, report, tries)
+    found, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if globally and not found.interrupted:
         check = global_check.check(evaluate, found, seed, report, sloped=posed.sloped)
-
-    training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*named.values()]))
-    judged_gains, floors = {}, {}
-    for name, candidate in {"tuned": tuned, **others}.items():
-        if name != "tuned":
-            fresh[name] = judging.judge(candidate, fresh_seed, ready.requirements)
-        judged_gains[name] = gains.gains_of(study(judging.as_flown(candidate)).parts)
-        floors[name] = judging.floor_of(candidate, fresh_seed)
-    limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
-    shortest = None
-    if limit is not None and T_F not in problem.names and ready.parts.controller.prescribed:
-        shortest = shortest_time(tuned, limit, fresh_seed, fresh["tuned"].trial)
-    believed, beyond = None, {}
-    at_bound = evaluate.bounds.at_bound(found.gains)
+    problem = posed.problem
+    training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()]))
+    candidates = {"tuned": judged.scenario} | {name: judging.as_flown(other) for name, other in others.items()}
+    fresh = {"tuned": judged.trials} | {
+        name: judging.judge(other, judged.seed, posed.ready.requirements) for name, other in others.items()
+    }
+    shortest = _shortest(posed, judged)
+    believed, beyond, at_bound = None, {}, evaluate.bounds.at_bound(found.gains)
     if trusted and not found.interrupted:
         report("profiles, sensitivities and margins of the gains found", 0, 0, found.value, 0.0)
-        wanted = tuple(dict.fromkeys([*SENSITIVE, *problem.metrics]))
-        believed = Trust(
-            slope_error=(
-                trust.slope_error(evaluate, found.problem, evaluate.bounds.share(own)),
-                trust.slope_error(evaluate, found.problem, found.share),
-            )
-            if posed.sloped
-            else None,
-            profiles=trust.profiles(evaluate, found.problem, found.share),
-            sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, wanted),
-            margins=stability.worst(study(tuned)),
-        )
-        beyond = _beyond(tuned, {name: side for name, side in at_bound.items() if not believed.profiles[name].flat},
-                         named, fresh["tuned"], fresh_seed)  # fmt: skip
+        believed = _trust(posed, judged)
+        beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not believed.profiles[name].flat})
     return Tuning(
-        tuned=tuned,
-        gains=named,
+        tuned=judged.scenario,
+        gains=judged.gains,
         search=found,
         earlier=earlier,
         at_bound=at_bound,
@@ -197,17 +166,81 @@ def tune(
         fresh=fresh,
         paper_refused=refused,
         seed=seed,
-        fresh_seed=fresh_seed,
-        judged_gains=judged_gains,
-        floors=floors,
-        verdicts=verdicts,
+        fresh_seed=judged.seed,
+        judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
+        floors={name: judging.floor_of(one, judged.seed) for name, one in candidates.items()},
+        verdicts=judged.verdicts,
         shortest=shortest,
         trust=believed,
         beyond=beyond,
         check=check,
         rollouts=rollouts,
         gradients=gradients,
-        seconds=seconds,
+        seconds=judged.begun - started,
+    )
+
+
+def _search_and_judge(
+    scenario: Scenario, posed: Posed, seed: int, report: Report, tries: int
+) -> tuple[_Judged, list[Try]]:
+    """Search and judge; again, with more distance from the limits, where fresh trials break what the search kept."""
+    table = scenario.tune
+    assert table is not None
+    look = partial(
+        search,
+        posed.evaluate,
+        posed.problem,
+        posed.asked,
+        steps=table.steps,
+        seed=seed,
+        sloped=posed.sloped,
+        robust=table.worst_case,
+        report=report,
+    )
+    found, earlier = look(posed.own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
+    while True:
+        report("judging on fresh trials", 0, 0, found.value, 0.0)
+        judged = _judge(scenario, posed, found, judging.seed_of_judge(seed, len(earlier)))
+        over = _over(found, judged.verdicts)
+        if not over or found.interrupted or len(earlier) + 1 >= tries:
+            return judged, earlier
+        earlier.append(Try(judged.seed, judged.gains, found.margin, over))
+        reached = dict(zip(found.problem.rows, found.worst, strict=True))  # on the trials of the search
+        more = look(found.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
+        found = replace(more, history=[*found.history, *_after(found.history, more.history)])
+
+
+def _judge(scenario: Scenario, posed: Posed, found: Search, fresh_seed: int) -> _Judged:
+    """The gains that a search found, as they are handed over, on fresh trials."""
+    begun = time.monotonic()
+    named = posed.evaluate.bounds.rounded(found.gains, DIGITS)
+    flown = judging.as_flown(gains.in_scenario(scenario, named))
+    trials = judging.judge(flown, fresh_seed, posed.ready.requirements)
+    return _Judged(found, named, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
+
+
+def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
+    """The shortest t_f that the limit on the torque would allow; None without one, or where t_f itself is tuned."""
+    ready = posed.ready
+    limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
+    if limit is None or T_F in posed.problem.names or not ready.parts.controller.prescribed:
+        return None
+    return shortest_time(judged.scenario, limit, judged.seed, judged.trials.trial)
+
+
+def _trust(posed: Posed, judged: _Judged) -> Trust:
+    """What makes the gains found believable."""
+    found, evaluate = judged.search, posed.evaluate
+    slope_error = None
+    if posed.sloped:
+        at_start = trust.slope_error(evaluate, found.problem, evaluate.bounds.share(posed.own))
+        slope_error = at_start, trust.slope_error(evaluate, found.problem, found.share)
+    metrics = tuple(dict.fromkeys([*SENSITIVE, *found.problem.metrics]))
+    return Trust(
+        slope_error=slope_error,
+        profiles=trust.profiles(evaluate, found.problem, found.share),
+        sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, metrics),
+        margins=stability.worst(study(judged.scenario)),
     )
 
 
@@ -232,31 +265,28 @@ def _after(history: list[Step], more: list[Step]) -> list[Step]:
     return [replace(step, start=first + step.start) for step in more]
 
 
-def _beyond(
-    tuned: Scenario, at_bound: dict[str, str], named: dict[str, float], judged: Trials, fresh_seed: int
-) -> dict[str, Beyond]:
+def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
     """What the fresh trials say of each gain that ended on a bound, a step beyond that bound, where it may go there.
 
     Of the sampled loop, where what is minimised is an error.
     """
-    found = {}
+    found, tuned = dict[str, Beyond](), judged.scenario
     assert tuned.tune is not None
     if tuned.loop.mode != "sampled" or tuned.tune.objective == T_F:
         return found
     for name, side in at_bound.items():
-        gain = gains.base(name)
-        value = free_gains.beyond(tuned, gain, side)
+        value = free_gains.beyond(tuned, gains.base(name), side)
         if value is None:
             continue
         try:
-            other = gains.in_scenario(tuned, {**named, name: value})
-            study(judging.as_flown(other))
+            other = judging.as_flown(gains.in_scenario(tuned, {**judged.gains, name: value}))
+            ready = study(other)
         except ScenarioError:  # it may not
             continue
-        trials = judging.judge(other, fresh_seed, study(judging.as_flown(other)).requirements)
-        both = trials.finished & judged.finished
-        there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged))
-        broken = _broken(judging.verdicts_of(other, trials, fresh_seed), trials)
+        trials = judging.judge(other, judged.seed, ready.requirements)
+        both = trials.finished & judged.trials.finished
+        there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
+        broken = _broken(judging.verdicts_of(other, trials, judged.seed), trials)
         found[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, broken)
     return found
 
