@@ -51,7 +51,7 @@ def _check_requirements(scenario: Scenario) -> None:
             ask = '{ limit = .., probability = .., interpretation = "mixed" }'
             name = f"requirements.{key.removeprefix(catalogues.WITHIN)}"
             raise ScenarioError(f"requirements.{key} is a share of the time, to be large; allowed is {name} = {ask}")
-        if key.startswith(catalogues.KNOWLEDGE) and not measures(scenario):
+        if key.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
             raise ScenarioError(f"requirements.{key} needs noise in [hardware]: the law sees the true state")
         if isinstance(value, tables.Limit):
             _check_limit(key, value)
@@ -62,12 +62,6 @@ def _check_requirements(scenario: Scenario) -> None:
                 f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
                 "allowed is a width greater than 0"
             )
-
-
-def measures(scenario: Scenario) -> bool:
-    """Whether the law sees something else than the true state."""
-    noises = ("attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk", "state_noise")
-    return scenario.estimator.on or any(getattr(scenario.hardware, noise, None) is not None for noise in noises)
 
 
 def _check_limit(metric: str, limit: tables.Limit) -> None:
@@ -98,9 +92,7 @@ def _check_sensors(scenario: Scenario) -> None:
         return
     if scenario.loop.mode != "sampled":
         raise ScenarioError(f'[sensors] needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
-    said = ("attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk", "star_tracker_every",
-            "star_tracker_period", "state_noise")  # fmt: skip
-    for key in said:
+    for key in (*scenario.devices.noises, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:
             raise wrong(f"hardware.{key}", value, "absent where [sensors] says what is seen")

@@ -41,6 +41,12 @@ class Actuators(Table, frozen=True):
     torque_step: Positive | None = None
     delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # that can be drawn: the keys, any of which gives it
+    noises: ClassVar[tuple[str, ...]] = ()  # keys of what the sensors are off by
+
+    @property
+    def noisy(self) -> bool:
+        """Whether any of `noises` is there."""
+        return any(getattr(self, key) is not None for key in self.noises)
 
     @property
     def gains(self) -> Mapping[str, GainBounds]:
@@ -106,6 +112,9 @@ class Hardware(Actuators, frozen=True):
         "rate_noise": ("rate_noise", "rate_noise_density"),
         "torque_limit": ("torque_limit",),
     }
+    noises: ClassVar[tuple[str, ...]] = (
+        "attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk"
+    )  # fmt: skip
 
     def gyro_noise(self, period: float) -> float:
         """Noise of the gyro, 1 sigma a sample [rad/s]."""
@@ -149,8 +158,7 @@ class Hardware(Actuators, frozen=True):
         from ptsmc_jax.devices.sensors import Sensors
         from ptsmc_jax.numerics.pytrees import vector
 
-        noises = (self.attitude_noise, self.rate_noise, self.rate_noise_density, self.rate_bias, self.rate_bias_walk)
-        if not scenario.estimator.on and all(noise is None for noise in noises):
+        if not scenario.measured:
             return None
         period, walk = scenario.loop.period, self.rate_bias_walk
         return Sensors(
@@ -185,6 +193,7 @@ class StateHardware(Actuators, frozen=True):
         "state_noise": ("state_noise",),
         "torque_limit": ("torque_limit",),
     }
+    noises: ClassVar[tuple[str, ...]] = ("state_noise",)
 
     def check(self, scenario: Any) -> None:
         """One number for each state."""

@@ -79,8 +79,7 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     J_1 and J_3 are the smallest and the largest principal moment of the true body, three sigma apart where drawn; c
     moves in the body's axes as the orbit and the body turn.
     """
-    table = scenario.spacecraft
-    inertia = np.asarray(table.inertia if table.true_inertia is None else table.true_inertia, dtype=float)
+    inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
     drawn = getattr(scenario.dispersion, "inertia", None)
     off = 0.0 if drawn is None else SIGMAS * drawn.std

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
-from ptsmc_jax.scenario import build, checks, own_checks, reading, timing
+from ptsmc_jax.scenario import build, own_checks, reading, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -41,7 +41,7 @@ def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
     def there(name: str, entry: catalogues.Entry) -> bool:
         if name.startswith(catalogues.WITHIN) and name not in timed:
             return False
-        if name.startswith(catalogues.KNOWLEDGE) and not checks.measures(scenario):
+        if name.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
             return False
         return entry.table is None or getattr(scenario, entry.table, None) is not None
 

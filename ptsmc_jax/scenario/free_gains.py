@@ -1,13 +1,12 @@
 """What tuning may move in a scenario: the default bounds of each gain, and how far they may be set."""
 
 import math
-from collections.abc import Mapping
 
 import msgspec
 
 from ptsmc_jax.scenario import errors, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_record import Choice, GainBounds
+from ptsmc_jax.scenario.gain_record import Choice
 from ptsmc_jax.scenario.tables import Scenario
 
 _OTHERS = ("filter_bandwidth", "command_corner")  # gains that are none of a law or an observer
@@ -22,8 +21,8 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     if free is None:
         law = scenario.controller
         first, rest = law.free(sampled=scenario.loop.mode == "sampled")
-        sensed = _of_sensors(scenario)
-        free = (*first, *scenario.observer.gains, *rest, *sensed, *scenario.estimator.gains, *scenario.devices.gains)
+        others = [name for name in scenario.gains if name not in (*law.gains, *scenario.observer.gains)]
+        free = (*first, *scenario.observer.gains, *rest, *others)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
@@ -39,11 +38,9 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
 
 def _check(scenario: Scenario, tune: tables.Tune) -> None:
     """Raise ScenarioError where the table asks for what cannot be tuned, before defaults are computed from it."""
-    free = tune.free
-    assert free is not None  # `resolve` filled it in
+    free, own = tune.gains, scenario.gains
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    own = {*scenario.controller.gains, *scenario.observer.gains, *_of_sensors(scenario)}
     if not set(free) <= {*tables.FREE, *own}:
         raise wrong("tune.free", free, tables.FREE_TOLD)
     said = f"tune.free is {errors.brief(free)}, but"
@@ -86,13 +83,12 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 
 def _check_bounds(choice: Choice, name: str) -> None:
     key, (lower, upper) = f"tune.bounds.{name}", choice.bounds[name]
-    own = *choice.scenario.controller.gains, *choice.scenario.observer.gains, *_of_sensors(choice.scenario)
-    known = dict.fromkeys((*own, *tables.FREE))
+    known = dict.fromkeys((*choice.scenario.gains, *tables.FREE))
     if name not in known:
         raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
     if name not in choice.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
-    least, most, closed = _gain(choice.scenario, name).allowed(choice)
+    least, most, closed = choice.scenario.gains[name].allowed(choice)
     if not (least <= lower if closed else least < lower) or not upper < most:
         allowed = f"two numbers {'from' if closed else 'above'} {least}"
         raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
@@ -100,23 +96,12 @@ def _check_bounds(choice: Choice, name: str) -> None:
         raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")
 
 
-def _gain(scenario: Scenario, name: str) -> GainBounds:
-    """The bounds of a gain that the scenario has."""
-    others = scenario.observer.gains, _of_sensors(scenario), scenario.estimator.gains, scenario.devices.gains
-    return {name: gain for gains in (scenario.controller.gains, *others) for name, gain in gains.items()}[name]
-
-
-def _of_sensors(scenario: Scenario) -> Mapping[str, GainBounds]:
-    """Those of sensors of one's own."""
-    return {} if scenario.sensors is None else scenario.sensors.gains
-
-
 def _default(choice: Choice, name: str) -> tuple[float, float]:
     """The usual bounds, moved where the law allows the scenario's own gain outside them.
 
     Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
     """
-    gain = _gain(choice.scenario, name)
+    gain = choice.scenario.gains[name]
     (low, high), own = gain.usual(choice), _own(choice.scenario, name)
     if own:
         least, most, closed = gain.allowed(choice)
@@ -134,7 +119,7 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
     if name == "command_corner":
         filtering = scenario.devices.command_filter
         return () if filtering is None else (filtering.corner,)
-    if name in _of_sensors(scenario):
+    if scenario.sensors is not None and name in scenario.sensors.gains:
         return (float(getattr(scenario.sensors, name.removeprefix("sensors_"))),)
     law = name in scenario.controller.gains
     value = getattr(scenario.controller if law else scenario.observer, name if law else _field(name), None)
@@ -154,7 +139,7 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
     tune = scenario.tune
     if scenario.loop.mode != "sampled" or tune is None:
         return None
-    gain = _gain(scenario, name)
+    gain = scenario.gains[name]
     words = gain.below if side == "lower" else gain.above
     if words is None:
         return None
@@ -168,12 +153,11 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
 
     Of an interval that is searched on a log scale a tenth of its logarithm.
     """
-    tune = scenario.tune
-    assert tune is not None
+    tune = scenario.search
     low, high = tune.bounds[name]
     if border(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    least, most, _ = _gain(scenario, name).allowed(Choice(scenario, tune.free or (), tune.bounds))
+    least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
     if high > 10.0 * low:
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
@@ -186,4 +170,4 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """The default bounds of a free gain, before they reach out to the scenario's own."""
     tune = scenario.search
-    return _gain(scenario, name).usual(Choice(scenario, tune.free or (), tune.bounds))
+    return scenario.gains[name].usual(Choice(scenario, tune.gains, tune.bounds))

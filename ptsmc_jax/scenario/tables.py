@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario.device_tables import NoFilter
+from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Table, Truth
 from ptsmc_jax.simulation.catalogues import Entry
@@ -93,6 +94,11 @@ class Tune(Table, frozen=True):
     starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 32
     steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
 
+    @property
+    def gains(self) -> tuple[str, ...]:
+        """The gains to find, in a checked scenario, where `free` is filled in."""
+        return self.free or ()
+
 
 class Scenario(Table, frozen=True, kw_only=True, eq=False):
     """A scenario as its file says it, every key resolved: the tables that all plants have; optional ones may be off.
@@ -164,6 +170,17 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def moments(self) -> tuple[float, float] | tuple[None, None]:
         """Mean and largest moment of inertia [kg m^2]; None without a body."""
         return None, None
+
+    @property
+    def gains(self) -> dict[str, GainBounds]:
+        """The gains that it has for tuning to move, with their bounds."""
+        parts = self.controller, self.observer, self.sensors, self.estimator, self.devices
+        return {name: gain for part in parts if part is not None for name, gain in part.gains.items()}
+
+    @property
+    def measured(self) -> bool:
+        """Whether the law sees something else than the true state."""
+        return self.estimator.on or self.devices.noisy
 
     @property
     def search(self) -> Tune:

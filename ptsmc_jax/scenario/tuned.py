@@ -23,10 +23,8 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
     if "filter_bandwidth" in gains:
         changes["filter__bandwidth"] = gains["filter_bandwidth"]
     if "command_corner" in gains:
-        table = scenario.devices.command_filter
-        assert table is not None
-        changes["hardware__command_filter"] = {**plain(table), "corner": gains["command_corner"]}
+        table = plain(scenario.devices.command_filter)
+        changes["hardware__command_filter"] = {**table, "corner": gains["command_corner"]}
     if "t_f" in gains:
-        assert scenario.loop.t_end is not None
-        changes["loop__t_end"] = gains["t_f"] + (scenario.loop.t_end - scenario.controller.t_f)
+        changes["loop__t_end"] = gains["t_f"] + (scenario.end - scenario.controller.t_f)
     return reading.replace(reading.settled(scenario), **changes)

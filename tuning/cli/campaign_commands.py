@@ -1,9 +1,11 @@
 """The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
 
+import contextlib
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -90,29 +92,32 @@ def montecarlo(
     Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
     input or a full disk, 130 interrupted.
     """
-    width = until_confident
     share = _shard(shard)
-    tls = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
-    tls = {name: str(path) for name, path in tls.items() if path is not None}
-    if tls and cluster is None:
-        raise UsageError("--tls-ca, --tls-cert and --tls-key go with --cluster only")
-    if width is not None and (share != (1, 1) or dry_run):
-        raise UsageError("--until-confident looks at all rows, and does not go with --shard or --dry-run")
-    if plan is not None and trials is not None:
-        raise UsageError("--trials does not go with --plan, each row of which is a trial")
-    if plan is not None and width is not None:
-        raise UsageError("--until-confident looks at ever more trials drawn at random, and does not go with --plan")
-    if cluster is not None and (share != (1, 1) or dry_run):
-        raise UsageError("--cluster does not go with --shard or --dry-run")
-    if precision not in ("64", "32"):
-        raise UsageError(f"--precision is {precision}, but must be 64 or 32")
+    given = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
+    tls = {name: str(path) for name, path in given.items() if path is not None}
+    confident, clustered, a_part = until_confident is not None, cluster is not None, share != (1, 1) or dry_run
+    for refused, sentence in (
+        (tls and not clustered, "--tls-ca, --tls-cert and --tls-key go with --cluster only"),
+        (confident and a_part, "--until-confident looks at all rows, and does not go with --shard or --dry-run"),
+        (plan and trials is not None, "--trials does not go with --plan, each row of which is a trial"),
+        (
+            plan and confident,
+            "--until-confident looks at ever more trials drawn at random, and does not go with --plan",
+        ),
+        (clustered and a_part, "--cluster does not go with --shard or --dry-run"),
+        (precision not in ("64", "32"), f"--precision is {precision}, but must be 64 or 32"),
+        (
+            clustered and (precision, device) != ("64", "cpu"),
+            "--cluster flies on its workers' processors with 64 bits, and goes with no other",
+        ),
+    ):
+        if refused:
+            raise UsageError(sentence)
     bits = 32 if precision == "32" else 64
-    if (bits, device) != (64, "cpu") and cluster is not None:
-        raise UsageError("--cluster flies on its workers' processors with 64 bits, and goes with no other")
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
     from ptsmc_jax.simulation import catalogues
 
-    if width is not None and set(loaded.requirements) <= set(catalogues.MARGINS):
+    if confident and set(loaded.requirements) <= set(catalogues.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning.studies import campaign_folder
 
@@ -124,39 +129,51 @@ def montecarlo(
         place = path if out is not None else path.with_name(f"{path.name}-{plan.stem}")
         folder = replace(folder, path=place, trials=table.height, plan=plan.name, table=table)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
-    if cluster is not None:
-        from ptsmc_jax.campaigns import cluster as clusters
-
-        elsewhere = clusters.connected(cluster, tls)
-    else:
-        elsewhere = None
-    campaign_folder.begin(folder, force)
     try:
-        with campaign_terminal.Progress(quiet) as report:
-            if dry_run:
-                campaign_folder.write_plan(folder, report)
-            elif width is not None:
-                from tuning.studies import campaign_summary  # takes a second to import, which flying need not wait for
-
-                stopped = campaign_summary.until_confident(
-                    folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
-                )
-                folder = campaign_folder.settle(folder, stopped)
-            else:
-                campaign_folder.fly(folder, share, report, elsewhere)
-            if not dry_run:
-                campaign_folder.find_floor(folder)
+        with _elsewhere(cluster, tls) as elsewhere:
+            campaign_folder.begin(folder, force)
+            with campaign_terminal.Progress(quiet) as report:
+                if dry_run:
+                    campaign_folder.write_plan(folder, report)
+                else:
+                    folder = _flown(folder, share, report, elsewhere, until_confident)
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED
-    finally:
-        if elsewhere is not None:
-            elsewhere.close()
-    if dry_run or share != (1, 1):
+    if a_part:
         if not quiet:
             campaign_terminal.share_done(folder, share, planned=dry_run)
         return 0
     return _summarised(folder, quiet, figures)
+
+
+@contextlib.contextmanager
+def _elsewhere(cluster: str | None, tls: dict[str, str]) -> Iterator[Any]:
+    """What flies parts on a cluster, which is left at the end; None: they are flown here."""
+    if cluster is None:
+        yield None
+        return
+    from ptsmc_jax.campaigns import cluster as clusters
+
+    with contextlib.closing(clusters.connected(cluster, tls)) as connected:
+        yield connected
+
+
+def _flown(folder: Any, share: tuple[int, int], report: Any, elsewhere: Any, width: float | None) -> Any:
+    """The campaign flown, its share of it; width: until every requirement's share is known to within it."""
+    from tuning.studies import campaign_folder
+
+    if width is None:
+        campaign_folder.fly(folder, share, report, elsewhere)
+    else:
+        from tuning.studies import campaign_summary  # takes a second to import, which flying need not wait for
+
+        stopped = campaign_summary.until_confident(
+            folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
+        )
+        folder = campaign_folder.settle(folder, stopped)
+    campaign_folder.find_floor(folder)
+    return folder
 
 
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:

@@ -207,7 +207,7 @@ def tune(
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
-    goal = tuner.GOALS[loaded.tune.objective]  # pyright: ignore[reportOptionalMemberAccess]
+    goal = tuner.GOALS[loaded.search.objective]
     known_by = tune_files.identity(loaded, seed, globally=global_check)
     return searches.run(
         loaded, folder, known_by, force, quiet, goal,
@@ -288,7 +288,7 @@ def compare(
     known_by = comparing.identity(loaded, seed, rivals)
     return searches.run(
         loaded, folder, known_by, force, quiet,
-        comparing.tuner.GOALS[loaded.tune.objective],  # pyright: ignore[reportOptionalMemberAccess]
+        comparing.tuner.GOALS[loaded.search.objective],
         check=posed,
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),

@@ -51,11 +51,8 @@ def units_of(scenario: Scenario) -> dict[str, str]:
 
 def named(scenario: Scenario) -> tuple[str, ...]:
     """Names of the free gains, axis by axis where the scenario says so."""
-    tune = scenario.tune
-    assert tune is not None
-    assert tune.free is not None  # a checked scenario names them
-    names: list[str] = []
-    for name in tune.free:
+    tune, names = scenario.search, list[str]()
+    for name in tune.gains:
         each = tune.per_axis and name == "observer_gain"
         names += [f"{AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))] if each else [name]
     return tuple(names)

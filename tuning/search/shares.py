@@ -83,9 +83,8 @@ class Bounds:
 
 def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
     """The bounds of a checked scenario's free gains; its parts."""
-    assert scenario.tune is not None
     names = gain_names.named(scenario)
-    intervals = {name: scenario.tune.bounds[gain_names.base(name)] for name in names}
+    intervals = {name: scenario.search.bounds[gain_names.base(name)] for name in names}
     hop = 0.0
     if "sign_width" in names and _hops(scenario, parts):
         hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
@@ -102,5 +101,4 @@ def _hops(scenario: Scenario, parts: Parts) -> bool:
     """Whether the sign may be so narrow that it hops, by a bound that is nobody's but the usual one."""
     if scenario.loop.mode != "sampled" or not parts.controller.prescribed:
         return False
-    assert scenario.tune is not None
-    return scenario.tune.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]
+    return scenario.search.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]

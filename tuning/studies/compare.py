@@ -128,8 +128,7 @@ class Rivals:
 
 def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
-    assert scenario.tune is not None
-    table, tune = scenario.controller, scenario.tune
+    table, tune = scenario.controller, scenario.search
     common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     found = {}
@@ -162,10 +161,8 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
     """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
     if tune.objective != T_F:
         return replace(other, tune=same)
-    default = replace(other, tune={}).tune
-    assert default is not None
-    assert default.free is not None
-    return replace(other, tune={**same, "free": [*default.free, "t_f"], "bounds": {"t_f": tune.bounds["t_f"]}})
+    free = [*replace(other, tune={}).search.gains, "t_f"]
+    return replace(other, tune={**same, "free": free, "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
 def perturbed(flown: Scenario) -> dict[str, Scenario]:

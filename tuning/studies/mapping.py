@@ -135,9 +135,8 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
             number = [value if k in chosen else old for k, old in enumerate(current)]
         changes[f"{table}__{name}"] = number
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
-        loop, t_f = scenario.loop, values.get("controller.t_f", scenario.controller.t_f)
-        assert loop.t_end is not None
-        after = max(loop.t_end - scenario.controller.t_f, values.get("loop.window", scenario.window))
+        t_f = values.get("controller.t_f", scenario.controller.t_f)
+        after = max(scenario.end - scenario.controller.t_f, values.get("loop.window", scenario.window))
         changes["loop__t_end"] = t_f + after
     return changed(scenario, **changes)
 

@@ -93,8 +93,7 @@ def trace(
 ) -> Front:
     """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""
     limited, own_limit = _limited(scenario)
-    table = limited.tune
-    assert table is not None
+    table = limited.search
     posed = posing.pose(limited, seed, journal)
     ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
     others, refused = judging.beside(limited)
@@ -134,13 +133,12 @@ def trace(
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where there is no front of accuracy against torque to look for."""
-    assert scenario.tune is not None
-    of = "for a front of the window error"
-    if scenario.tune.objective == T_F:
+    of, tune = "for a front of the window error", scenario.search
+    if tune.objective == T_F:
         raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {of}')
-    if scenario.tune.torque_weight:
-        raise wrong("tune.torque_weight", scenario.tune.torque_weight, f"absent {of} against the torque")
-    if scenario.tune.worst_case:
+    if tune.torque_weight:
+        raise wrong("tune.torque_weight", tune.torque_weight, f"absent {of} against the torque")
+    if tune.worst_case:
         raise wrong("tune.worst_case", True, f"false {of}, whose points keep their limits in the trials drawn")
 
 

@@ -31,8 +31,7 @@ class Posed:
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
     """The tuning problem of a scenario; farther: see `reach`."""
-    table = scenario.tune
-    assert table is not None
+    table = scenario.search
     ready = study(scenario, reach=reach(scenario, table, **farther))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
     asked = [r.implied_by for r in ready.requirements]

@@ -69,15 +69,14 @@ def usual_times(scenario: Scenario) -> tuple[float, ...]:
 
 def check(scenario: Scenario, times: Sequence[float]) -> None:
     """Raise ScenarioError where there is nothing to ask, or a time that cannot be flown [s]."""
-    assert scenario.tune is not None
-    against = "to ask what a faster slew costs"
+    against, tune = "to ask what a faster slew costs", scenario.search
     if not scenario.controller.prescribed:
         raise wrong("controller.kind", scenario.controller.kind, f"prescribed_time {against}")
-    if scenario.tune.objective == T_F:
+    if tune.objective == T_F:
         raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
-    if T_F in (scenario.tune.free or ()):
-        raise wrong("tune.free", list(scenario.tune.free or ()), f"without t_f {against}")
-    if scenario.tune.worst_case:
+    if T_F in tune.gains:
+        raise wrong("tune.free", list(tune.gains), f"without t_f {against}")
+    if tune.worst_case:
         raise wrong("tune.worst_case", True, f"false {against}")
     for key in scenario.requirements:
         if key in catalogues.MARGINS:
@@ -103,8 +102,7 @@ def trace(
     """The best gains for each of these times [s]. Raises KeyboardInterrupt on Ctrl-C."""
     times = sorted(times)
     base = _at(scenario, times[0])
-    table = base.tune
-    assert table is not None
+    table = base.search
     posed = posing.pose(base, seed, journal, t_f=times[-1])
     ladder = [replace(posed.problem, parts=gains.with_gains(posed.problem.parts, {"t_f": t_f})) for t_f in times]
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}

@@ -53,7 +53,6 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
 def summary(tuning: Tuning) -> dict[str, Any]:
     """What `summary.json` says."""
     kind, found = tuning.tuned.plant.kind, tuning.search
-    assert tuning.tuned.tune is not None
     groups = {
         name: {"gains": tuning.judged_gains[name], "floor": tuning.floors[name], **statistics(trials, kind)}
         for name, trials in tuning.fresh.items()
@@ -77,7 +76,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "judged_on": judged_on(tuning.tuned),
         "cautions": cautions.of(tuning.tuned),
         "search": {
-            "objective": tuning.tuned.tune.objective,
+            "objective": tuning.tuned.search.objective,
             "goal": found.value,
             "starts": len({step.start for step in found.history}),
             "steps": len(found.history),
@@ -88,7 +87,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
             ],
-            "worst_case": tuning.tuned.tune.worst_case,
+            "worst_case": tuning.tuned.search.worst_case,
             "hardest": None
             if found.hardest is None
             else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
@@ -118,7 +117,6 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
 
 def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
     loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
-    assert tuning.tuned.tune is not None
     influence = {}
     for name, profile in believed.profiles.items():
         if profile.flat:
@@ -129,7 +127,7 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
             influence[name] = "no trade-off: without sampling and noise more of it only helps"
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]
-            bound = tuning.tuned.tune.bounds[gain][side == "upper"]
+            bound = tuning.tuned.search.bounds[gain][side == "upper"]
             known = free_gains.border(tuning.tuned, gain, side, bound)
             influence[name] = known or _beyond(tuning.beyond.get(name), bound)
     slopes = believed.slope_error
@@ -157,8 +155,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     """Fill a result folder; known_by: see `identity`."""
     store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
     store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
-    assert scenario.tune is not None
-    objective = scenario.tune.objective
+    objective = scenario.search.objective
     goal = objective if objective == "t_f" else f"{objective}_window_error"
     over = [f"{m}_over_limit" for m in tuning.search.problem.rows]
     rows = [
@@ -184,7 +181,6 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Figures of a tuning run by name."""
-    assert scenario.tune is not None
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     known = gain_names.units_of(scenario)
     units = [known[gain_names.base(name)] for name in names]
@@ -196,8 +192,8 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
     limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
-    unit = "s" if scenario.tune.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
-    goal = f"{GOALS[scenario.tune.objective].replace(' window', chr(10) + 'window')} [{unit}]"
+    unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
+    goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
     found = {
         "history": study_plots.tuning_history(

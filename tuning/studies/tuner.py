@@ -184,8 +184,7 @@ def _search_and_judge(
     scenario: Scenario, posed: Posed, seed: int, report: Report, tries: int
 ) -> tuple[_Judged, list[Try]]:
     """Search and judge; again, with more distance from the limits, where fresh trials break what the search kept."""
-    table = scenario.tune
-    assert table is not None
+    table = scenario.search
     look = partial(
         search,
         posed.evaluate,
@@ -271,8 +270,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
     Of the sampled loop, where what is minimised is an error.
     """
     found, tuned = dict[str, Beyond](), judged.scenario
-    assert tuned.tune is not None
-    if tuned.loop.mode != "sampled" or tuned.tune.objective == T_F:
+    if tuned.loop.mode != "sampled" or tuned.search.objective == T_F:
         return found
     for name, side in at_bound.items():
         value = free_gains.beyond(tuned, gains.base(name), side)
