@@ -1,9 +1,9 @@
 """Small arrays as components, each a vector over the trials, and what the plain primitives do to them: for `lanes`."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
-from itertools import pairwise
 from typing import Any
 
 import jax
@@ -223,24 +223,13 @@ def _structural(eqn: Any, values: Sequence) -> list[Lane]:
 
 
 def _renumbered(eqn: Any, values: Sequence) -> list[Lane]:
-    """Apply the primitive to the numbers of the components instead, and pick the components by the result."""
-    pool, numbered = [], []
-    for value in values:
-        parts = parts_of(value)
-        numbered.append(np.arange(len(pool), len(pool) + parts.size, dtype=np.int32).reshape(parts.shape))
-        pool += list(parts.flat)
-    with jax.ensure_compile_time_eval():
-        outputs = [np.asarray(chosen) for chosen in bind(eqn, [jnp.asarray(n) for n in numbered])]
-    return [Lane(out.shape, object_array(out.shape, [pool[k] for k in out.flat])) for out in outputs]
+    return [Lane(moved.shape, moved) for moved in picked(eqn, list(map(parts_of, values)))]
 
 
 def _reduction(eqn: Any, values: Sequence) -> list[Lane]:
-    (value,), axes = values, eqn.params["axes"]
-    kept = [a for a in range(len(value.shape)) if a not in axes]
-    shape = tuple(value.shape[a] for a in kept)
-    rows = value.parts.transpose([*kept, *axes]).reshape((*shape, -1))
     operation = _REDUCTIONS[eqn.primitive.name]
-    return [Lane(shape, object_array(shape, (_fold(operation, rows[i]) for i in np.ndindex(*shape))))]
+    found = reduced(eqn, values[0].parts, lambda row: _fold(operation, row))
+    return [Lane(found.shape, found)]
 
 
 def _fold(operation: Callable, items: Iterable) -> Any:
@@ -251,23 +240,14 @@ def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
     kind = eqn.outvars[0].aval.dtype
     if jnp.issubdtype(kind, bool):
         return None
-    contracted, batched = eqn.params["dimension_numbers"]
 
-    def rows(value: Any, own: Any, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-        """(batch, kept, contracted), flat, of the result's type."""
+    def operand(value: Any, own: Any) -> np.ndarray:
+        """Of the result's type."""
         parts = parts_of(value)
-        kept = [a for a in range(parts.ndim) if a not in (*axes, *batch)]
-        sizes = [math.prod(parts.shape[a] for a in group) for group in (batch, kept, axes)]
-        flat = parts.transpose([*batch, *kept, *axes]).reshape(sizes)
-        return (
-            flat
-            if own == kind
-            else object_array(flat.shape, (lax.convert_element_type(part, kind) for part in flat.flat))
-        )
+        return parts if own == kind else object_array(
+            parts.shape, (lax.convert_element_type(part, kind) for part in parts.flat)
+        )  # fmt: skip
 
-    kinds = [v.aval.dtype for v in eqn.invars]
-    left, right = (rows(*row) for row in zip(values, kinds, contracted, batched, strict=True))
-    shape = eqn.outvars[0].aval.shape
     skip = sloped(values)
 
     def inner(row: np.ndarray, column: np.ndarray) -> Any:
@@ -275,24 +255,60 @@ def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
         some = [pair for pair in pairs if not (skip and any(map(zero, pair)))]
         return _fold(lax.add, [lax.mul(*_alike(pair)) for pair in some]) if some else kind.type(0)
 
-    items = (
-        inner(left[k, i], right[k, j])
-        for k in range(left.shape[0])
-        for i in range(left.shape[1])
-        for j in range(right.shape[1])
-    )
-    return [Lane(shape, object_array(shape, items))]
+    left, right = (operand(value, v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True))
+    found = contracted(eqn, left, right, inner)
+    return [Lane(found.shape, found)]
 
 
 def _cumulative(eqn: Any, values: Sequence) -> list[Lane]:
-    axis, backwards = eqn.params["axis"], eqn.params["reverse"]
     operation = _CUMULATIVE[eqn.primitive.name]
-    parts = np.moveaxis(values[0].parts.copy(), axis, 0)
-    order = range(len(parts))[::-1] if backwards else range(len(parts))
-    for before, k in pairwise(order):
-        for i in np.ndindex(*parts.shape[1:]):
-            parts[(k, *i)] = operation(*_alike([parts[(before, *i)], parts[(k, *i)]]))
-    return [Lane(values[0].shape, np.moveaxis(parts, 0, axis))]
+    return [Lane(values[0].shape, cumulated(eqn, values[0].parts, lambda *pair: operation(*_alike(pair))))]
+
+
+# How primitives move the entries of object arrays, whatever these are: `onboard.translate` has expressions in them.
+
+
+def picked(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """What a primitive that only moves entries makes of these: it is applied to their numbers."""
+    entries = [entry for array in arrays for entry in array.flat]
+    firsts = itertools.accumulate((array.size for array in arrays), initial=0)
+    with jax.ensure_compile_time_eval():
+        numbers = [jnp.arange(first, first + array.size, dtype=np.int32).reshape(array.shape)
+                   for first, array in zip(firsts, arrays, strict=False)]  # fmt: skip
+        outputs = [np.asarray(chosen) for chosen in bind(eqn, numbers)]
+    return [object_array(out.shape, (entries[k] for k in out.flat)) for out in outputs]
+
+
+def reduced(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> np.ndarray:
+    """A reduction; fold: of the entries that become one."""
+    axes = eqn.params["axes"]
+    kept = [a for a in range(array.ndim) if a not in axes]
+    shape = tuple(array.shape[a] for a in kept)
+    rows = array.transpose([*kept, *axes]).reshape((*shape, -1))
+    return object_array(shape, (fold(rows[i]) for i in np.ndindex(*shape)))
+
+
+def contracted(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..., Any]) -> np.ndarray:
+    """A `dot_general`; inner: of the entries of a row and of a column."""
+
+    def rows(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+        """(batch, kept, contracted)."""
+        kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
+        sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
+        return array.transpose([*batch, *kept, *axes]).reshape(sizes)
+
+    a, b = (rows(*each) for each in zip((left, right), *eqn.params["dimension_numbers"], strict=True))
+    every = itertools.product(range(len(a)), range(a.shape[1]), range(b.shape[1]))
+    return object_array(eqn.outvars[0].aval.shape, (inner(a[k, i], b[k, j]) for k, i, j in every))
+
+
+def cumulated(eqn: Any, array: np.ndarray, operation: Callable[[Any, Any], Any]) -> np.ndarray:
+    """A cumulative sum, product or extreme along an axis; operation: on what there is so far and the next entry."""
+    found = np.moveaxis(array.copy(), eqn.params["axis"], 0)
+    for before, k in itertools.pairwise(range(len(found))[:: -1 if eqn.params["reverse"] else 1]):
+        for i in np.ndindex(*found.shape[1:]):
+            found[(k, *i)] = operation(found[(before, *i)], found[(k, *i)])
+    return np.moveaxis(found, 0, eqn.params["axis"])
 
 
 _REDUCTIONS = {

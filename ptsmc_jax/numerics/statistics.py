@@ -124,15 +124,13 @@ def drivers(
     known = {} if known is None else known
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
         return {}
-    rank = stats.rankdata(metric)
-    rank = (rank - rank.mean()) / rank.std()
-    found = {}
+    rank, found = _ranked(metric), {}
     for name, values in inputs.items():
         if np.ptp(values) == 0.0:
             continue
         if name not in known:
-            own = stats.rankdata(values)
-            own, order = (own - own.mean()) / own.std(), np.argsort(own, kind="stable")
+            own = _ranked(values)
+            order = np.argsort(own, kind="stable")
             alike = any(abs(np.mean(own * one)) > ALIKE for one, _ in filter(None, known.values()))
             known[name] = () if alike else (own, order)
         if not known[name]:
@@ -147,6 +145,12 @@ def drivers(
     return found
 
 
+def _ranked(values: np.ndarray) -> np.ndarray:
+    """Ranks of values (trials,), of mean 0 and variance 1: the mean of their products is Spearman's correlation."""
+    rank = stats.rankdata(values)
+    return (rank - rank.mean()) / rank.std()
+
+
 def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
     """Names of inputs (trials,) each, but for those that rank the trials as one before them does, or its reverse.
 
@@ -156,8 +160,7 @@ def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
     """
     kept: dict[str, np.ndarray] = {}
     for name, values in inputs.items():
-        rank = stats.rankdata(values)
-        rank = (rank - rank.mean()) / rank.std()
+        rank = _ranked(values)
         if all(abs(np.mean(rank * other)) <= ALIKE for other in kept.values()):
             kept[name] = rank
     return list(kept)

@@ -1,6 +1,7 @@
 """Branches and loops of a trace as regions of C; short loops with a fixed length are written out."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,32 +13,36 @@ UNROLLED = 8  # passes of a loop that are written out, and
 WRITTEN = 200  # operations that they may have together
 
 
-def _inside(to: Any, closed: Any, args: Sequence[np.ndarray]) -> tuple[Block, list[np.ndarray]]:
-    """A block of its own, and what its trace gives."""
+def _inside(to: Any, region: Region, made: Callable[[], list[np.ndarray]]) -> None:
+    """A block of its own in a region, and what comes out of it: the components that are made there."""
     outer = to.pool.block
     to.pool.block = Block(outer)
-    results = to.evaluate(closed, args)
-    block, to.pool.block = to.pool.block, outer
-    return block, results
+    region.outputs.append(_flat(made()))
+    region.blocks.append(to.pool.block)
+    to.pool.block = outer
 
 
-def _region(to: Any, region: Region, shapes: Sequence[tuple[int, ...]], kinds: Sequence[str]) -> list[np.ndarray]:
+def _flat(arrays: Sequence[np.ndarray]) -> list[Node]:
+    return [node for array in arrays for node in array.flat]
+
+
+def _variables(to: Any, like: Sequence[Any]) -> list[np.ndarray]:
+    """Variables that a branch or a loop sets, as many as these of its trace have components."""
+    shapes, kinds = [v.aval.shape for v in like], [kind_of(v.aval.dtype) for v in like]
+    return [object_array(shape, [to.pool.fresh(kind) for _ in range(math.prod(shape))])
+            for shape, kind in zip(shapes, kinds, strict=True)]  # fmt: skip
+
+
+def _region(to: Any, region: Region, like: Sequence[Any]) -> list[np.ndarray]:
     """Ends a region: variables that hold its results."""
-    found = []
-    for shape, kind in zip(shapes, kinds, strict=True):
-        nodes = [to.pool.fresh(kind) for _ in range(int(np.prod(shape, dtype=int)))]
-        region.results += nodes
-        found.append(object_array(shape, nodes))
+    found = _variables(to, like)
+    region.results += _flat(found)
     statement = Node("region", (), "", region, to.pool.block)
     statement.section = to.pool.section
     for node in region.results:
         node.args = (statement,)
     to.pool.block.nodes.append(statement)
     return found
-
-
-def _avals(variables: Sequence[Any]) -> tuple[list[tuple[int, ...]], list[str]]:
-    return [v.aval.shape for v in variables], [kind_of(v.aval.dtype) for v in variables]
 
 
 def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
@@ -59,17 +64,12 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
     else:
         on = to.pool.make("ge", test, to.pool.constant(last, test.kind), kind=BOOL)
     region = Region("branch", on)
-    for rest in ([branches[-1]], branches[:-1]):
-        if len(rest) == 1:
-            block, results = _inside(to, rest[0], operands)
-        else:
-            outer = to.pool.block
-            to.pool.block = Block(outer)
-            results = _switch(to, eqn, test, rest, operands)
-            block, to.pool.block = to.pool.block, outer
-        region.blocks.append(block)
-        region.outputs.append([node for result in results for node in result.flat])
-    return _region(to, region, *_avals(eqn.outvars))
+    _inside(to, region, lambda: to.evaluate(branches[-1], operands))
+    if last == 1:
+        _inside(to, region, lambda: to.evaluate(branches[0], operands))
+    else:
+        _inside(to, region, lambda: _switch(to, eqn, test, branches[:-1], operands))
+    return _region(to, region, eqn.outvars)
 
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
@@ -79,24 +79,16 @@ def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     test_consts, body_consts, init = values[:first], values[first:second], values[second:]
     region = Region("while")
-    shapes, kinds = _avals(eqn.outvars)
-    region.initial = [node for value in init for node in value.flat]
-    carry = _carry(to, region, shapes, kinds)
-    block, going = _inside(to, test, [*test_consts, *carry])
-    region.blocks.append(block)
-    region.outputs.append([going[0].item()])
-    block, after = _inside(to, body, [*body_consts, *carry])
-    region.blocks.append(block)
-    region.outputs.append([node for value in after for node in value.flat])
-    return _region(to, region, shapes, kinds)
+    carry = _carry(to, region, init, eqn.outvars)
+    _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))
+    _inside(to, region, lambda: to.evaluate(body, [*body_consts, *carry]))
+    return _region(to, region, eqn.outvars)
 
 
-def _carry(to: Any, region: Region, shapes: Sequence[tuple[int, ...]], kinds: Sequence[str]) -> list[np.ndarray]:
-    found = []
-    for shape, kind in zip(shapes, kinds, strict=True):
-        nodes = [to.pool.fresh(kind) for _ in range(int(np.prod(shape, dtype=int)))]
-        region.carried += nodes
-        found.append(object_array(shape, nodes))
+def _carry(to: Any, region: Region, init: Sequence[np.ndarray], like: Sequence[Any]) -> list[np.ndarray]:
+    """Variables that a loop carries, which begin with these components."""
+    region.initial, found = _flat(init), _variables(to, like)
+    region.carried = _flat(found)
     return found
 
 
@@ -118,36 +110,37 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
         return [*carry, *stacked]
     region = Region("count")
     region.length, region.index = length, to.pool.fresh("int32_t", "index")
-    shapes, kinds = _avals(body.jaxpr.outvars[:carried])
-    region.initial = [node for value in init for node in value.flat]
-    carry = _carry(to, region, shapes, kinds)
-    outer = to.pool.block
-    to.pool.block = Block(outer)
-    entries = []
-    for x in xs:  # each component is a table over the passes
-        nodes = []
-        for column in x[list(order)].reshape(length, -1).T:
-            table = to.pool.fresh(column[0].kind, "table")
-            region.tables.append((table, list(column)))
-            nodes.append(to.pool.make("entry", table, region.index, kind=table.kind))
-        entries.append(object_array(x.shape[1:], nodes))
-    after = to.evaluate(body, [*consts, *carry, *entries])
-    block, to.pool.block = to.pool.block, outer
-    region.blocks.append(block)
-    region.outputs.append([node for value in after for node in value.flat])
-    out = _region(to, region, shapes, kinds)
-    at, filled = len(region.results), []
-    shapes, kinds = _avals(body.jaxpr.outvars[carried:])
-    for shape, kind in zip(shapes, kinds, strict=True):
-        columns = []
-        for _ in range(int(np.prod(shape, dtype=int))):
-            table = to.pool.fresh(kind, "table")
-            table.args = (to.pool.block.nodes[-1],)
-            region.rows.append((table, at + len(region.rows)))
-            columns.append([to.pool.make("entry", table, to.pool.constant(k, "int32_t"), kind=kind)
-                            for k in order])  # fmt: skip
-        filled.append(object_array((length, *shape), (column[k] for k in range(length) for column in columns)))
-    return [*out, *filled]
+    state, stacked = body.jaxpr.outvars[:carried], body.jaxpr.outvars[carried:]
+    carry = _carry(to, region, init, state)
+
+    def passed() -> list[np.ndarray]:
+        entries = [_entries(to, region, x[list(order)]) for x in xs]
+        return to.evaluate(body, [*consts, *carry, *entries])
+
+    _inside(to, region, passed)
+    out = _region(to, region, state)
+    return [*out, *(_filled(to, region, v.aval, order) for v in stacked)]
+
+
+def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
+    """What a pass of a counted loop has of x (passes, ..), each component of which becomes a table over the passes."""
+    nodes = []
+    for column in x.reshape(len(x), -1).T:
+        table = to.pool.fresh(column[0].kind, "table")
+        region.tables.append((table, list(column)))
+        nodes.append(to.pool.make("entry", table, region.index, kind=table.kind))
+    return object_array(x.shape[1:], nodes)
+
+
+def _filled(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
+    """What a counted loop stacks of one of its outputs, behind its state, (passes, ..): tables that it fills."""
+    kind, columns = kind_of(aval.dtype), []
+    for _ in range(math.prod(aval.shape)):
+        table = to.pool.fresh(kind, "table")
+        table.args = (to.pool.block.nodes[-1],)
+        region.rows.append((table, len(region.results) + len(region.rows)))
+        columns.append([to.pool.make("entry", table, to.pool.constant(k, "int32_t"), kind=kind) for k in order])
+    return object_array((len(order), *aval.shape), (column[k] for k in range(len(order)) for column in columns))
 
 
 CONTROL = {"scan": scan, "while": loop, "cond": branch}  # by primitive; `to` is the translator

@@ -4,7 +4,7 @@ The same functions as the library's own give them here; traced, they are what C 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,24 +15,18 @@ from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation.assembly import Parts
 
 Given = dict[str, Any]  # the parameters, see `board.board`
-
-
-@dataclass(frozen=True)
-class Rule:
-    """How some of the parameters follow from the others."""
-
-    run: Callable[[Given], Given]  # of all parameters: all of them, those that follow computed anew
+Rule = Callable[[Given], Given]  # of all parameters: all of them, those that follow from others computed anew
 
 
 def rules(parts: Parts) -> list[Rule]:
     """The rules for the flight computer of these parts, each for what the ones before it give."""
-    found: list[Callable[[Given], Given]] = [_inverses, _estimation]
+    found: list[Rule] = [_inverses, _estimation]
     device = parts.actuators
     if getattr(parts.sensors, "filter", None) is not None:
         found.append(_filtering(parts.sensors))
     if device is not None and device.wheels is not None:
         found.append(_allocation)
-    return [Rule(run) for run in found]
+    return found
 
 
 def _inverse(model: Any) -> Any:
@@ -53,7 +47,7 @@ def _estimation(given: Given) -> Given:
     return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
 
 
-def _filtering(sensors: Any) -> Callable[[Given], Given]:
+def _filtering(sensors: Any) -> Rule:
     every = sensors.every
 
     def run(given: Given) -> Given:

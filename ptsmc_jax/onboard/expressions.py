@@ -68,10 +68,6 @@ class Region:
         self.rows: list[tuple[Node, int]] = []  # arrays that it fills: name, which output
 
 
-def _round_even(x: float) -> float:
-    return float(np.rint(x))
-
-
 # op: its value for known operands
 FOLDED: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -93,7 +89,7 @@ FOLDED: dict[str, Callable] = {
     "sqrt": lambda a: math.sqrt(a) if a >= 0.0 else math.nan,
     "floor": lambda a: float(np.floor(a)),
     "ceil": lambda a: float(np.ceil(a)),
-    "rint": _round_even,
+    "rint": lambda a: float(np.rint(a)),
     "sign": lambda a: float((a > 0) - (a < 0)),
 }
 

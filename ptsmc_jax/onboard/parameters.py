@@ -111,7 +111,7 @@ def _traced(made: Parameters, rules: Iterable[Rule]) -> Any:
     def run(leaves: list[Any]) -> list[Any]:
         given = made.tree(leaves)
         for rule in rules:
-            given = rule.run(given)
+            given = rule(given)
         return jax.tree.leaves(given)
 
     return jax.make_jaxpr(run)(made.leaves)

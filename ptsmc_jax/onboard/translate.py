@@ -5,7 +5,6 @@ regions; short loops with a fixed length are written out.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import jax
@@ -130,12 +129,8 @@ class Translator:
             return None
 
     def _reduction(self, eqn: Any, value: np.ndarray) -> np.ndarray:
-        axes, op = eqn.params["axes"], _FOLDS[eqn.primitive.name]
-        kept = [a for a in range(value.ndim) if a not in axes]
-        shape = tuple(value.shape[a] for a in kept)
-        rows = value.transpose([*kept, *axes]).reshape((*shape, -1))
-        kind = kind_of(eqn.outvars[0].aval.dtype)
-        return object_array(shape, (self._fold(op, kind, rows[i]) for i in np.ndindex(*shape)))
+        op, kind = _FOLDS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
+        return components.reduced(eqn, value, lambda row: self._fold(op, kind, row))
 
     def _fold(self, op: str, kind: str, items: Any) -> Node:
         items = list(items)
@@ -145,34 +140,18 @@ class Translator:
         return total
 
     def _contraction(self, eqn: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        contracted, batched = eqn.params["dimension_numbers"]
-        aval = eqn.outvars[0].aval
-        kind = kind_of(aval.dtype)
+        kind = kind_of(eqn.outvars[0].aval.dtype)
 
-        def rows(parts: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-            kept = [a for a in range(parts.ndim) if a not in (*axes, *batch)]
-            sizes = [int(np.prod([parts.shape[a] for a in group], dtype=int)) for group in (batch, kept, axes)]
-            return parts.transpose([*batch, *kept, *axes]).reshape(sizes)
+        def inner(row: np.ndarray, column: np.ndarray) -> Node:
+            return self._fold(
+                "add", kind, (self.pool.make("mul", *p, kind=kind) for p in zip(row, column, strict=True))
+            )
 
-        a, b = (rows(*row) for row in zip((left, right), contracted, batched, strict=True))
-        items = (
-            self._fold("add", kind, [self.pool.make("mul", *p, kind=kind) for p in zip(a[k, i], b[k, j], strict=True)])
-            for k in range(a.shape[0])
-            for i in range(a.shape[1])
-            for j in range(b.shape[1])
-        )
-        return object_array(aval.shape, items)
+        return components.contracted(eqn, left, right, inner)
 
     def _cumulative(self, eqn: Any, value: np.ndarray) -> np.ndarray:
-        axis, kind = eqn.params["axis"], kind_of(eqn.outvars[0].aval.dtype)
-        parts = np.moveaxis(value.copy(), axis, 0)
-        order = list(range(len(parts)))[:: -1 if eqn.params["reverse"] else 1]
-        for before, k in pairwise(order):
-            for i in np.ndindex(*parts.shape[1:]):
-                parts[(k, *i)] = self.pool.make(
-                    _SCANS[eqn.primitive.name], parts[(before, *i)], parts[(k, *i)], kind=kind
-                )
-        return np.moveaxis(parts, 0, axis)
+        op, kind = _SCANS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
+        return components.cumulated(eqn, value, lambda *pair: self.pool.make(op, *pair, kind=kind))
 
     def _place_of_extreme(self, eqn: Any, value: np.ndarray) -> np.ndarray:
         (axis,), kind = eqn.params["axes"], kind_of(eqn.outvars[0].aval.dtype)
@@ -191,35 +170,31 @@ class Translator:
 
     def _moved(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
         """Components moved as the primitive moves entries; by places that are known, or chosen among them."""
-        name = eqn.primitive.name
-        if name in ("dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add"):
-            return self._indexed(eqn, values)
-        pool, numbered = [], []
-        for value in values:
-            numbered.append(np.arange(len(pool), len(pool) + value.size, dtype=np.int32).reshape(value.shape))
-            pool += list(value.flat)
-        with jax.ensure_compile_time_eval():
-            outputs = [np.asarray(chosen) for chosen in components.bind(eqn, [jnp.asarray(n) for n in numbered])]
-        return [object_array(out.shape, (pool[k] for k in out.flat)) for out in outputs]
+        match eqn.primitive.name:
+            case "dynamic_slice":
+                arrays, places = values[:1], values[1:]
+            case "dynamic_update_slice":
+                arrays, places = values[:2], values[2:]
+            case "gather" | "scatter":
+                arrays, places = values[::2], values[1:2]
+            case _:
+                return components.picked(eqn, values)
+        return self._indexed(eqn, values, arrays, places)
 
-    def _indexed(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-        """A slice, a row or an update at places that are computed: chosen among all that there may be."""
-        name = eqn.primitive.name
-        many = 2 if name in ("dynamic_update_slice",) or name.startswith("scatter") else 1
-        arrays = [values[0], *([values[1]] if name == "dynamic_update_slice" else [])]
-        places = values[many:] if name == "dynamic_slice" or name == "dynamic_update_slice" else [values[1]]
-        if name.startswith("scatter"):
-            arrays, places = [values[0], values[2]], [values[1]]
+    def _indexed(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], places: Sequence[np.ndarray]
+    ) -> list[np.ndarray] | None:
+        """Entries of arrays at places among the values, which are computed: chosen among all that there may be."""
         flat = [node for place in places for node in place.flat]
         open_places = [node for node in flat if node.op != "constant"]
-        if len({id(node) for node in open_places}) > 1 or name == "scatter-add":
+        if len({id(node) for node in open_places}) > 1:
             return None
         if not open_places:
-            return [self._at(eqn, values, arrays, places, None, 0)]
+            return [self._at(eqn, values, arrays, None, 0)]
         chosen, index = open_places[0], None
         bound = max(values[0].shape)
         for k in range(bound - 1, -1, -1):
-            case = self._at(eqn, values, arrays, places, chosen, k)
+            case = self._at(eqn, values, arrays, chosen, k)
             if index is None:
                 index = case
                 continue
@@ -231,7 +206,10 @@ class Translator:
             )
         return None if index is None else [index]
 
-    def _at(self, eqn, values, arrays, places, chosen, k) -> np.ndarray:
+    def _at(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
+    ) -> np.ndarray:
+        """What is moved where the place that is computed, `chosen`, is k."""
         pool: list[Node] = []
         numbered: dict[int, np.ndarray] = {}
         for array in arrays:
@@ -245,10 +223,8 @@ class Translator:
             else:
                 known = [k if node is chosen else node.value for node in value.flat]
                 operands.append(jnp.asarray(np.asarray(known).reshape(value.shape), dtype=variable.aval.dtype))
-        params = dict(eqn.params)
         with jax.ensure_compile_time_eval():
-            out = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(params))
-        out = np.asarray(out)
+            out = np.asarray(components.bind(eqn, operands)[0])
         inside = (out >= 0) & (out < len(pool) - 1)
         return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
 
