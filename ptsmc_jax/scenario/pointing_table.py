@@ -1,5 +1,6 @@
 """The table of a scenario file that says what pointing is observed."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -47,4 +48,6 @@ class Pointing(Table, frozen=True):
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
-        return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed)
+        # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
+        samples = math.ceil(self.window / scenario.loop.period) + 2 if scenario.loop.mode == "sampled" else 0
+        return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

@@ -26,9 +26,9 @@ INDICES = {
     "rke": "RKE, the error of the attitude that the law is given less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-TIMED = ("ape", "mpe", "ake", "mke")  # of which there are shares of time
+TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # of which there are shares of time
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
-KNOWLEDGE = ("ake", "mke", "rke", "within_ake", "within_mke")  # how metrics begin that a run without noise lacks
+KNOWLEDGE = ("ake", "mke", "rke", "within_ake", "within_mke", "within_rke")  # how metrics begin that a run without noise lacks
 WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
 
 CATALOGUE = {

@@ -131,39 +131,53 @@ def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -
     return jnp.where(interval.t_next >= criteria.t_f, jnp.where(early, ringing, jnp.maximum(largest, ringing)), largest)
 
 
-def _tally(start: Start, criteria: Criteria) -> pointing.Tally | None:
-    return None if criteria.pointing is None else pointing.begin(jnp.zeros_like(criteria.t_f))
+# absolute, mean and relative index: of the attitude's error, and of what the law is told of it
+OF_ATTITUDE, OF_KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")
+
+
+def _tally(indices: tuple[str, str, str], criteria: Criteria) -> pointing.Tally | None:
+    """Of an error whose indices, absolute, mean and relative, are these; None: no pointing is observed."""
+    asked = criteria.pointing
+    return None if asked is None else pointing.begin(jnp.zeros_like(criteria.t_f), asked.segments(indices[2]))
 
 
 def _observed(
-    tally: Any, course: pointing.Course, names: tuple[str, str], interval: Interval, criteria: Criteria
+    tally: Any, course: pointing.Course, indices: tuple[str, str, str], interval: Interval, criteria: Criteria
 ) -> pointing.Tally:
     assert criteria.pointing is not None
     asked = criteria.pointing
-    each = [[jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES] for name in names]
+    each = [[jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES] for name in indices]
     limits = jnp.stack([jnp.stack(some) for some in each])
     begins = criteria.t_f + asked.after
     return pointing.update(tally, course, interval.t, interval.t_next, begins, asked.window, limits)
 
 
 def _pointing(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.pointing(), ("ape", "mpe"), interval, criteria)  # pyright: ignore[reportOptionalCall]
+    return tally if tally is None else _observed(tally, interval.pointing(), OF_ATTITUDE, interval, criteria)  # pyright: ignore[reportOptionalCall]
 
 
 def _knowledge(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.knowledge(), ("ake", "mke"), interval, criteria)  # pyright: ignore[reportOptionalCall]
+    return tally if tally is None else _observed(tally, interval.knowledge(), OF_KNOWLEDGE, interval, criteria)  # pyright: ignore[reportOptionalCall]
 
 
 def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
     assert criteria.pointing is not None
-    return tally.within / (criteria.t_end - criteria.t_f - criteria.pointing.after)
+    return 1.0 - tally.beyond / (criteria.t_end - criteria.t_f - criteria.pointing.after)
 
 
 def _means_within(tally: pointing.Tally, criteria: Criteria) -> Array:
-    """Of the time in whole windows; NaN where none is over."""
+    return _of_windows(tally.means_beyond, tally, criteria)
+
+
+def _relative_within(tally: pointing.Tally, criteria: Criteria) -> Array:
+    return _of_windows(tally.relative_beyond, tally, criteria)
+
+
+def _of_windows(beyond: Array, tally: pointing.Tally, criteria: Criteria) -> Array:
+    """What a time beyond limits leaves of that in whole windows, as a share of it; NaN where none is over."""
     assert criteria.pointing is not None
     observed = tally.windows * criteria.pointing.window
-    return jnp.where(observed > 0.0, tally.means_within / jnp.where(observed > 0.0, observed, 1.0), jnp.nan)
+    return jnp.where(observed > 0.0, 1.0 - beyond / jnp.where(observed > 0.0, observed, 1.0), jnp.nan)
 
 
 def _from(first: str, index: Callable[[pointing.Tally, Criteria], Array], axis: int) -> Callable:
@@ -184,6 +198,7 @@ POINTING = {
     "pde": lambda tally, criteria: pointing.drift(tally),
     "within_ape": _time_within,
     "within_mpe": _means_within,
+    "within_rpe": _relative_within,
 }
 KNOWLEDGE = {
     "ake": POINTING["ape"],
@@ -191,6 +206,7 @@ KNOWLEDGE = {
     "rke": POINTING["rpe"],
     "within_ake": _time_within,
     "within_mke": _means_within,
+    "within_rke": _relative_within,
 }
 
 
@@ -203,8 +219,9 @@ def _pointing_rows() -> dict[str, Metric]:
             for k, axis in enumerate(pointing.AXES):
                 none, value = (lambda start, criteria: None), _from(first, of, k)
                 found[f"{index}_{axis}"] = Metric(begin=none, value=value, may_lack=True)
-    found["ape_x"] = replace(found["ape_x"], begin=_tally, update_after_t_f=_pointing)
-    measured = lambda start, criteria: _tally(start, criteria) if start.measured else None  # noqa: E731
+    told = lambda start, criteria: _tally(OF_ATTITUDE, criteria)  # noqa: E731
+    found["ape_x"] = replace(found["ape_x"], begin=told, update_after_t_f=_pointing)
+    measured = lambda start, criteria: _tally(OF_KNOWLEDGE, criteria) if start.measured else None  # noqa: E731
     found["ake_x"] = replace(found["ake_x"], begin=measured, update_after_t_f=_knowledge)
     return found
 

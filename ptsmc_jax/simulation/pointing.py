@@ -1,4 +1,5 @@
-"""Pointing error indices (ECSS-E-ST-60-10C), accumulated interval by interval: no history is kept.
+"""Pointing error indices (ECSS-E-ST-60-10C), accumulated interval by interval: no history is kept, but that
+of the window that time is in, where a limit asks for the time in which the relative error is within it.
 
 Of an error e(t), seen over an observation of consecutive windows of length D: the absolute error |e(t)|, its mean over
 a window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference between the means
@@ -6,7 +7,7 @@ of two windows. Each is reported by its largest value in the observation: about 
 boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of what the law is told of it (AKE, MKE, RKE).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -38,6 +39,18 @@ class Pointing:
     after: Leaf  # of t_f, when the observation begins [s]
     window: Leaf  # D [s]
     limits: dict[str, Leaf] = field(default_factory=dict)  # [rad] by metric: the time within is told of these
+    samples: int = field(default=0, metadata={"static": True})  # most in a window; 0: as many as the run has
+
+    def of_run(self, steps: int) -> "Pointing":
+        """The same for a run of so many steps."""
+        return self if self.samples else replace(self, samples=steps)
+
+    def segments(self, index: str) -> int:
+        """How many segments of a window are kept for shares of time of a relative index; 0: no limit asks for them.
+
+        One more than the samples that part it, and one of no length where the window before ended with a sample.
+        """
+        return self.samples + 2 if any(name.startswith(index) for name in self.limits) else 0
 
 
 def across(boresight: Any) -> np.ndarray:
@@ -119,12 +132,42 @@ def held(q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3
     return Course(error, jnp.zeros_like(error), error, jnp.zeros_like(error), length)
 
 
+class Path(NamedTuple):
+    """The error in the window that time is in, segment by segment: its mean is known at its end only."""
+
+    ends: Array  # (segments, 2, 5) at the start and the end of each [rad]
+    lengths: Array  # (segments,) [s], 0 of those to come
+    count: Array  # how many there are
+
+    def added(self, start: Array, end: Array, length: Scalar) -> "Path":
+        """With one segment more; beyond the last there is no room, which `count` tells."""
+        return Path(
+            self.ends.at[self.count].set(jnp.stack([start, end])),
+            self.lengths.at[self.count].set(length),
+            self.count + 1,
+        )
+
+    def emptied(self) -> "Path":
+        """Without segments."""
+        return Path(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.count))
+
+    def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
+        """How long the error less its mean is beyond limits [s]; NaN where there was no room for all of it."""
+
+        def of_segment(ends: Array, length: Scalar) -> Array:
+            return length * _share_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
+
+        total = jnp.sum(jax.vmap(of_segment)(self.ends, self.lengths), axis=0)
+        return jnp.where(self.count > self.lengths.size, jnp.nan, total)
+
+
 class Window(NamedTuple):
     """What is remembered of the window that time is in."""
 
     integral: Array  # (5,) of the error [rad s]
     high: Array  # (3 + DIRECTIONS,) the largest of its projections [rad]
     low: Array
+    path: Path | None  # None: no limit is on the relative error
 
 
 class Tally(NamedTuple):
@@ -137,23 +180,25 @@ class Tally(NamedTuple):
     means_high: Array  # (3 + DIRECTIONS,) of the windows so far
     means_low: Array
     windows: Scalar  # how many are closed
-    within: Array  # time within the limits [s]
-    means_within: Array  # time in windows whose means are within theirs [s]
+    beyond: Array  # time beyond the limits [s]: exactly 0 of a run that keeps them, which a sum of times within is not
+    means_beyond: Array  # time in windows whose means are beyond theirs [s]
+    relative_beyond: Array  # time in closed windows in which the relative error is beyond its limits [s]
 
 
-def begin(zero: Scalar) -> Tally:
-    """Before the observation; zero: of the run's numbers."""
+def begin(zero: Scalar, segments: int = 0) -> Tally:
+    """Before the observation; zero: of the run's numbers; segments: of a window that are kept, see `Pointing`."""
     four, many = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
-    window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf)
-    return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four, four)
+    path = Path(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
+    window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf, path)
+    return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four, four, four)
 
 
 def update(
-    tally: Tally, course: Course, t: Scalar, t_next: Scalar, begins: Scalar, window: Scalar, limits: Float[Array, "2 4"]
+    tally: Tally, course: Course, t: Scalar, t_next: Scalar, begins: Scalar, window: Scalar, limits: Float[Array, "3 4"]
 ) -> Tally:
     """After an interval from t to t_next that is no longer than a window; begins: when the observation does [s].
 
-    limits: (2, 4) [rad], on the error and on its means.
+    limits: (3, 4) [rad], on the error, on its means and on the relative error.
     """
     length = course.length
     share = jnp.clip((begins - t) / length, 0.0, 1.0)
@@ -165,12 +210,13 @@ def update(
     opened = guards.select(t <= begins, _with(tally.window, first), tally.window)
     started = jnp.where(t <= begins, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
     added = opened.integral + course.integral(until) - course.integral(share)
-    present = _with(opened._replace(integral=added), last)
+    kept = None if opened.path is None else opened.path.added(first, last, length * (until - share))
+    present = _with(opened._replace(integral=added, path=kept), last)
     sizes = _sizes(first), _sizes(course.end)
     still = tally._replace(
         largest=jnp.maximum(started, sizes[1]),
         window=present,
-        within=tally.within + length * (1.0 - share) * _share_within(*sizes, limits[0]),
+        beyond=tally.beyond + length * (1.0 - share) * _share_beyond(*sizes, limits[0]),
     )
 
     def closed() -> Tally:
@@ -178,7 +224,11 @@ def update(
         means = _projected(mean)
         off = jnp.maximum(present.high - means, means - present.low)
         rest = course.integral(jnp.ones_like(until)) - course.integral(until)
-        new = _with(_with(Window(rest, 0.0 * means - jnp.inf, 0.0 * means + jnp.inf), last), course.end)
+        path, beyond = present.path, jnp.zeros(4)
+        if path is not None:
+            beyond = path.time_beyond(mean, limits[2])
+            path = path.emptied().added(last, course.end, length * (1.0 - until))
+        new = _with(_with(Window(rest, 0.0 * means - jnp.inf, 0.0 * means + jnp.inf, path), last), course.end)
         return still._replace(
             mean=jnp.maximum(still.mean, _sizes(mean)),
             relative=jnp.maximum(still.relative, _sizes_of(off)),
@@ -186,7 +236,8 @@ def update(
             means_high=jnp.maximum(still.means_high, means),
             means_low=jnp.minimum(still.means_low, means),
             windows=still.windows + 1.0,
-            means_within=still.means_within + jnp.where(_sizes(mean) <= limits[1], window, 0.0),
+            means_beyond=still.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
+            relative_beyond=still.relative_beyond + beyond,
         )
 
     found = jax.lax.cond(closes, closed, lambda: still)
@@ -218,10 +269,10 @@ def _sizes_of(projected: Array) -> Array:
     return jnp.append(projected[:3], jnp.max(projected[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
-def _share_within(start: Array, end: Array, limits: Array) -> Array:
-    """Share of an interval in which sizes are within limits, as if they went straight from start to end."""
-    room, room_next = limits - start, limits - end
-    both = jnp.where((room >= 0.0) & (room_next >= 0.0), 1.0, 0.0)
-    crosses = (room >= 0.0) != (room_next >= 0.0)
-    apart = jnp.where(crosses, jnp.abs(room - room_next), 1.0)
-    return jnp.where(crosses, jnp.maximum(room, room_next) / apart, both)
+def _share_beyond(start: Array, end: Array, limits: Array) -> Array:
+    """Share of an interval in which sizes are beyond limits, as if they went straight from start to end."""
+    kept, kept_next = start <= limits, end <= limits
+    both = jnp.where(kept & kept_next, 0.0, 1.0)
+    crosses = kept != kept_next
+    apart = jnp.where(crosses, jnp.abs(start - end), 1.0)
+    return jnp.where(crosses, (jnp.maximum(start, end) - limits) / apart, both)

@@ -108,7 +108,8 @@ def simulate(
     A run that goes wrong never raises: it returns a status and the first bad time, and its metrics as they came out.
     """
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, parts.pointing)
+    observed = None if parts.pointing is None else parts.pointing.of_run(ticks.t.size)
+    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, observed)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = parts.controller.align(parts.initial, target)
     unit = parts.controller.clearance_unit(parts.controller.clearance(x0, target))

@@ -615,8 +615,8 @@ BAD = [
         "one of them",
     ),
     (
-        "pointing = {}\nrequirements.rpe_x = { limit = 1e-3, probability = 0.9, interpretation = 'mixed' }",
-        'requirements.rpe_x.interpretation is "mixed"',
+        "pointing = {}\nrequirements.pde_x = { limit = 1e-3, probability = 0.9, interpretation = 'mixed' }",
+        'requirements.pde_x.interpretation is "mixed"',
         "ape_x, ape_y",
     ),
     (

@@ -2,6 +2,7 @@
 
 import dataclasses
 import tomllib
+from functools import partial
 from typing import Any
 
 import jax
@@ -61,8 +62,25 @@ def close(found, expected, rel):
         assert 1.0 - rel <= ratio <= slack * (1.0 + rel), index
 
 
-@jax.jit
-def tallied(nodes, error, rate, begins, window, limits):
+def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
+    """Of the time in whole windows, that in which the error less its window's mean is within limits (4,).
+
+    Sizes go straight from node to node, and are taken at a window's ends as well.
+    """
+    count, shares = int((t_end - begins) / window + 1e-9), []
+    for k in range(count):
+        low, high = begins + k * window, begins + (k + 1) * window
+        inside = (t > low) & (t < high)
+        nodes = np.concatenate([[low], t[inside], [high]])
+        off = np.concatenate([mean_of("at")([low]), error[inside], mean_of("at")([high])]) - mean_of(low, high)
+        sizes = np.concatenate([np.abs(off[:, :3]), np.linalg.norm(off[:, 3:], axis=1)[:, None]], axis=1)
+        fine = np.linspace(low, high, 20_001)
+        shares.append([np.mean(np.interp(fine, nodes, sizes[:, i]) <= limits[i]) for i in range(4)])
+    return np.mean(shares, axis=0)
+
+
+@partial(jax.jit, static_argnames="segments")
+def tallied(nodes, error, rate, begins, window, limits, segments=33):
     """A tally over errors (n, 5) with their rates at nodes (n,)."""
 
     def step(tally, row):
@@ -71,7 +89,7 @@ def tallied(nodes, error, rate, begins, window, limits):
         return pointing.update(tally, course, t, t_next, begins, window, limits), None
 
     rows = nodes[:-1], nodes[1:], error[:-1], rate[:-1], error[1:], rate[1:]
-    return jax.lax.scan(step, pointing.begin(jnp.zeros(())), rows)[0]
+    return jax.lax.scan(step, pointing.begin(jnp.zeros(()), segments), rows)[0]
 
 
 def indices(tally):
@@ -93,11 +111,16 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
         expected = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1])
         limits = np.array([0.5, 1.0, 1.5, 2.0])
         of_means = 0.9 * expected["mpe"]  # which some windows keep
-        tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, np.stack([limits, of_means]))))
+        deviations = np.array([0.6, 0.9, 1.2, 1.6])
+        asked = np.stack([limits, of_means, deviations])
+        tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, asked)))
         close(indices(tally), expected, 1e-10)  # sums of a hundred numbers
         assert float(tally.windows) == int((NODES[-1] - begins) / window + 1e-9)
         kept = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1], of_means)
-        np.testing.assert_allclose(tally.means_within / (tally.windows * window), kept, rtol=1e-12)
+        np.testing.assert_allclose(1.0 - tally.means_beyond / (tally.windows * window), kept, rtol=1e-12)
+        off = relative_share(NODES, error, of_spline(spline), begins, window, NODES[-1], deviations)
+        np.testing.assert_allclose(1.0 - tally.relative_beyond / (tally.windows * window), off, atol=2e-4)
+        assert np.all((0.0 < off) & (off < 1.0))
         # the time within a limit, sizes going straight from node to node
         sizes = np.concatenate([np.abs(error[:, :3]), np.linalg.norm(error[:, 3:], axis=1)[:, None]], axis=1)
         fine = np.linspace(begins, NODES[-1], 200_001)
@@ -107,7 +130,7 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
         for k, limit in enumerate(limits):
             shown = np.interp(fine, np.append(begins, NODES[later]), np.append(opened[k], sizes[later, k]))
             share = np.mean(shown <= limit)
-            assert float(tally.within[k]) / (NODES[-1] - begins) == pytest.approx(share, abs=1e-4)
+            assert 1.0 - float(tally.beyond[k]) / (NODES[-1] - begins) == pytest.approx(share, abs=1e-4)
 
     for seed in range(3):
         check(seed)
@@ -115,12 +138,12 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
 
 def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
     error = np.tile([1.0, -2.0, 3.0, 0.6, 0.8], (NODES.size, 1))
-    tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full((2, 4), np.inf))))
+    tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full((3, 4), np.inf))))
     np.testing.assert_allclose(tally.largest, [1.0, 2.0, 3.0, 1.0], rtol=1e-14)
     np.testing.assert_allclose(tally.mean, [1.0, 2.0, 3.0, 1.0], rtol=1e-13)
     np.testing.assert_allclose(tally.relative, 0.0, atol=1e-13)
     ramp, slope = NODES[:, None] * np.ones(5), np.ones((NODES.size, 5))
-    tally = tallied(*map(jnp.asarray, (NODES, ramp, slope, 2.0, 1.0, np.full((2, 4), np.inf))))
+    tally = tallied(*map(jnp.asarray, (NODES, ramp, slope, 2.0, 1.0, np.full((3, 4), np.inf))))
     np.testing.assert_allclose(tally.relative[:3], 0.5, rtol=1e-12)
     np.testing.assert_allclose(pointing.drift(tally)[:3], 7.0, rtol=1e-12)  # eight windows of 1 s
     np.testing.assert_allclose(tally.mean[:3], 9.5, rtol=1e-12)
@@ -144,6 +167,7 @@ def check_the_cone(seed):
 
 test_the_half_cone_is_the_angle_of_the_boresight = drawn(check_the_cone, 20, seed=st.integers(0, 2**32 - 1))
 
+KNOWN_WITHIN = 1e-5  # rad
 POINTED = (
     SHORT.replace("[requirements]\npeak_torque = 30.0\n", "")
     + """
@@ -156,6 +180,8 @@ kind = "spin"
 rate = [0.01, -0.02, 0.03]
 [requirements]
 ape_boresight = { limit = 0.016, probability = 0.95, interpretation = "mixed" }
+rpe_boresight = { limit = 5e-4, probability = 0.95, interpretation = "temporal" }
+rke_x = { limit = 1e-5, probability = 0.95, interpretation = "mixed" }
 """
 )
 
@@ -200,7 +226,12 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     share = np.mean(np.interp(fine, nodes, np.linalg.norm(seen[:, 3:], axis=1)) <= 0.016)  # straight from node to node
     assert float(result.metrics.within_ape_boresight) == pytest.approx(share, abs=1e-4)
     assert 0.0 < share < 1.0
-    assert float(result.metrics.within_ape_x) == 1.0  # no limit of its own
+    # without a limit of their own: exactly all of the time, or else rounding would count as time beyond it
+    assert [float(getattr(result.metrics, f"within_{name}_x")) for name in ("ape", "mpe", "rpe")] == [1.0, 1.0, 1.0]
+    limits = np.array([np.inf, np.inf, np.inf, 5e-4])
+    relative = relative_share(t[late], errors(0.0)[late], of_spline(spline), begins, 0.33, 6.5, limits)[3]
+    assert float(result.metrics.within_rpe_boresight) == pytest.approx(relative, abs=2e-4)
+    assert 0.1 < relative < 0.9
 
 
 def test_what_the_law_is_told_is_off_by_its_noise(flown):
@@ -215,13 +246,31 @@ def test_what_the_law_is_told_is_off_by_its_noise(flown):
     frame = np.asarray(ready.parts.pointing.frame)
     cones = np.linalg.norm(np.cross(turns, frame[0]), axis=1)
     assert float(found.ake_boresight) == pytest.approx(cones[in_view].max(), rel=1e-6)
-    means = []
+    means, within = [], 0.0
     for k in range(3):
         low, high = 5.25 + 0.33 * k, 5.25 + 0.33 * (k + 1)
         lasts = np.clip(np.minimum(began + 0.1, high) - np.maximum(began, low), 0.0, None)
         means.append(lasts @ turns / 0.33)
+        within += lasts @ (np.abs(turns - means[-1])[:, 0] <= KNOWN_WITHIN)
+    assert float(found.within_rke_x) == pytest.approx(within / 0.99, rel=1e-9)
+    assert 0.1 < within / 0.99 < 0.9
     for k, axis in enumerate("xyz"):
         assert float(getattr(found, f"mke_{axis}")) == pytest.approx(np.abs(means)[:, k].max(), rel=1e-6)
+
+
+def test_a_window_with_more_samples_than_there_is_room_for_has_no_share_of_time():
+    error = np.zeros((NODES.size, 5))
+    asked = [jnp.asarray(given) for given in (NODES, error, error, 4.0, 1.0, np.ones((3, 4)))]
+    np.testing.assert_array_equal(tallied(*asked).relative_beyond, 0.0)
+    assert np.all(np.isnan(tallied(*asked, segments=9).relative_beyond))
+
+
+def test_a_run_that_is_not_sampled_has_room_for_all_its_steps():
+    frame = pointing.across((0.0, 0.0, 1.0))
+    asked = pointing.Pointing(frame, 0.0, 1.0, {"rpe_z": 1.0})
+    assert asked.of_run(700).segments("rpe") == 702
+    assert asked.of_run(700).segments("rke") == 0
+    assert dataclasses.replace(asked, samples=12).of_run(700).segments("rpe") == 14
 
 
 def test_indices_have_slopes(flown):
@@ -246,7 +295,7 @@ def test_indices_have_slopes(flown):
 def test_every_index_is_a_metric_of_a_scenario_that_observes_it(flown):
     ready, _ = flown
     named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in pointing.AXES}
-    assert named | {"within_ape_boresight"} <= set(ready.catalogue)
+    assert named | {"within_ape_boresight", "within_rpe_boresight", "within_rke_x"} <= set(ready.catalogue)
     assert not {"within_ape_x", "within_ake_boresight"} & set(ready.catalogue)
     quiet = scenario.replace(ready.scenario, hardware=None, requirements=None)
     assert {name for name in named if "ke_" in name} & set(scenario.catalogue(quiet)) == set()
