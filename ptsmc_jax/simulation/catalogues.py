@@ -28,8 +28,9 @@ INDICES = {
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
 TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # of which there are shares of time
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
-KNOWLEDGE = ("ake", "mke", "rke", "within_ake", "within_mke", "within_rke")  # how metrics begin that a run without noise lacks
 WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
+# how metrics begin that a run without noise lacks
+KNOWLEDGE = tuple(f"{of}{index}" for of in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
     "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),

@@ -120,7 +120,7 @@ def test_indices_of_an_error_are_those_of_its_history(begins, window):
         np.testing.assert_allclose(1.0 - tally.means_beyond / (tally.windows * window), kept, rtol=1e-12)
         off = relative_share(NODES, error, of_spline(spline), begins, window, NODES[-1], deviations)
         np.testing.assert_allclose(1.0 - tally.relative_beyond / (tally.windows * window), off, atol=2e-4)
-        assert np.all((0.0 < off) & (off < 1.0))
+        assert np.all((off > 0.0) & (off < 1.0))
         # the time within a limit, sizes going straight from node to node
         sizes = np.concatenate([np.abs(error[:, :3]), np.linalg.norm(error[:, 3:], axis=1)[:, None]], axis=1)
         fine = np.linspace(begins, NODES[-1], 200_001)
