@@ -1,10 +1,11 @@
 """Pointing error indices (ECSS-E-ST-60-10C), accumulated interval by interval.
 
 No history is kept, but that of the window that time is in, where a limit asks for the time in which the relative error
-is within it. Of an error e(t), seen over an observation of consecutive windows of length D: the absolute error |e(t)|, its mean over
-a window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference between the means
-of two windows. Each is reported by its largest value in the observation: about each axis, and as the half-cone of the
-boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of what the law is told of it (AKE, MKE, RKE).
+is within it. Of an error e(t), seen over an observation of consecutive windows of length D: the absolute error |e(t)|,
+its mean over a window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference
+between the means of two windows. Each is reported by its largest value in the observation: about each axis, and as the
+half-cone of the boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of what the law is told of it
+(AKE, MKE, RKE).
 """
 
 from dataclasses import dataclass, field, replace
