@@ -22,11 +22,19 @@ _OPTIONS = (
 )
 
 
+def _flags(options: tuple[str, ...]) -> str:
+    """The options as XLA_FLAGS."""
+    extra = ",".join(option for option in options if not option.startswith("--"))
+    plain = [option for option in options if option.startswith("--")]
+    return " ".join([*([f"--xla_backend_extra_options={extra}"] if extra else []), *plain])
+
+
 # folder of whole compiled programs, see `ptsmc_jax.programs`; None: they are not kept
 programs: Path | None = None
 
 
 _called = _said = False  # whether `configure` was, and whether it was said that it was not
+_added = _flags(_OPTIONS)  # to XLA_FLAGS by an earlier call, or by that of a process that began this one
 
 
 class NoDeviceError(ValueError):
@@ -58,10 +66,8 @@ def configure(
     anything runs on JAX; later it raises RuntimeError where the backend has already started with something else.
     """
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
-    flags = os.environ.get("XLA_FLAGS", "")
-    if fast and "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {_flags(_accepted(folder))}".strip()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when jaxlib is loaded; what is fatal is still said
+    _set_compiler_options(fast, folder)
     global programs, _called
     _called = True
     programs = folder / "programs" if keep_programs and folder is not None else None
@@ -87,6 +93,36 @@ def configure(
             jax.devices()  # starts the backend
         except RuntimeError:
             raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
+
+
+def _set_compiler_options(fast: bool, folder: Path | None) -> None:
+    """XLA_FLAGS with our options or without; raises RuntimeError where JAX has already started with others."""
+    global _added
+    before = os.environ.get("XLA_FLAGS", "")
+    flags = before.replace(_added, "").strip()
+    ours = _flags(_accepted(folder)) if fast and "xla_backend_extra_options" not in flags else ""
+    wanted = f"{flags} {ours}".strip()
+    if sorted(wanted.split()) == sorted(before.split()):
+        return
+    if _has_started():
+        raise RuntimeError(
+            "configure() comes too late: JAX has already run something in this process, with other compiler options "
+            f"than fast={fast} asks for; call it first, right after the imports"
+        )
+    os.environ["XLA_FLAGS"], _added = wanted, ours or _added
+
+
+def _has_started() -> bool:
+    """Whether JAX has run something: the number of its devices cannot be changed any more."""
+    import jax
+
+    number = jax.config.values["jax_num_cpu_devices"]
+    try:
+        jax.config.update("jax_num_cpu_devices", number + 1)
+    except RuntimeError:
+        return True
+    jax.config.update("jax_num_cpu_devices", number)
+    return False
 
 
 _REJECTED = "Error reading persistent compilation cache"
@@ -132,13 +168,6 @@ def warn_if_forgotten() -> None:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _flags(options: tuple[str, ...]) -> str:
-    """The options as XLA_FLAGS."""
-    extra = ",".join(option for option in options if not option.startswith("--"))
-    plain = [option for option in options if option.startswith("--")]
-    return " ".join([*([f"--xla_backend_extra_options={extra}"] if extra else []), *plain])
 
 
 def _accepted(folder: Path | None) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
 
 FAR = 10.0  # times off, from which on a stated bound is said to be
+LATE = 0.1  # of t_f, from which on a delay is likely the number of another unit
 COARSE = np.deg2rad(5.0)  # of noise [rad], from which on it is likely another unit's number
 
 
@@ -15,7 +16,18 @@ def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
     found = disturbance_bounds.of(scenario, scenario.inputs)
     bounded = [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
-    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario)]
+    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario)]
+
+
+def _late(scenario: Scenario) -> list[str]:
+    """A delay that is likely a time: it is counted in control periods."""
+    delay, period = scenario.devices.delay_periods, scenario.loop.period
+    if delay * period < LATE * scenario.controller.t_f:
+        return []
+    return [
+        f"hardware.delay is {delay}, which are {delay * period:g} s: it counts control periods, of {period:g} s each, "
+        "and no time"
+    ]
 
 
 def _coarse(scenario: Scenario) -> list[str]:

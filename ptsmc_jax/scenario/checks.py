@@ -143,11 +143,16 @@ def _check_periods(scenario: Scenario) -> None:
         raise wrong("hardware.command_filter.corner", filtering.corner, highest)
     if window < loop.period * (1 - 1e-9):
         raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")
+    delay, t_f = scenario.devices.delay_periods, scenario.controller.t_f
+    if delay * loop.period >= t_f:
+        least = (
+            f"a number of control periods, of {loop.period:g} s each, that are shorter than controller.t_f, {t_f:g} s"
+        )
+        raise wrong("hardware.delay", delay, least)
     samples = math.ceil(scenario.end / loop.period * (1 - 1e-9))
-    for key in ("delay", "star_tracker_every"):
-        periods = getattr(scenario.hardware, key, None) or 0
-        if periods > samples:
-            raise wrong(f"hardware.{key}", periods, f"at most the {samples} control periods until loop.t_end")
+    every = getattr(scenario.hardware, "star_tracker_every", None) or 0
+    if every > samples:
+        raise wrong("hardware.star_tracker_every", every, f"at most the {samples} control periods until loop.t_end")
     star = getattr(scenario.hardware, "star_tracker_period", None) or 0.0
     if star > scenario.end:
         raise wrong("hardware.star_tracker_period", star, f"at most loop.t_end, {scenario.end}")

@@ -28,10 +28,12 @@ class Pointing(Table, frozen=True):
         """Raise ScenarioError where no direction is given, or not two windows fit into the observation."""
         if not np.linalg.norm(self.boresight) > 0.0:
             raise wrong("pointing.boresight", self.boresight, "a direction, not all zero")
-        left = scenario.end - scenario.controller.t_f - self.after
-        if not left >= 2.0 * self.window * (1 - 1e-9):
-            times = f"loop.t_end - controller.t_f{' - pointing.after' if self.after else ''}"
-            raise wrong("pointing.window", self.window, f"at most half of {times}, {left:.6g}")
+        left, needed = scenario.end - scenario.controller.t_f, 2.0 * self.window * (1 - 1e-9)
+        if not left >= needed:
+            raise wrong("pointing.window", self.window, f"at most half of loop.t_end - controller.t_f, {left:.6g}")
+        if not left - self.after >= needed:
+            latest = f"at most {left - 2.0 * self.window:.6g}, two windows of {self.window:g} s before loop.t_end"
+            raise wrong("pointing.after", self.after, latest)
         sampled = scenario.loop.mode == "sampled"
         least, what = (scenario.loop.period, "loop.period") if sampled else (LONGEST_STEP, "the longest step")
         if self.window < least * (1 - 1e-9):

@@ -41,7 +41,7 @@ class Limit(Table, frozen=True):
     """A requirement in full: metric <= limit in a share of the trials, or of the time.
 
     Attributes:
-        limit: the largest value allowed, a number or with its unit, "0.05 deg"
+        limit: the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only
         quantile: the share of the trials in which it must hold; default: all that are flown
         probability: of what `interpretation` says; of an ensemble it is the quantile
         confidence: of the one-sided bound by which that share must be shown; default: none asked

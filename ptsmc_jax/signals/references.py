@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 
 Time = Float[Array, ""]
 
@@ -61,6 +61,23 @@ def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
     q_dot, q_ddot = time_derivative(path, t), time_derivative(lambda t: time_derivative(path, t), t)
     inverse = attitude.conjugate(q)
     return Target(q, 2.0 * attitude.multiply(inverse, q_dot)[:3], 2.0 * attitude.multiply(inverse, q_ddot)[:3])
+
+
+@pytree
+@dataclass(frozen=True)
+class TurningFunction(Function):
+    """A plain function of time [s] as a reference attitude: of a `Target`, or of a quaternion (4,) of any length."""
+
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]; a quaternion's rates are its derivatives. Raises TypeError where it is neither."""
+        found = self.function(t)
+        if isinstance(found, Target):
+            return found
+        if jnp.shape(found) != (4,):
+            raise TypeError(
+                f"the reference function returns {found!r}, but must return a quaternion (4,), scalar last, or a Target"
+            )
+        return moving(lambda t: attitude.normalise(jnp.asarray(self.function(t))), t)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.rigid_body import spacecraft
+from ptsmc_jax.signals.references import TurningFunction
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 from ptsmc_jax.simulation.pointing import Pointing
 
@@ -37,11 +38,12 @@ class Setup:
     pointing: Pointing | None = None  # what pointing error indices are taken of
 
     def __post_init__(self) -> None:
-        """A plain function, or a lambda, is a disturbance and a reference too."""
+        """A plain function, or a lambda, is a disturbance and a reference too; an attitude may be its quaternion."""
         for name in ("disturbance", "reference"):
             value = getattr(self, name)
             if isinstance(value, FunctionType):
-                object.__setattr__(self, name, Function(value))
+                turning = name == "reference" and self.plant.attitude
+                object.__setattr__(self, name, TurningFunction(value) if turning else Function(value))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
         """The parts with another prescribed time [s]; the time after it is kept."""
@@ -51,12 +53,17 @@ class Setup:
     def with_inertia(self: _Setup, inertia: Any, *, known: bool = True) -> _Setup:
         """The parts of a spacecraft with another inertia [kg m^2], see `spacecraft`; traced ones too.
 
-        known: the law and the observer know it; else it is that of the truth alone.
+        known: the law and the observer know it; else it is that of the truth alone. Raises ValueError where a plant
+        has none.
         """
         body, moved = spacecraft(inertia), dict[str, Any](plant=self.plant)
         if known:
             both = {"controller": self.controller, "observer": self.observer}
             moved |= {name: part.model for name, part in both.items() if hasattr(part, "model")}
+        for name, plant in moved.items():
+            if not hasattr(plant, "with_inertia"):
+                of = "plant" if name == "plant" else f"model of the {name}"
+                raise ValueError(f"the {of} is a {type(plant).__name__}, but with_inertia goes with a spacecraft")
         changed = {name: plant.with_inertia(body.inertia, body.inertia_inverse) for name, plant in moved.items()}
         models = {name: replace(getattr(self, name), model=model) for name, model in changed.items() if name != "plant"}
         return replace(self, plant=changed["plant"], **models)

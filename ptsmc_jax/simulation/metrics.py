@@ -1,9 +1,12 @@
 """What a run is judged by, accumulated interval by interval inside the rollout: loops over the rows of `METRICS`."""
 
 from collections import namedtuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import core
 from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
@@ -15,6 +18,21 @@ class Metrics(namedtuple("Metrics", METRICS)):
     """Metrics of a run by name, scalars; units and meaning in `catalogues`. NaN: a metric that this run lacks."""
 
     __slots__ = ()
+
+    def __repr__(self) -> str:
+        """Those that the run has, a line each; of many runs, or traced ones, what stands for them."""
+        known = {name: value for name, value in self._asdict().items() if not _lacks(name, value)}
+        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in known.items())
+
+
+def _lacks(name: str, value: Any) -> bool:
+    """Whether no run has the metric; one that never settles has that one."""
+    return name != "settling_time" and not isinstance(value, core.Tracer) and bool(np.all(np.isnan(value)))
+
+
+def _shown(value: Any) -> str:
+    known = isinstance(value, core.Tracer) or np.ndim(value) > 0
+    return f"{type(value).__name__} {np.shape(value)}" if known else f"{float(value):.6g}"
 
 
 def begin(start: Start, criteria: Criteria) -> Running:

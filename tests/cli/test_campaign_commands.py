@@ -1,6 +1,7 @@
 """`ptsmc montecarlo`, `summarize`, `worst` and `replay` as a user calls them."""
 
 import json
+import re
 
 import jax
 import numpy as np
@@ -80,6 +81,15 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     assert told["0.9973"]["high"] is None  # 250 trials bound it on no side
     unsettled = rows["settling_time"].null_count()
     assert found["quantiles"]["settling_time"]["without_value"] == unsettled
+
+
+def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown):
+    assert not [said for said in summary(flown)["cautions"] if "the same flight" in said]
+    text = (tmp_path / "s.toml").read_text()
+    text = re.sub("attitude = .*", "", text).replace("noise = 2e-5", "noise = 0").replace("noise = 1e-6", "noise = 0")
+    (tmp_path / "same.toml").write_text(text)
+    _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
+    assert "CAUTION: all 250 trials are the same flight: nothing is drawn" in said
 
 
 def test_more_trials_add_to_what_is_there(command, flown):

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_sea
 from tests.output.pages import checked
 from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.scenario.bad_scenarios import check_sentence
-from tuning.cli import main
+from tuning.cli import main, options
 from tuning.output import sentences
 from tuning.studies import single, stability
 
@@ -145,6 +146,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict
+    assert "Its gains are those before the search" in read.text[read.text.index("Scenario") :]
     (verdict,) = summary["verdicts"]
     assert f"{100 * verdict['margin']:.3g} % of the limit" in read.text[: read.text.index("Requirements")]
 
@@ -202,7 +204,7 @@ WHOLE = "a whole number from 0 to 4294967295"
         (("simulate", "--loud"), ("--loud",)),
         (("tune", "--trial", "1"), ("--trial",)),
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
-        (("simulate", "s.toml", "t.toml"), ("t.toml",)),
+        (("simulate", "s.toml", "t.toml"), ("simulate does not take t.toml", "ptsmc simulate --help")),
         (("simulat",), ("simulat", "simulate, reproduce, map, margins, tune")),
         (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, margins, tune")),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
@@ -250,6 +252,23 @@ def test_the_papers_case_one_without_a_file(command, tmp_path):
     assert summary["peak_rate"] == pytest.approx(np.linalg.norm(rows[:, 5:8], axis=1).max(), rel=1e-12)
     momentum = np.linalg.norm(rows[:, 5:8] * [10.0, 12.0, 14.0], axis=1)
     assert summary["peak_momentum"] == pytest.approx(momentum.max(), rel=1e-12)
+
+
+def test_an_empty_file_is_said_to_be_the_papers_case(command, tmp_path):
+    (tmp_path / "none.toml").write_text("# to come\n")
+    status, _, said = command("simulate", "none.toml", "--quiet", "--no-figures")
+    assert (status, said) == (0, "ptsmc: none.toml says nothing: what flies is the paper's Case I\n")
+
+
+@pytest.mark.parametrize(("file", "name"), [
+    (None, "default"), ("mine.toml", "mine"), ("a/mine.toml", "mine"), ("tune-a/tuned.toml", "tune-a"),
+    ("b/../tune-b/tuned.toml", "tune-b"), ("tuned.toml", "here"),
+])  # fmt: skip
+def test_results_are_named_after_the_file_and_what_is_tuned_after_its_folder(tmp_path, monkeypatch, file, name):
+    here = tmp_path / "here"
+    (here / "b").mkdir(parents=True)
+    monkeypatch.chdir(here)
+    assert options.results(None if file is None else Path(file)) == name
 
 
 @pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.4700001'])

@@ -264,6 +264,14 @@ def test_a_star_tracker_without_a_gyro_is_said(hardware, said):
     assert bool(found) == said
 
 
+@pytest.mark.parametrize(("delay", "said"), [(0, False), (59, False), (60, True), (599, True)])
+def test_a_delay_that_is_likely_a_time_is_said(delay, said):
+    """From a tenth of t_f = 30 s on, 60 periods of 0.05 s."""
+    found = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"delay": delay}}))
+    known = f"hardware.delay is {delay}, which are {delay * 0.05:g} s: it counts control periods, of 0.05 s each"
+    assert found == [f"{known}, and no time"] * said
+
+
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
 def test_a_noise_that_no_star_tracker_has_is_said(noise, said):
     tables = {"loop": {"mode": "sampled"}, "hardware": {"attitude_noise": noise, "rate_noise": 0.0}}

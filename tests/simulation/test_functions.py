@@ -1,16 +1,20 @@
 """What those who know JAX expect: plain functions among the parts, names at the top, a late configure in a sentence."""
 
+import re
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.signals.disturbances import Sinusoid
-from ptsmc_jax.signals.references import Fixed
-from tests.helpers import parts
+from ptsmc_jax.signals.references import Fixed, Spin
+from ptsmc_jax.simulation import catalogues
+from tests.helpers import chain_parts, parts
 
 WAVE = Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
 
@@ -27,6 +31,40 @@ def test_a_lambda_is_a_disturbance_and_a_function_a_reference_under_jit():
                   period=0.1, flight=True)  # fmt: skip
     expected, found = (ptsmc.simulate_jit(run, np.uint32(0), np.uint32(0)).metrics for run in (wave, plain))
     np.testing.assert_allclose(found.window_error, expected.window_error, rtol=1e-9)
+
+
+def test_a_function_that_returns_a_quaternion_is_a_reference():
+    """Of any length; a turn about z at 0.02 rad/s is `Spin`, whose rates are written down."""
+    turn = Spin(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0, 0.0, 0.02]))
+
+    def reference(t):
+        return 2.0 * jnp.stack([0.0 * t, 0.0 * t, jnp.sin(0.01 * t), jnp.cos(0.01 * t)])
+
+    plain = parts(8.0, 3.0, 0.5, reference=reference)
+    for t in (0.0, 7.0):
+        for found, expected in zip(plain.reference(jnp.asarray(t)), turn(jnp.asarray(t)), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-16)  # some rounding of 0.02
+
+
+def test_what_is_no_attitude_and_what_has_no_inertia_is_refused_in_a_sentence():
+    wrong = parts(8.0, 3.0, 0.5, reference=lambda t: jnp.zeros(3))
+    with pytest.raises(TypeError, match=r"must return a quaternion \(4,\), scalar last, or a Target"):
+        wrong.reference(jnp.asarray(0.0))
+    with pytest.raises(ValueError, match="the plant is a Chain, but with_inertia goes with a spacecraft"):
+        chain_parts([1.0, 0.0]).with_inertia([1.0, 1.0, 1.0])
+
+
+def test_metrics_show_what_a_run_has():
+    run = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
+    found = ptsmc.simulate_jit(run, np.uint32(0), np.uint32(0)).metrics
+    shown = dict(line.split() for line in repr(found).splitlines())
+    assert set(shown) == set(catalogues.CATALOGUES["spacecraft"]) & set(shown)
+    assert {"window_error", "settling_time", "peak_momentum"} <= set(shown)
+    assert not {"peak_wheel_torque", "ape_x", "peak_modal"} & set(shown)
+    assert float(shown["window_error"]) == pytest.approx(float(found.window_error), rel=1e-5)
+    many = jax.tree.map(lambda v: jnp.stack([v, v]), found)
+    assert re.search(r"window_error +ArrayImpl \(2,\)", repr(many))
+    jax.jit(lambda metrics: repr(metrics) and metrics)(found)
 
 
 def test_the_names_that_everybody_needs_are_at_the_top():
@@ -46,3 +84,12 @@ def test_forgetting_configure_warns_and_calling_it_late_says_so_in_one_sentence(
     )
     assert "JAX computes with 32 bits here" in late
     assert late.splitlines()[-1].startswith("RuntimeError: configure() comes too late")
+
+
+def test_other_compiler_options_are_set_before_anything_runs_or_refused():
+    begin = "from ptsmc_jax.configure import configure\nimport jax, os\nconfigure(cache=None)\n"
+    run = "jax.numpy.zeros(3).block_until_ready()\n"
+    last = "print(os.environ['XLA_FLAGS'], file=__import__('sys').stderr)"
+    assert "than fast=False asks for" in said(begin + run + "configure(cache=None, fast=False)").splitlines()[-1]
+    assert said(begin + run + "configure(cache=None)\n" + last).strip() == said(begin + last).strip() != ""
+    assert said(begin + "configure(cache=None, fast=False)\n" + run + last).strip() == ""

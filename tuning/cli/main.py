@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
+from cyclopts.exceptions import UnusedCliTokensError
 
 import ptsmc_jax
 from tuning.cli import campaign_commands, flight_commands, searches, writing_commands
@@ -318,6 +319,8 @@ def main() -> None:
     status: object = None
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+    except UnusedCliTokensError as error:
+        _fail(_too_many(error))
     except CycloptsError as error:
         refused = error.__cause__  # of one of `options`' converters
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
@@ -334,6 +337,12 @@ def main() -> None:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _too_many(error: UnusedCliTokensError) -> str:
+    """What stands behind a command that takes less."""
+    command, unused = " ".join(error.command_chain or ()), " ".join(error.unused_tokens or ())
+    return f"{command} does not take {unused}; what it takes: ptsmc {command} --help"
 
 
 def _expected(error: ValueError) -> bool:

@@ -1,5 +1,6 @@
 """What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -48,7 +49,12 @@ ScenarioFile = Annotated[
 SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
-Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
+Out = Annotated[
+    Path | None,
+    Parameter(
+        help="Folder for the results; by default out/COMMAND-NAME, the file's name, of a tuned.toml its folder's name."
+    ),
+]
 Seed = Annotated[int, whole_number("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
@@ -134,10 +140,19 @@ def prepare(
         configure(device=device, bits=bits, keep_programs=True)
     except NoDeviceError as error:
         raise UsageError(f"--device is {device}, but {error}") from None
-    name = "default" if scenario is None else scenario.stem
     if scenario is not None:
+        from ptsmc_jax.scenario import parsing
         from tuning.search import own_parts
 
+        if not any(parsing.stated(loaded).values()):
+            print(f"ptsmc: {scenario} says nothing: what flies is the paper's Case I", file=sys.stderr)
         own_parts.allow_scenario(scenario, loaded, trust)
     loaded = reading.complete(loaded)
-    return loaded, out if out is not None else Path("out") / f"{command}-{name}"
+    return loaded, out if out is not None else Path("out") / f"{command}-{results(scenario)}"
+
+
+def results(scenario: Path | None) -> str:
+    """What results of a scenario are called; every search leaves a tuned.toml, told apart by its folder."""
+    if scenario is None:
+        return "default"
+    return scenario.resolve().parent.name or "tuned" if scenario.name == "tuned.toml" else scenario.stem

@@ -387,7 +387,8 @@ def _origin(result: Result) -> Iterator[Section]:
     versions = result.versions
     path = result.folder / "scenario.toml"
     if path.exists():
-        yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"))])
+        note = page_captions.SCENARIO.get(versions["command"], "")
+        yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"), note=note)])
     note = "Where the scenario above is the file scenario.toml." if path.exists() else ""
     yield Section("How to make this again", [Block("code", text=made_again.call(versions, result.scenario), note=note)])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]

@@ -5,6 +5,12 @@ MAP = (
     "factor up to which the loop is stable) and delay_margin [s] are those of the frozen loop at the hand-over, stable "
     "where the radius of its poles is below 1, and hold_radius, .. those in hold."
 )
+# under the scenario, by the command: whose gains it has
+SCENARIO = {
+    "tune": "Its gains are those before the search; the same scenario with the tuned ones is the file tuned.toml.",
+    "pareto": "Its gains are those before the search; those of each point stand in the table above.",
+    "compare": "Its gains are those before the search; those of each law stand above.",
+}
 CAPTIONS = {
     "history": "Gains and goal of every start over the steps of the descent.",
     "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",

@@ -122,8 +122,19 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_pointing(folder, parts, finished),
         "quantiles": found,
         "drivers": drivers,
-        "cautions": cautions.of(folder.scenario),
+        "cautions": [*cautions.of(folder.scenario), *_alike(found, done)],
     }
+
+
+def _alike(found: dict[str, Any], trials: int) -> list[str]:
+    """Whether every trial is the same flight, to round-off."""
+    known = [of for of in found.values() if "max" in of]
+    if trials < 2 or not known or any(abs(of["max"] - of["mean"]) > SAME * abs(of["max"]) for of in known):
+        return []
+    return [
+        f"all {trials} trials are the same flight: nothing is drawn in them, neither by [dispersion] nor as noise of "
+        "[hardware], and one would do"
+    ]
 
 
 def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, Any]:
