@@ -38,7 +38,7 @@ class Code:
     functions: list[str] = field(default_factory=list)  # their text
     calls: dict[str, str] = field(default_factory=dict)  # by stage
     about: dict[str, str] = field(default_factory=dict)  # what each stage does, of those of a sample
-    counts: dict[str, int] = field(default_factory=dict)  # operations of a step at most
+    counts: Counter[str] = field(default_factory=Counter)  # operations of a step at most
     derived: list[Field] = field(default_factory=list)  # what follows from parameters
     basis: list[Field] = field(default_factory=list)  # the parameters that it follows from
     derivation: str = ""  # the text of the function that does
@@ -116,66 +116,62 @@ def names_of(board: Board) -> dict[str, list[str]]:
     return columns(*(list(structs[name].fields.values()) for name in ("in", "before", "out")))
 
 
+# of what a stage reads and writes, by the first part of its name: its struct, and what C has before the field's name
+STRUCTS = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
+PLACES = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
+
+
 def _function(
     code: Code, board: Board, stage: Stage, structs: dict[str, Struct], trees: dict[str, Any],
     known: parameters.Parameters,
 ) -> None:  # fmt: skip
-    pool = Pool()
-    read = [_shape_of(board, name) for name in stage.reads]
+    """Adds the function of a stage to the code."""
+
+    def fields_of(name: str) -> list[Field]:
+        prefix, _, key = name.partition(".")
+        made = structs[STRUCTS[prefix]].fields
+        return [made[leaf] for leaf in jax.tree.leaves(trees[f"{STRUCTS[prefix]}.{key}"])]
 
     def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
         return stage.run(known.tree(leaves), *read)
 
-    closed, shape = jax.make_jaxpr(run, return_shape=True)(known.leaves, read)
-    places: dict[str, str] = {}  # of what C reads: the pointer or argument
+    pool, places = Pool(), dict[str, str]()  # places: of what C reads, the pointer or argument
+    closed, shape = jax.make_jaxpr(run, return_shape=True)(known.leaves, [_shape_of(board, n) for n in stage.reads])
     args = known.nodes(pool, places)
     for name in stage.reads:
-        prefix, _, key = name.partition(".")
         if name in SCALARS:
-            kind = "int32_t" if name in ("regular", "tracking") else "real"
-            node = pool.place(name, kind)
+            node = pool.place(name, "int32_t" if name in ("regular", "tracking") else "real")
             places[name] = name
             args.append(np.array(node, dtype=object).reshape(()))
             continue
-        text = {"in": "in->", "before": "before->", "last": "before->last.", "now": "now->", "out": "out->"}[prefix]
-        struct = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}[prefix]
+        prefix = name.partition(".")[0]
         pointer = "before" if prefix == "last" else prefix
-        for leaf in jax.tree.leaves(trees[f"{struct}.{key}"]):
-            args.append(parameters.nodes_of(pool, text, structs[struct].fields[leaf], places, pointer))
-    results = Translator(pool).evaluate(closed, args)
-    outputs: list[tuple[str, Node]] = []
-    writes: set[str] = set()
-    returned: Node | None = None
-    for (name, part), result in zip(_named(shape), results, strict=True):
-        prefix, _, key = name.partition(".")
+        args += [parameters.nodes_of(pool, PLACES[prefix], made, places, pointer) for made in fields_of(name)]
+    results = iter(Translator(pool).evaluate(closed, args))
+    ends, returned, writes = list[tuple[str, Node]](), list[tuple[str, Node]](), set[str]()
+    for name in sorted(shape):  # JAX's order of a dict
         if name == "limited":
-            returned = result.item()
+            returned.append(("return", next(results).item()))
             continue
-        struct = "before" if prefix == "now" else "out"
-        made = structs[struct].fields[jax.tree.leaves(trees[f"{struct}.{key}"])[part]]
+        prefix = name.partition(".")[0]
         writes.add(prefix)
-        flat, title = result.reshape(-1), Title(made.name)
-        for index, node in np.ndenumerate(result):
-            if node.op == "variable" and node.title is None:
-                node.title, node.part = title, "".join(str(i + 1) for i in index)
-        outputs += [(f"{prefix}->{element}", node) for element, node in zip(made.elements(), flat, strict=True)]
+        for made, result in zip(fields_of(name), results, strict=False):  # as many as it has
+            _titled(result, made.name)
+            ends += [
+                (PLACES[prefix] + element, node) for element, node in zip(made.elements(), result.flat, strict=True)
+            ]
     printer = printing.Printer(ARGUMENTS)
-    ends = [*outputs, *([("return", returned)] if returned is not None else [])]
-    body = printer.body(pool.block, ends)
+    body = [line.replace("return = ", "return ") for line in printer.body(pool.block, [*ends, *returned])]
     needed = {places[node.value] for node in printer.nodes.values() if node.op == "place"} | writes
     known.use(printer)
-    signature = [POINTERS[name] for name in POINTERS if name in needed]
-    signature += [ARGUMENTS[name] for name in ARGUMENTS if name in needed]
-    passed = [PASSED.get(name, name) for name in (*POINTERS, *ARGUMENTS) if name in needed]
-    body = [line.replace("return = ", "return ") for line in body]
-    kind = "int" if returned is not None else "void"
-    head = printing.wrapped(f"static {kind} {stage.name}({', '.join(signature)})", "")
+    arguments = {name: text for name, text in (POINTERS | ARGUMENTS).items() if name in needed}
+    kind = "int" if returned else "void"
+    head = printing.wrapped(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
     code.functions.append("\n".join([*_documents(stage), *head, "{", *_shortened(body), "}"]))
     if stage.name != "begin":
         code.about[stage.name] = stage.about
-    code.calls[stage.name] = f"{stage.name}({', '.join(passed)})"
-    for op, count in printer.counts.items():
-        code.counts[op] = code.counts.get(op, 0) + count
+    code.calls[stage.name] = f"{stage.name}({', '.join(PASSED.get(name, name) for name in arguments)})"
+    code.counts.update(printer.counts)
     code.variables = max(code.variables, len(printer.names))
 
 
@@ -205,9 +201,12 @@ def _shape_of(board: Board, name: str) -> Any:
             "out": board.outputs}[prefix][key]  # fmt: skip
 
 
-def _named(shape: dict[str, Any]) -> list[tuple[str, int]]:
-    """For each leaf of what a stage gives, in JAX's order: the name of its tree, and which leaf of it it is."""
-    return [(name, k) for name in sorted(shape) for k in range(len(jax.tree.leaves(shape[name])))]
+def _titled(result: np.ndarray, name: str) -> None:
+    """Gives variables of branches and loops that have no name of their own that of the field which they are for."""
+    title = Title(name)
+    for index, node in np.ndenumerate(result):
+        if node.op == "variable" and node.title is None:
+            node.title, node.part = title, "".join(str(i + 1) for i in index)
 
 
 def _documents(stage: Stage) -> list[str]:
