@@ -88,7 +88,7 @@ def shapes(tree: Any) -> Any:
 def board(parts: Parts) -> Board:
     """The flight computer of parts whose loop is sampled."""
     observer, law, device = parts.observer, parts.controller, parts.actuators
-    period = parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    period = parts.period
     parameters = {
         "law": law,
         "reference": parts.reference,

@@ -47,7 +47,7 @@ class Controller:
     @property
     def period(self) -> float:
         """Of control [s]."""
-        return float(self.ready.parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        return float(self.ready.parts.period)
 
 
 def flown(scenario: Scenario) -> Scenario:

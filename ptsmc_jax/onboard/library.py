@@ -152,7 +152,7 @@ class InTheLoop:
                     f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
-        period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+        period = float(parts.period)
         if library.period != period:
             raise ScenarioError(
                 f"loop.period is {period:g} s, but must be {library.period:g} s, that of the controller in "

@@ -138,7 +138,7 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
     own, zero = parts.sensors.own, jnp.zeros(())
     x = parts.controller.align(parts.initial, parts.reference(zero))
     memory = ask("begin", own.begin, x)
-    period = jnp.asarray(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    period = jnp.asarray(parts.period)
     returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ask.refused("see", _described(returned), "the state as seen and its memory")
@@ -173,7 +173,7 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
 def _observer(parts: Parts, ask: _Asked) -> None:
     observer, m = parts.observer, parts.plant.inputs
     memory = ask("begin", observer.begin)
-    period = jnp.asarray(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    period = jnp.asarray(parts.period)
     kept = ask("step", observer.step, memory, jnp.zeros(m), period, period)
     ask.same_memory("step", memory, kept)
     ask.check("estimate", "an estimate", ask("estimate", observer.estimate, kept), (m,))
@@ -185,7 +185,7 @@ def _law(parts: Parts, ask: _Asked) -> None:
     zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
     target = parts.reference(zero)
     x = law.align(parts.initial, target)
-    now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.period))
     k2, memory = parts.observer.error_bound()(zero), ask("begin", law.begin)
     methods = {
         "command": (law.command, (memory, now, x, target, jnp.zeros(m), k2)),

@@ -81,6 +81,12 @@ class Parts(Setup):
     clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
 
+    @property
+    def period(self) -> Any:
+        """The control period of a sampled loop [s]."""
+        clock: Any = self.clock
+        return clock.period
+
     def with_t_f(self, t_f: Leaf) -> "Parts":
         """The parts with another prescribed time [s]; the time after it is kept."""
         moved = super().with_t_f(t_f)

@@ -69,7 +69,7 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
     length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
     partial_before = jnp.concatenate([jnp.zeros(1), ticks.noise_weight[:-1]]) < 1.0
     # the observer's matrix for a whole period and for the partial first one, outside the loop
-    matrix = parts.observer.update_matrix(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    matrix = parts.observer.update_matrix(parts.period)
     first_length = jnp.sum(jnp.where(ticks.noise_weight < 1.0, lengths, 0.0))
     first_matrix = parts.observer.update_matrix(first_length)
 
@@ -128,7 +128,7 @@ def command(
     """The law's torque (m,) [N m], its sliding variable and its memory; k2: its K2(t) [s]."""
     now, flown = period.now, period.length > 0.0
     # a length that one may divide by, also in a period that is none
-    sample = Sample(now.t, now.hold, jnp.where(flown, period.length, parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+    sample = Sample(now.t, now.hold, jnp.where(flown, period.length, parts.period))
     u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
     return u, s, _kept(flown, memory, computer.law)
 

@@ -61,8 +61,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         own_sensors = replace(parts.sensors.own, **of_sensors(gains))
         parts = replace(parts, sensors=replace(parts.sensors, own=own_sensors))
     if "filter_bandwidth" in gains:
-        known: Any = parts
-        sensors = known.sensors.with_bandwidth(gains["filter_bandwidth"], known.clock.period)
+        sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.period)
         parts = replace(parts, sensors=sensors)
     if "command_corner" in gains:
         assert parts.command_filter is not None  # `_check_names`
@@ -123,7 +122,7 @@ def gains_of(parts: Parts) -> dict[str, float]:
     for name in _tunable_of_sensors(parts):
         gains[SENSORS + name] = float(getattr(parts.sensors.own, name))
     if getattr(parts.sensors, "filter", None) is not None:
-        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.clock.period))  # pyright: ignore[reportAttributeAccessIssue]
+        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.period))
     if parts.command_filter is not None:
         gains["command_corner"] = float(parts.command_filter.corner)
     return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}

@@ -36,8 +36,28 @@ class Metric:
     may_lack: bool = False  # a run that is finite may end with NaN
 
 
-def _largest(torques: tuple[Array, ...]) -> Array:
+def _peak(
+    during: Callable[[Interval], Array | None], at_start: Callable[[Start], Array | None] | None = None
+) -> Metric:
+    """The largest of what there is at t = 0, by default 0, and in every interval; None: the run lacks it."""
+
+    def begin(start: Start, criteria: Criteria) -> Array:
+        first = jnp.zeros_like(criteria.t_f) if at_start is None else at_start(start)
+        return jnp.full_like(criteria.t_f, jnp.nan) if first is None else first
+
+    def update(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+        present = during(interval)
+        return largest if present is None else jnp.maximum(largest, present)
+
+    return Metric(begin, update)
+
+
+def _largest_of(torques: tuple[Array, ...]) -> Array:
     return jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques]))
+
+
+def _size(of_wheels: Array | None) -> Array | None:
+    return None if of_wheels is None else jnp.max(jnp.abs(of_wheels))
 
 
 def _effort(effort: Array, interval: Interval, criteria: Criteria) -> Array:
@@ -86,11 +106,6 @@ def _chattering(variation: Array, running: Running, criteria: Criteria) -> Array
     return jnp.max(variation) / jnp.where(still > 0.0, still, 1.0)
 
 
-def _wheels_at_start(start: Start, criteria: Criteria) -> Array:
-    zero, stored = jnp.zeros_like(criteria.t_f), start.wheel_momentum
-    return jnp.full_like(zero, jnp.nan) if stored is None else jnp.max(jnp.abs(stored))
-
-
 def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     """Integral of angle^2 over the window so far; an angle has a kink where it is zero: by the mean of both ends."""
     start, end = interval.start.angle, interval.end.angle
@@ -100,26 +115,6 @@ def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: C
 
 def _hold_angle(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, interval.end.angle), largest)
-
-
-def _wheel_torque(largest: Array, interval: Interval, criteria: Criteria) -> Array:
-    torque = interval.wheel_torque
-    return largest if torque is None else jnp.maximum(largest, jnp.max(jnp.abs(torque)))
-
-
-def _wheels(largest: Array, interval: Interval, criteria: Criteria) -> Array:
-    stored = interval.wheel_momentum
-    return largest if stored is None else jnp.maximum(largest, jnp.max(jnp.abs(stored)))
-
-
-def _ringing_at_start(start: Start, criteria: Criteria) -> Array:
-    ringing = start.snapshot.ringing
-    return jnp.full_like(criteria.t_f, jnp.nan) if ringing is None else ringing
-
-
-def _ringing(largest: Array, interval: Interval, criteria: Criteria) -> Array:
-    ringing = interval.end.ringing
-    return largest if ringing is None else jnp.maximum(largest, ringing)
 
 
 def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -> Array:
@@ -226,6 +221,7 @@ def _pointing_rows() -> dict[str, Metric]:
     return found
 
 
+_RINGING = _peak(lambda interval: interval.end.ringing, lambda start: start.snapshot.ringing)
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
@@ -242,12 +238,8 @@ METRICS = {
     "hold_angle": Metric(
         update_after_t_f=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
     ),
-    "peak_torque": Metric(
-        update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.commanded))
-    ),
-    "peak_torque_delivered": Metric(
-        update=lambda largest, interval, criteria: jnp.maximum(largest, _largest(interval.delivered))
-    ),
+    "peak_torque": _peak(lambda interval: _largest_of(interval.commanded)),
+    "peak_torque_delivered": _peak(lambda interval: _largest_of(interval.delivered)),
     "saturated": Metric(
         update=lambda limited_for, interval, criteria: limited_for + interval.length * interval.limited,
         value=lambda limited_for, run, criteria: jnp.where(
@@ -264,19 +256,16 @@ METRICS = {
     "chattering": Metric(
         begin=lambda start, criteria: jnp.zeros(start.inputs), update_after_t_f=_variation, value=_chattering
     ),
-    "peak_rate": Metric(
-        begin=lambda start, criteria: start.snapshot.rate,
-        update=lambda largest, interval, criteria: jnp.maximum(largest, interval.end.rate),
+    "peak_rate": _peak(lambda interval: interval.end.rate, lambda start: start.snapshot.rate),
+    "peak_momentum": _peak(lambda interval: interval.end.momentum, lambda start: start.snapshot.momentum),
+    "peak_wheel_momentum": _peak(
+        lambda interval: _size(interval.wheel_momentum), lambda start: _size(start.wheel_momentum)
     ),
-    "peak_momentum": Metric(
-        begin=lambda start, criteria: start.snapshot.momentum,
-        update=lambda largest, interval, criteria: jnp.maximum(largest, interval.end.momentum),
+    "peak_wheel_torque": _peak(
+        lambda interval: _size(interval.wheel_torque),
+        lambda start: None if start.wheel_momentum is None else jnp.zeros_like(start.snapshot.angle),
     ),
-    "peak_wheel_momentum": Metric(begin=_wheels_at_start, update=_wheels),
-    "peak_wheel_torque": Metric(
-        begin=lambda start, criteria: 0.0 * _wheels_at_start(start, criteria), update=_wheel_torque
-    ),
-    "peak_modal": Metric(begin=_ringing_at_start, update=_ringing),
-    "residual_modal": Metric(begin=_ringing_at_start, update=_ringing_after_t_f),
+    "peak_modal": _RINGING,
+    "residual_modal": replace(_RINGING, update=_ringing_after_t_f),
     **_pointing_rows(),
 }

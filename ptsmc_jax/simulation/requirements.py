@@ -5,7 +5,8 @@ On metrics of what is flown, and on margins of its loop, most of which are to be
 
 import bisect
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -92,85 +93,50 @@ class Verdict:
         least = must_keep(self.trials, self.quantile, self.confidence)
         return least is not None and self.trials - self.failures >= least
 
+    @classmethod
+    def read(cls, told: Mapping[str, Any]) -> "Verdict":
+        """A verdict as `summary.json` has it, where null stands for a number that is not finite."""
+        known = {field.name: told[field.name] for field in fields(cls) if told.get(field.name) is not None}
+        return cls(**{"worst": math.nan, "margin": math.nan, **known})
+
     def __str__(self) -> str:
-        if self.share_of_time is not None:
-            assert self.quantile is not None
-            return time_text(
-                self.metric, self.limit, self.unit, self.quantile, self.confidence, self.interpretation,
-                self.share_of_time, self.shown, self.failures, self.trials, met=self.met,
-            )  # fmt: skip
-        return verdict_text(
-            self.metric,
-            self.limit,
-            self.unit,
-            self.worst,
-            self.failures,
-            self.trials,
-            self.quantile,
-            self.confidence,
-            at_least=self.at_least,
-        )
+        """In one line."""
+        return self._of_trials() if self.share_of_time is None else self._of_time(self.share_of_time)
 
+    def _of_time(self, share: float) -> str:
+        assert self.quantile is not None
+        most = f"{self.limit:g} {self.unit}{_in_degrees(self.limit, self.unit)}"
+        wanted = f"{self.metric} at most {most} in {100 * self.quantile:g} % of {INTERPRETATIONS[self.interpretation]}"
+        met = "met" if self.met else "NOT met"
+        if self.interpretation == "temporal":
+            beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
+            return f"{wanted}: the least of a run is {100 * share:.6g} %: {met}{beyond}"
+        seen = f"{100 * share:.6g} %"
+        if self.confidence is not None and self.shown is not None:
+            seen += f", at least {100 * self.shown:.6g} % at {100 * self.confidence:g} % confidence"
+        return f"{wanted}: {seen}: {met}"
 
-def time_text(
-    metric: str,
-    limit: float,
-    unit: str,
-    probability: float,
-    confidence: float | None,
-    interpretation: str,
-    share_of_time: float,
-    shown: float | None,
-    failures: int,
-    trials: int,
-    *,
-    met: bool,
-) -> str:
-    """The verdict on a limit that is to be kept for a share of the time, in one line; see `Verdict`."""
-    most = f"{limit:g} {unit}{_in_degrees(limit, unit)}"
-    wanted = f"{metric} at most {most} in {100 * probability:g} % of {INTERPRETATIONS[interpretation]}"
-    if interpretation == "temporal":
-        seen = f"the least of a run is {100 * share_of_time:.6g} %"
-        beyond = "" if met or trials == 1 else f", {failures} of {trials} runs have less"
-        return f"{wanted}: {seen}: {'met' if met else 'NOT met'}{beyond}"
-    seen = f"{100 * share_of_time:.6g} %"
-    if confidence is not None and shown is not None:
-        seen += f", at least {100 * shown:.6g} % at {100 * confidence:g} % confidence"
-    return f"{wanted}: {seen}: {'met' if met else 'NOT met'}"
-
-
-def verdict_text(
-    metric: str,
-    limit: float,
-    unit: str,
-    worst: float | None,
-    failures: int,
-    trials: int,
-    quantile: float | None = None,
-    confidence: float | None = None,
-    *,
-    at_least: bool = False,
-) -> str:
-    """A verdict in one line; worst: None or NaN where a trial failed or has no value, or is infinite."""
-    wanted = f"{metric} at {'least' if at_least else 'most'} {limit:g} {unit}".rstrip(" -") + _in_degrees(limit, unit)
-    if quantile is not None:
-        wanted += f" in {100 * quantile:g} % of trials"
-        wanted += f" with {100 * confidence:g} % confidence" if confidence is not None else ""
-    if at_least and not failures and (worst is None or math.isinf(worst)):
-        seen = "unlimited"  # an infinite margin, which JSON has no number for
-    elif worst is None or worst != worst:
-        seen = "no value" if trials == 1 else "no worst value"
-    else:
-        seen = ("worst " if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, unit)
-    least = must_keep(trials, quantile, confidence)
-    if least is None:
-        assert quantile is not None
-        assert confidence is not None
-        return f"{wanted}: {seen}: NOT shown, which takes at least {fewest_trials(quantile, confidence)} trials"
-    if trials - failures >= least:
-        return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} trials" if failures else "")
-    allowed = f", at most {trials - least} allowed" if trials > least else ""
-    return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} trials{allowed}" if trials > 1 else "")
+    def _of_trials(self) -> str:
+        failures, trials, worst = self.failures, self.trials, self.worst
+        wanted = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
+        wanted += _in_degrees(self.limit, self.unit)
+        if self.quantile is not None:
+            wanted += f" in {100 * self.quantile:g} % of trials"
+            wanted += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
+        if self.at_least and not failures and not math.isfinite(worst):
+            seen = "unlimited"  # an infinite margin, which JSON has no number for
+        elif math.isnan(worst):
+            seen = "no value" if trials == 1 else "no worst value"
+        else:
+            seen = ("worst " if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, self.unit)
+        least = must_keep(trials, self.quantile, self.confidence)
+        if least is None and self.quantile is not None and self.confidence is not None:
+            few = fewest_trials(self.quantile, self.confidence)
+            return f"{wanted}: {seen}: NOT shown, which takes at least {few} trials"
+        if self.met:
+            return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} trials" if failures else "")
+        allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
+        return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} trials{allowed}" if trials > 1 else "")
 
 
 def _in_degrees(value: float, unit: str) -> str:

@@ -151,7 +151,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     def late(t: Scalar, sample: Array) -> Scalar:
         """By how much a sample comes after its time t [s]; the first and the end of the run are where they are."""
         assert parts.jitter is not None
-        most = jnp.minimum(parts.jitter * parts.clock.period, jnp.minimum(t, parts.t_end - t) / 2.0)  # pyright: ignore[reportAttributeAccessIssue]
+        most = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return most * (2.0 * draws.uniforms(jitter, 1, sample)[0] - 1.0)
 
     def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
@@ -344,7 +344,7 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
         if world is None:
             u, s = parts.controller.torque(criteria.t_end, hold, *about)
         else:  # the input is held
-            sample = Sample(criteria.t_end, hold, parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+            sample = Sample(criteria.t_end, hold, parts.period)
             _, s, _ = parts.controller.command(world.computer.law, sample, *about)
             u = state.u
         pushed = None if world is None else world.pushed

@@ -55,7 +55,7 @@ def _mean_width(width: float, sigma: float) -> float:
 def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     """Of z, the commands on their way, the sensor's own states and the random walk's torque, sample by sample."""
     ticks = jax.tree.map(np.asarray, run.period.now)
-    h = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    h = float(parts.period)
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * h)
     rows: Any = linear.opened_in(parts, run, lasting)
     loops = rows.loop

@@ -293,7 +293,7 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
 
 def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
-    ticks, period = run.period.now, parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    ticks, period = run.period.now, parts.period
     whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
     ruled = ticks.hold if hold else ~parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
     return np.flatnonzero(whole & np.asarray(ruled))

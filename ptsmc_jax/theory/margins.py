@@ -252,7 +252,7 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
     next; to where the loop takes as long to settle as it has left. They move with t_f and delta, and with them slopes.
     """
     law = parts.controller
-    shortest = jnp.maximum(law.delta, SLOWEST * parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    shortest = jnp.maximum(law.delta, SLOWEST * parts.period)
     longest = jnp.maximum(SHARE * law.t_f, shortest)
     return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
 
@@ -317,7 +317,7 @@ judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
     kept, run = judged_times(parts), linear.nominal_jit(parts)
-    period = float(parts.clock.period)  # pyright: ignore[reportAttributeAccessIssue]
+    period = float(parts.period)
     found = at(parts, jnp.append(kept, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
     known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}
     order = np.asarray([k for _, k in sorted(known.items())] + [len(found.t) - 1])

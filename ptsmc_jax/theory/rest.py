@@ -40,7 +40,7 @@ class History(NamedTuple):
 def whole(parts: Parts, run: linear.Nominal) -> Array:
     """Which periods of a run are whole ones, (periods,) bool; of times in [s]."""
     ticks = run.period.now
-    return ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.clock.period  # pyright: ignore[reportAttributeAccessIssue]
+    return ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.period
 
 
 def history(parts: Parts, run: linear.Nominal) -> History:

@@ -12,7 +12,7 @@ import pytest
 from ptsmc_jax import explore, programs, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.requirements import Requirement, over, verdict_text
+from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins
 from tests.helpers import short
 from tuning.search import margin_rows
@@ -63,7 +63,7 @@ def test_a_margin_is_to_be_at_least_its_limit(value, met, over, tmp_path):
     assert str(verdict).startswith("gain_margin at least 6 dB")
     store.write_json(tmp_path / "kept.json", {"worst": verdict.worst})
     kept = json.loads((tmp_path / "kept.json").read_text())["worst"]  # null where infinite
-    read = verdict_text(verdict.metric, verdict.limit, "dB", kept, verdict.failures, 1, at_least=True)
+    read = str(Verdict.read({**dataclasses.asdict(verdict), "worst": kept}))
     assert read == str(verdict)
     assert ("unlimited" in read) == np.isinf(value)
 

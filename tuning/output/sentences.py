@@ -7,22 +7,15 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import pointing_sentences
 from tuning.output.cells import Summary, Table
 
-TIMED = ("metric", "limit", "unit", "quantile", "confidence", "interpretation", "share_of_time", "shown", "failures",
-         "trials")  # of a verdict on a share of the time  # fmt: skip
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
 
 def verdict(told: Summary) -> str:
     """A verdict in one line; over many trials with the share of them that keeps the limit."""
-    from ptsmc_jax.simulation.requirements import time_text, verdict_text
+    from ptsmc_jax.simulation.requirements import Verdict
 
-    if told.get("share_of_time") is not None:
-        shares = (told[name] for name in TIMED)
-        return time_text(*shares, met=told["met"])
-    fields = ("metric", "limit", "unit", "worst", "failures", "trials", "quantile", "confidence")
-    values: list[Any] = [told.get(field) for field in fields]
-    text = verdict_text(*values, at_least=told.get("at_least", False))
-    if "share_interval" not in told:
+    text = str(Verdict.read(told))
+    if told.get("share_of_time") is not None or "share_interval" not in told:
         return text
     low, high = told["share_interval"]
     text += f"; {100 * told['share']:.6g} % of trials keep the limit (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
