@@ -26,7 +26,7 @@ from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
-from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -162,14 +162,9 @@ def finished(frame: pl.DataFrame) -> np.ndarray:
     return frame["status"].is_in([rollout.STATUS[code][0] for code in rollout.FINISHED]).to_numpy()
 
 
-def verdicts(requirements: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
+def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
     """One for each requirement over these rows; a failed trial breaks every one."""
-    ok = finished(frame)
-
-    def column(name: str | None) -> np.ndarray | None:
-        return None if name is None else frame[name].to_numpy().astype(float)
-
-    return [r.verdict(frame[r.metric].to_numpy().astype(float), ok, column(r.timed)) for r in requirements]
+    return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), finished(frame))
 
 
 def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:

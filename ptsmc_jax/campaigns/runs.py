@@ -15,7 +15,7 @@ from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
-from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.catalogues import Entry
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Verdict
@@ -98,10 +98,7 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     status, reason = rollout.STATUS[int(result.status)]
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
     finished = np.asarray(int(result.status) in rollout.FINISHED)
-    verdicts = [
-        r.verdict(np.asarray(metrics[r.metric]), finished, None if r.timed is None else np.asarray(metrics[r.timed]))
-        for r in ready.requirements
-    ]
+    verdicts = requirements.verdicts(ready.requirements, metrics.__getitem__, finished)
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
 
 

@@ -15,8 +15,6 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 Scalar = Float[Array, ""]
-
-
 Vector = Float[Array, " m"]
 
 

@@ -24,10 +24,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 
 Scalar = Float[Array, ""]
 
-
 ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
-
-
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
 
 

@@ -14,29 +14,15 @@ from jaxtyping import Array, Float
 from ptsmc_jax.simulation.rollout import Parts
 
 Numbers = Float[Array, " n"]
-
-INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
-
-
-INERTIA, REFERENCE = "inertia", "reference"
-
-
-DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
-
-
-DISTURBANCE_BIAS = "disturbance_bias"
-
-
-FARTHEST = 3.0  # standard deviations of what is truncated, at most
-
-
 Drawn = Literal["uniform", "normal"]
-
-
-OWN = "own"
-
-
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
+
+# names of what is drawn, and of the streams that it is drawn from
+INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
+INERTIA, REFERENCE, OWN = "inertia", "reference", "own"
+DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
+DISTURBANCE_BIAS = "disturbance_bias"
+FARTHEST = 3.0  # standard deviations of what is truncated, at most
 
 
 class UnfitError(ValueError):

@@ -23,8 +23,6 @@ from ptsmc_jax.signals.references import Target
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
-
-
 State = Float[Array, " twice"]
 
 

@@ -30,11 +30,7 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> An
 
 
 _TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
-
-
 _DOUBLINGS = 40  # norms up to 2^39
-
-
 _FEW = 4  # of them
 
 

@@ -15,7 +15,6 @@ Memory = Float[Array, " memory"]
 Scalar = Float[Array, ""]
 Vector = Float[Array, " m"]
 
-
 # Largest |e| at the next zero of e0 over that at the last one, for |d'| <= 0, 0.1 .. 1 times c and the worst d': it
 # slows e down while |e0| grows and speeds it up while it falls (found by integration, checked in the tests).
 _OVERSHOOT = (0.159, 0.185, 0.212, 0.240, 0.270, 0.301, 0.336, 0.374, 0.417, 0.470, 0.538)

@@ -67,30 +67,9 @@ def _select(pool: Pool, params: Any, kind: str, which: Node, *cases: Node) -> No
     return chosen
 
 
-def _clamp(pool: Pool, params: Any, kind: str, low: Node, x: Node, high: Node) -> Node:
-    return pool.make("min", pool.make("max", x, low, kind=kind), high, kind=kind)
-
-
 def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     even = "EVEN" in str(params["rounding_method"]) or int(params["rounding_method"]) == 1
     return pool.make("rint" if even else "round", x)
-
-
-def _rem(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
-    return pool.make("fmod" if kind == REAL else "rem", a, b, kind=kind)
-
-
-def _logistic(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    one = pool.constant(1.0, REAL)
-    return pool.make("div", one, pool.make("add", one, pool.make("exp", pool.make("neg", x))))
-
-
-def _rsqrt(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    return pool.make("div", pool.constant(1.0, REAL), pool.make("sqrt", x))
-
-
-def _square(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    return pool.make("mul", x, x, kind=kind)
 
 
 def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
@@ -99,12 +78,8 @@ def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     return power(pool, x, params["y"])
 
 
-def _pow(pool: Pool, params: Any, kind: str, x: Node, y: Node) -> Node:
-    return pool.make("pow", x, convert(pool, REAL, y))
-
-
-def _same(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    return x
+def _one_over(pool: Pool, x: Node) -> Node:
+    return pool.make("div", pool.constant(1.0, REAL), x)
 
 
 ELEMENTWISE: dict[str, Callable] = {
@@ -117,9 +92,18 @@ ELEMENTWISE: dict[str, Callable] = {
     "nextafter": _plain("nextafter"),
     "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),
     "and": _logical("and"), "or": _logical("or"), "not": _logical("not"), "xor": _xor,
-    "add_any": _plain("add"), "pow": _pow, "integer_pow": _integer_pow, "square": _square, "rsqrt": _rsqrt,
-    "select_n": _select, "clamp": _clamp, "round": _round, "rem": _rem, "logistic": _logistic,
+    "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
+    "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
+    "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
+    "rsqrt": lambda pool, params, kind, x: _one_over(pool, pool.make("sqrt", x)),
+    "clamp": lambda pool, params, kind, low, x, high: pool.make(
+        "min", pool.make("max", x, low, kind=kind), high, kind=kind
+    ),
+    "rem": lambda pool, params, kind, a, b: pool.make("fmod" if kind == REAL else "rem", a, b, kind=kind),
+    "logistic": lambda pool, params, kind, x: _one_over(
+        pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
+    ),
     "convert_element_type": lambda pool, params, kind, x: convert(pool, kind, x),
-    "stop_gradient": _same, "copy": _same, "copy_p": _same, "reduce_precision": _same, "optimization_barrier": _same,
-    "pvary": _same,
+    **dict.fromkeys("stop_gradient copy copy_p reduce_precision optimization_barrier pvary".split(),
+                    lambda pool, params, kind, x: x),
 }  # fmt: skip

@@ -25,8 +25,6 @@ from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
 LONGEST_KEY = 100  # characters
-
-
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 # a dotted key without end, for which the parser would take memory by the square of its length
 _DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")

@@ -31,7 +31,6 @@ Interval = Annotated[tuple[float, float], Meta(description="two numbers, the low
 Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 
-
 MOST_STEPS = 200_000  # of a run
 
 

@@ -5,7 +5,7 @@ On metrics of what is flown, and on margins of its loop, most of which are to be
 
 import bisect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -225,3 +225,8 @@ class Requirement:
             share_of_time=least,
             shown=shown,
         )
+
+
+def verdicts(asked: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:
+    """One for each requirement on what is flown; values: of a metric, by its name, of one run or of many."""
+    return [r.verdict(values(r.metric), finished, None if r.timed is None else values(r.timed)) for r in asked]

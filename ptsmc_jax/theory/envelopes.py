@@ -13,7 +13,6 @@ from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
 
-
 GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): what the smooth sign gives away per component, in units of its width
 
 

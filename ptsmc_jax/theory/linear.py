@@ -291,12 +291,17 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
+def whole(parts: Parts, run: Nominal) -> Array:
+    """Which periods of a run are whole ones, (periods,) bool; of times in [s]."""
+    ticks = run.period.now
+    return ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.period
+
+
 def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
-    ticks, period = run.period.now, parts.period
-    whole = np.asarray(ticks.t_next - ticks.t) > (1.0 - 1e-6) * float(period)
+    ticks = run.period.now
     ruled = ticks.hold if hold else ~parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
-    return np.flatnonzero(whole & np.asarray(ruled))
+    return np.flatnonzero(np.asarray(whole(parts, run) & ruled))
 
 
 def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:

@@ -37,15 +37,9 @@ class History(NamedTuple):
     in_hold: Array  # (periods,) bool: whole periods in hold
 
 
-def whole(parts: Parts, run: linear.Nominal) -> Array:
-    """Which periods of a run are whole ones, (periods,) bool; of times in [s]."""
-    ticks = run.period.now
-    return ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.period
-
-
 def history(parts: Parts, run: linear.Nominal) -> History:
     """The commands [N m] of a nominal run."""
-    return History(run.command, whole(parts, run) & run.period.now.hold)
+    return History(run.command, linear.whole(parts, run) & run.period.now.hold)
 
 
 class Swing(NamedTuple):

@@ -17,8 +17,6 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.simulation.assembly import Setup
 
 Scalar = Float[Array, ""]
-
-
 Vector = Float[Array, " n"]
 
 

@@ -6,38 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from tuning.output import pointing_sentences, sentences, terminal
-from tuning.output.progress_lines import Lines
+from tuning.output.progress_lines import Bar
 
 
-class Progress:
-    """A progress bar on the error stream: trials, trials a second, failures so far, time left; silent if told to be."""
+class Progress(Bar):
+    """A progress bar with the trials, how many a second, and failures so far."""
 
     def __init__(self, quiet: bool):
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        console = Console(stderr=True)
-        self._lines = Lines(silent=quiet or console.is_terminal)
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(20),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=True),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._bar.add_task("compiling", total=None)
+        super().__init__(quiet)
         self._started: tuple[float, int] | None = None
-
-    def __enter__(self) -> "Progress":
-        self._lines.__enter__()
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-        self._lines.__exit__()
 
     def __call__(self, standing: Any) -> None:
         """standing: a `campaign.Tally`."""

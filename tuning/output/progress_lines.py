@@ -1,9 +1,10 @@
-"""Progress where nobody looks at a terminal: a line every ten seconds, on the error stream."""
+"""Progress on the error stream: a bar where that is a terminal, else a line every ten seconds."""
 
 import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Self
 
 EVERY = 10.0  # seconds
 
@@ -46,3 +47,37 @@ class Lines:
             what, done, total = self._doing
             share = f", {done} of {total}" if total else ""
             print(f"ptsmc: {what}{share}, {now - self._begun:.0f} s", file=sys.stderr, flush=True)
+
+
+class Bar:
+    """A progress bar with the time left, within `with`; `Lines` where nobody looks at a terminal; silent if told to be.
+
+    counted: with how many are done of all.
+    """
+
+    def __init__(self, quiet: bool, *, counted: bool = False):
+        from rich import progress
+        from rich.console import Console
+
+        console = Console(stderr=True)
+        self._lines = Lines(silent=quiet or console.is_terminal)
+        self._bar = progress.Progress(
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(20),
+            *([progress.MofNCompleteColumn()] if counted else []),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("left"),
+            progress.TimeRemainingColumn(elapsed_when_finished=True),
+            console=console,
+            disable=quiet or not console.is_terminal,
+        )
+        self._task = self._bar.add_task("compiling", total=None)
+
+    def __enter__(self) -> Self:
+        self._lines.__enter__()
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+        self._lines.__exit__()

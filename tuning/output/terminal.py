@@ -4,47 +4,17 @@ from pathlib import Path
 from typing import Any
 
 from tuning.output import margin_sentences, search_sentences, sentences
-from tuning.output.progress_lines import Lines
+from tuning.output.progress_lines import Bar
 
 WIDE = 1000  # columns of what is no terminal
 
 
-class Progress:
-    """A progress bar on the error stream with the best so far and the time left; silent where told to be."""
+class Progress(Bar):
+    """A progress bar with the best so far."""
 
     def __init__(self, quiet: bool, goal: str = ""):
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        self._goal, console = goal, Console(stderr=True)
-        self._lines = Lines(silent=quiet or console.is_terminal)
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(20),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=True),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
-        self._total, self._task = 0, self._bar.add_task("compiling", total=None)
-
-    def __enter__(self) -> "Progress":
-        self._lines.__enter__()
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-        self._lines.__exit__()
+        super().__init__(quiet, counted=True)
+        self._goal, self._total = goal, 0
 
     def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
         """What is being done, steps done and in all; the best goal so far, how far it is beyond a limit."""

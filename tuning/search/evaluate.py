@@ -16,8 +16,6 @@ from tuning.search.objective import Problem, Rules, ended, judge, watched
 from tuning.search.shares import Bounds
 
 TOGETHER = 16  # points that are judged in one call
-
-
 M = TypeVar("M", bound="Measured")
 
 

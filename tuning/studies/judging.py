@@ -10,6 +10,7 @@ from ptsmc_jax.numerics import draws
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from tuning.search import confirm, gains
 
@@ -47,15 +48,12 @@ def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
 def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Verdict]:
     """One for each of the scenario's requirements over these trials, and for each margin asked of its loop."""
     ready = study(as_flown(scenario))
-    requirements = ready.requirements
-    alone = trials.status.size == 1  # nothing is drawn: no share of the trials to speak of
-    finished = trials.finished[0] if alone else trials.finished
+    one = 0 if trials.status.size == 1 else slice(None)  # nothing is drawn: no share of the trials to speak of
 
-    def of(name: str) -> np.ndarray:
-        values = getattr(trials.metrics, name)
-        return values[0] if alone else values
+    def values(name: str) -> np.ndarray:
+        return getattr(trials.metrics, name)[one]
 
-    flown = [r.verdict(of(r.metric), finished, None if r.timed is None else of(r.timed)) for r in requirements]
+    flown = requirements.verdicts(ready.requirements, values, trials.finished[one])
     return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
 
 
