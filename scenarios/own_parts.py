@@ -80,6 +80,28 @@ class StarTracker(ptsmc.SampledSensor):
         return x._replace(q=turned / jnp.sqrt(turned @ turned), w=x.w + self.rate_noise * noise[3:]), memory
 
 
+class LateStarTracker(ptsmc.SampledSensor):
+    """A star tracker whose samples arrive some control periods after they were taken, and a gyro that is in time."""
+
+    draws = 6
+    late = 2  # control periods
+    attitude_noise: float = 2e-5  # rad, 1 sigma of each axis
+    rate_noise: float = 1e-6  # rad/s
+
+    def begin(self, x):
+        """Samples on their way, the oldest first, as many as are late: the body was there before."""
+        return jnp.tile(x.q, (self.late, 1))
+
+    def see(self, memory, x, noise, t, dt):
+        """The attitude that arrives and the rate of now, and the samples that are then on their way."""
+        half = 0.5 * self.attitude_noise * noise[:3]
+        v, s = x.q[:3], x.q[3]
+        taken = jnp.concatenate([v + s * half + jnp.cross(v, half), jnp.stack([s - v @ half])])  # to first order
+        coming = jnp.concatenate([memory, taken[None]])
+        q = coming[0] / jnp.sqrt(coming[0] @ coming[0])
+        return x._replace(q=q, w=x.w + self.rate_noise * noise[3:]), coming[1:]
+
+
 class SunDirection(ptsmc.Draw):
     """The sun about which `SolarPressure` knows stands elsewhere in each trial."""
 

@@ -18,6 +18,8 @@ from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
 
+FAR_OFF = 3.0  # times what is drawn, from which on a limit is not drawn
+
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
@@ -239,7 +241,11 @@ def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwar
 
 
 def _limit(axes: Axes, limit: float, unit: str) -> None:
-    """Lines at plus and minus a limit."""
+    """Lines at plus and minus a limit; where the curves would be flat beside it, its number alone."""
+    largest = max((np.nanmax(np.abs(line.get_ydata()), initial=0.0) for line in axes.lines), default=0.0)
+    if limit > FAR_OFF * largest > 0.0:
+        axes.plot([], [], color="none", label=f"limit {limit:g}{unit}, beyond this axis")
+        return
     for sign in (-1.0, 1.0):
         axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
     axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")

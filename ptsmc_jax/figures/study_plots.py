@@ -15,6 +15,7 @@ from ptsmc_jax.figures.style import RC, STYLES, edges, figure_of, plain_ticks
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
+BEYOND = ("x", "+", "1", "2")  # of points that break a limit, by the limit
 
 
 def _looks(count: int) -> list[tuple[str, str]]:
@@ -28,11 +29,13 @@ def tuning_history(
     values: np.ndarray,
     admissible: np.ndarray,
     goal: str,
+    found: tuple[float, Mapping[str, float]],
 ) -> Figure:
-    """Search of all starts: the goal and the gains over the steps.
+    """Search of all starts: the goal and the gains over the steps, and what came of it.
 
     gains: name -> (unit, (steps, starts)); values (steps, starts) of the goal, NaN from where a start was left behind;
-    admissible (steps, starts) bool: every requirement met; goal: what the values are, with their unit.
+    admissible (steps, starts) bool: every requirement met; goal: what the values are, with their unit; found: the goal
+    and the gains, by name, that were judged.
     """
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=(8.0, 2.2 * (len(gains) + 1)), layout="constrained")
@@ -44,8 +47,10 @@ def tuning_history(
             axes[0].semilogy(steps, met, color=STYLES[0][0])
         axes[0].plot([], [], color=STYLES[0][0], label="requirements met")
         axes[0].plot([], [], color="0.75", label="beyond a limit")
+        for ax, value in zip(axes, (found[0], *(found[1][name] for name in gains)), strict=True):
+            ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="found, and judged on fresh trials")
         axes[0].set(ylabel=goal, title="Tuning, all starts")
-        axes[0].legend(ncols=2)
+        axes[0].legend(ncols=3, fontsize=9)
         for k, (name, (unit, seen)) in enumerate(gains.items()):
             axes[k + 1].plot(steps, seen, color=STYLES[1][0], lw=1.0)
             axes[k + 1].set_ylabel(f"{name}\n[{unit}]")
@@ -76,25 +81,32 @@ def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
     return figure
 
 
-def profiles(gains: Mapping[str, tuple[str, np.ndarray, np.ndarray, np.ndarray, float]], goal: str) -> Figure:
+def profiles(
+    gains: Mapping[str, tuple[str, np.ndarray, np.ndarray, np.ndarray, Sequence[str], float]], goal: str
+) -> Figure:
     """The goal along each gain, the others as tuned.
 
-    gains: name -> (unit, gain (points,), goal (points,), largest metric / limit (points,), the tuned gain).
+    gains: name -> (unit, gain (points,), goal (points,), largest metric / limit (points,), whose that is (points,), the
+    tuned gain).
     """
+    marks = dict.fromkeys(of for _, _, _, over, nearest, _ in gains.values() for of in np.asarray(nearest)[over > 1.0])
+    marks = {of: BEYOND[k % len(BEYOND)] for k, of in enumerate(marks)}
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=(8.0, 2.7 * len(gains)), layout="constrained")
         axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
-        for ax, (name, (unit, at, value, over, tuned)) in zip(axes, gains.items(), strict=True):
+        for ax, (name, (unit, at, value, over, nearest, tuned)) in zip(axes, gains.items(), strict=True):
             ax.semilogy(at, value, color="0.6", lw=1.2, label="goal")
             kept = over <= 1.0
             ax.semilogy(at[kept], value[kept], "o", color=STYLES[0][0], label="limits kept")
-            ax.semilogy(at[~kept], value[~kept], "x", color=STYLES[1][0], label="beyond a limit")
+            for of, mark in marks.items():
+                broken = ~kept & (np.asarray(nearest) == of)
+                ax.semilogy(at[broken], value[broken], mark, color=STYLES[1][0], label=f"beyond the limit of {of}")
             ax.axvline(tuned, color="0.3", lw=0.9, ls=":", label="tuned")
             if at[-1] > 10 * at[0]:
                 ax.set_xscale("log")
                 plain_ticks(ax.xaxis)
             ax.set(xlabel=f"{name} [{unit}]", ylabel=goal)
-        axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize=9)
+        axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
     return figure
 
 

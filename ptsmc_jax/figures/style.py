@@ -51,8 +51,19 @@ def edges(values: Sequence[float], logarithmic: bool) -> np.ndarray:
     return np.exp(edges) if logarithmic else edges
 
 
+class _Decades(matplotlib.ticker.LogLocator):
+    """1, 2 and 5 times each power of ten, or the powers alone where there are more than four."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        self.set_params(subs=(1.0,) if vmax > MANY * vmin else (1.0, 2.0, 5.0))
+        return super().tick_values(vmin, vmax)
+
+
+MANY = 1e4  # times, that an axis spans, from which on the numbers between its powers of ten would overlap
+
+
 def plain_ticks(line: Any) -> None:
     """Numbers such as 0.05 on a log axis."""
-    line.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    line.set_major_locator(_Decades())
     line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     line.set_minor_formatter(matplotlib.ticker.NullFormatter())

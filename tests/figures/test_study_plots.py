@@ -1,9 +1,12 @@
 """What figures of studies draw, read back from their lines and axes."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from ptsmc_jax.figures import study_plots
+from ptsmc_jax.figures import run_plots, study_plots
+from ptsmc_jax.figures.style import figure_of
 
 GRID = np.array([[1e-5, 2e-5], [3e-5, 4e-5]])
 NAMES = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
@@ -13,11 +16,41 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
     """Grey: all steps of a start; coloured above it: those that are admissible."""
     values = np.array([[3.0, 5.0], [2.0, 4.0], [1.0, np.nan]])
     met = np.array([[False, True], [True, False], [True, False]])
-    figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error")
+    judged = 0.9, {"eta": 3.1}
+    figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", judged)
+    for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # whatever the last step of a start was
+        (line,) = [line for line in axes.lines if str(line.get_label()).startswith("found")]
+        assert set(line.get_ydata()) == {value}
     drawn = [np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines[:4]]
     for start in range(2):
         np.testing.assert_array_equal(drawn[2 * start], values[:, start])
         np.testing.assert_array_equal(drawn[2 * start + 1], np.where(met[:, start], values[:, start], np.nan))
+
+
+def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap():
+    at = np.geomspace(1e-6, 0.1, 4)
+    over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
+    figure = study_plots.profiles({"sign_width": ("-", at, at, over, nearest, 1e-3)}, "goal")
+    (axes,) = figure.axes
+    drawn = {line.get_label(): list(line.get_xdata()) for line in axes.lines}
+    assert drawn["limits kept"] == [at[1]]
+    assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
+    assert drawn["beyond the limit of gain_margin"] == [at[2]]
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
+    boxes = sorted((box for box in boxes if 0 <= box.x0 <= figure.bbox.x1), key=lambda box: box.x0)
+    assert len(boxes) >= 5
+    assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
+
+
+@pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])
+def test_a_limit_far_above_what_is_drawn_is_said_and_does_not_flatten_it(limit, drawn):
+    _, axes = figure_of("torque", "u")
+    axes.plot([0.0, 1.0], [-1.0, 0.5])
+    run_plots._limit(axes, limit, " N m")
+    assert (max(axes.get_ylim()) > 2.0) == drawn
+    (said,) = [line.get_label() for line in axes.lines if str(line.get_label()).startswith("limit")]
+    assert said == f"limit {limit:g} N m" + ("" if drawn else ", beyond this axis")
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])

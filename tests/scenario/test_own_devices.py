@@ -13,12 +13,15 @@ from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.devices.own_sensors import OWN_NOISE
 from ptsmc_jax.numerics import draws
+from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
-from tests.helpers import SHORT
+from scenarios.own_parts import LateStarTracker
+from tests.helpers import FIRST_FLIGHT, SHORT
 from tuning.search import gains
+from tuning.studies import stability
 
 FILE = """
 import dataclasses
@@ -144,6 +147,34 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     again = command("simulate", "out/simulate-s/scenario.toml", "--quiet", "--out", "new")
     assert again[0] == 2
     assert "(sensors.code), which this command would run" in again[2]
+
+
+def test_a_late_star_tracker_says_where_the_body_was_and_the_gyro_how_it_turns_now():
+    sensor, rng = LateStarTracker(model=None), np.random.default_rng(1)
+    q = rng.normal(size=(8, 4))
+    q /= np.linalg.norm(q, axis=1)[:, None]
+    states = [AttitudeState(jnp.asarray(q[k]), jnp.full(3, float(k))) for k in range(8)]
+    memory, seen = sensor.begin(states[0]), []
+    for x in states:
+        one, memory = sensor.see(memory, x, jnp.zeros(6), jnp.asarray(0.0), jnp.asarray(0.1))
+        seen.append(one)
+    np.testing.assert_allclose([one.q for one in seen], q[np.maximum(np.arange(8) - sensor.late, 0)], atol=1e-15)
+    np.testing.assert_array_equal([one.w[0] for one in seen], np.arange(8.0))
+
+
+@pytest.mark.long
+def test_a_delay_of_the_whole_loop_leaves_less_than_a_late_star_tracker():
+    """At most what is left with neither, at least what is left where the gyro is late as well."""
+    flight = scenario.replace(
+        scenario.read(FIRST_FLIGHT), tune=None, requirements=None, controller__delta=1.0, observer__gain=[5.0] * 3
+    )
+    sensors = {"kind": "own", "code": LateStarTracker}
+    late = scenario.replace(flight, hardware=None, sensors=sensors)
+    all_late = scenario.replace(flight, hardware__delay=LateStarTracker.late)
+    left = [stability.worst(scenario.study(one))["hold"] for one in (all_late, late, flight)]
+    for margin in ("gain_margin", "phase_margin"):
+        least, own_delay, most = (found[margin] for found in left)
+        assert least < own_delay < most
 
 
 def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here):

@@ -33,6 +33,12 @@ class Measured:
         """(points,) largest c over the trials that end; -1 without a requirement."""
         return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
+    @property
+    def nearest(self) -> np.ndarray:
+        """(points,) number of the row of c that is nearest to its limit, or the farthest beyond it; 0 without one."""
+        largest = ended(self.c).max(axis=2, initial=-1.0)
+        return largest.argmax(axis=1) if largest.shape[1] else np.zeros(len(largest), int)
+
     def at(self: M, point: int) -> M:
         """One of the points."""
         return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})

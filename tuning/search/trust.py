@@ -1,7 +1,7 @@
 """What makes a tuning result believable: slopes checked, gains' influence, intervals of what was averaged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,7 @@ class Profile:
     value: np.ndarray  # (points,) the goal
     over: np.ndarray  # (points,) largest metric / limit; zero without a requirement
     f: np.ndarray  # (points,) F: ln of the goal, with what the torque weighs in it
+    nearest: list[str] = field(default_factory=list)  # (points,) whose the largest metric / limit is
 
     @property
     def flat(self) -> bool:
@@ -62,8 +63,10 @@ def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[s
     flown = evaluate.fly(problem, points.reshape(-1, count))
     found = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in found)
+    nearest = np.asarray(problem.rows or ("",))[flown.nearest].reshape(count, ACROSS + 1)
     return {
-        name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0]) for k, name in enumerate(problem.names)
+        name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0], nearest[k].tolist())
+        for k, name in enumerate(problem.names)
     }
 
 

@@ -201,6 +201,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
             over_steps(lambda step: step.value),
             over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
             goal,
+            (tuning.search.value, dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
         "tradeoff": study_plots.tradeoff(
             {
@@ -216,7 +217,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         found["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
         found["profiles"] = study_plots.profiles(
             {
-                name: (units[k], p.gain, p.value, p.over, float(tuning.search.gains[k]))
+                name: (units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
             goal,
