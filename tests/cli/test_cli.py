@@ -574,7 +574,9 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     assert "4 of 4 pairs flown" in out
     assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
     again = "ptsmc map scenario.toml --x controller.eta=2.7:2.9:2 --y controller.k1=0.8:1.6:2 --trials 2 --seed 0"
-    assert again in checked(tmp_path / "out" / "map-s").text
+    read = checked(tmp_path / "out" / "map-s")
+    assert again in read.text
+    assert "linear_torque [N m]" in read.text
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.k1=0.8:1.6:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
         status, out, err = command("map", "s.toml", *pairs, "--out", "bad", *bad)

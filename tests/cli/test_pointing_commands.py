@@ -68,10 +68,11 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert [row[:7] for row in table.rows] == [
         ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
          pointing_sentences.angle(ensemble["margin"] * 0.02)),
-        ("APE", "half-cone", "2.06e+03 arcsec", "50 %", "mixed", "90 %", f"{100 * mixed['shown']:.6g} % of the time"),
-        ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "-", f"{100 * temporal['shown']:.6g} % of the time"),
+        ("APE", "half-cone", "2063 arcsec", "50 %", "mixed", "90 %", f"{100 * mixed['shown']:.6g} % of the time"),
+        ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "none asked",
+         f"{100 * temporal['shown']:.6g} % of the time"),
     ]  # fmt: skip
-    assert [row[9] for row in table.rows] == ["22", "4", "-"]  # 0.9^22 <= 0.1
+    assert [row[9] for row in table.rows] == ["22", "4", "every run flown"]  # 0.9^22 <= 0.1
 
 
 def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
@@ -90,6 +91,16 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     assert pointing_sentences.angle(again["mpe"]["y"]) in str(
         pointing_sentences.budget({**found, "pointing": {**found["pointing"], "budget": again}})
     )
+
+
+@pytest.mark.parametrize(("ok", "said"), [
+    (2000, "1109 runs without a failure show a value"), (1990, "10 runs that are not ok are beyond every angle"),
+])  # fmt: skip
+def test_why_a_budget_has_no_value_is_said(ok, said):
+    told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95,
+            "budget": {"ape": {"x": None}}}  # fmt: skip
+    *_, last = pointing_sentences.heading({"pointing": told, "flown": 2000, "counts": {"ok": ok}})
+    assert last.startswith(f"where the budget has -, {said}")
 
 
 def test_a_single_run_knows_the_indices(command, flown, tmp_path):

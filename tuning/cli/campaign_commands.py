@@ -223,7 +223,7 @@ def worst(
         told = campaign_summary.why(opened, list(dict.fromkeys((by, *asked))), n)
         store.write_csv(folder / "why.csv", list(told[0]) if told else [], [list(one.values()) for one in told])
     if not quiet:
-        campaign_terminal.worst(frame, by, folder, own_code=bool(opened.programs))
+        campaign_terminal.worst(frame, by, folder, opened.scenario.plant.kind, own_code=bool(opened.programs))
         campaign_terminal.why(told)
     return 0
 

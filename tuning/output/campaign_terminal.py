@@ -57,20 +57,17 @@ def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
     print("when all are there, in this folder or gathered into one: ptsmc summarize DIR")
 
 
-def worst(frame: Any, by: str, folder: Path, *, own_code: bool = False) -> None:
-    """The worst trials, and how to see one in full; own_code: flying it runs code of one's own."""
-    from rich.console import Console
-    from rich.table import Table
-
+def worst(frame: Any, by: str, folder: Path, kind: str, *, own_code: bool = False) -> None:
+    """The worst trials, and how to see one in full; kind: of the plant; own_code: flying it runs code of one's own."""
     wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
     names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
-    table = Table(*names, box=None, pad_edge=False)
-    for row in frame.select(names).iter_rows():
-        table.add_row(*("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row))
-    console = Console(highlight=False)
-    console.print(table)
+    rows = [
+        tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
+        for row in frame.select(names).iter_rows()
+    ]
+    terminal.table(sentences.Table(tuple(sentences.with_unit(name, kind) for name in names), rows))
     one = f"ptsmc replay {folder} --trial {frame['trial'][0]}" + (" --trust" if own_code else "")
-    console.print(f"whole rows in {folder / 'worst.csv'}; one in full: {one}", soft_wrap=True)
+    terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 
 def why(told: list[dict[str, Any]]) -> None:

@@ -329,7 +329,8 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
 def _map(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
-    table = sentences.Table(tuple(rows[0]), [tuple(_short(cell) for cell in row) for row in rows[1:]])
+    head = tuple(sentences.with_unit(name, result.kind) for name in rows[0])
+    table = sentences.Table(head, [tuple(_short(cell) for cell in row) for row in rows[1:]])
     heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs of values"])
     return heading, [Section("Pairs", [_table(table, page_captions.MAP)])]
 

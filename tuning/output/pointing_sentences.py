@@ -18,7 +18,10 @@ def angle(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "-"
     degrees = math.degrees(value)
-    return f"{degrees:.3g} deg" if abs(degrees) >= 1.0 else f"{3600.0 * degrees:.3g} arcsec"
+    if abs(degrees) >= 1.0:
+        return f"{degrees:.3g} deg"
+    seconds = 3600.0 * degrees
+    return f"{seconds:.0f} arcsec" if abs(seconds) >= 1000.0 else f"{seconds:.3g} arcsec"
 
 
 def tables(summary: Summary) -> list[Table]:
@@ -60,7 +63,10 @@ def heading(summary: Summary) -> Iterator[str]:
         )
         if any(value is None for axes in told["budget"].values() for value in axes.values()):
             few, more = (fewest_trials(told["probability"], confidence) for confidence in USUAL)
-            yield f"where the budget has -, {more} runs without a failure show a value, and {few} with 90 % confidence"
+            least = f"{more} runs without a failure show a value, and {few} with 90 % confidence"
+            lost = summary["flown"] - summary["counts"]["ok"]
+            why = f"{lost} runs that are not ok are beyond every angle" if summary["flown"] >= more and lost else least
+            yield f"where the budget has -, {why}"
 
 
 def compliance(summary: Summary) -> Table | None:
@@ -90,7 +96,7 @@ def _row(told: Summary, index: str, axis: str) -> tuple[str, ...]:
         angle(told["limit"]),
         "all flown" if probability is None else f"{100 * probability:g} %",
         kind,
-        "-" if confidence is None else f"{100 * confidence:g} %",
+        "none asked" if confidence is None else f"{100 * confidence:g} %",
         shown,
         str(told["trials"]),
         str(told["failures"]),
@@ -104,7 +110,7 @@ def _needed(kind: str, probability: float | None, confidence: float | None) -> s
     from ptsmc_jax.simulation.requirements import fewest_trials
 
     if probability is None or kind == "temporal":
-        return "-"
+        return "every run flown"
     if confidence is not None:
         return str(fewest_trials(probability, confidence))
     return ", ".join(f"{fewest_trials(probability, c)} ({100 * c:g} %)" for c in USUAL)

@@ -45,6 +45,23 @@ def run(summary: Summary, kind: str) -> Table:
     return Table(("metric", "value", "unit", "meaning"), rows)
 
 
+def with_unit(name: str, kind: str) -> str:
+    """A column of rows, or of a map, with its unit; kind: of the plant.
+
+    >>> with_unit("largest_peak_torque", "spacecraft"), with_unit("delay_margin", "chain"), with_unit("status", "chain")
+    ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
+    """
+    from ptsmc_jax.simulation.catalogues import CATALOGUES
+
+    metric = name.removeprefix("hold_") if name.removeprefix("hold_") in MARGINS else name
+    for prefix in ("linear_", "largest_"):
+        metric = metric.removeprefix(prefix)
+    metric = "peak_torque" if metric == "torque" else metric
+    known = {**CATALOGUES[kind], **MARGINS}
+    unit = "rad" if name == "initial_angle" and kind == "spacecraft" else known[metric][0] if metric in known else "-"
+    return name if unit == "-" else f"{name} [{unit}]"
+
+
 def run_lines(summary: Summary) -> list[str]:
     """Status of one run, and its error beside the floor."""
     bad_time = summary["bad_time"]
