@@ -111,4 +111,4 @@ def encoded(frame: pl.DataFrame) -> bytes:
 def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.DataFrame:
     """The rows of these parts, in order; columns: those wanted, all if None."""
     wanted = None if columns is None else list(columns)
-    return pl.concat([pl.read_parquet(part.path, columns=wanted) for part in parts], rechunk=True)
+    return pl.read_parquet([part.path for part in parts], columns=wanted).rechunk()
