@@ -77,14 +77,14 @@ axes.set(xlabel="hand-over before t_f, delta [s]", ylabel="RMS window error [-]"
 axes.legend()
 
 # %% [markdown]
-# Try it: the sliders change η, δ and the period and fly 64 attitudes at each stop. Where there is no `ipywidgets`, one
-# setting is flown and printed instead.
+# Try it: the sliders change η, δ and the period and fly 64 attitudes at each stop, by one program: its clock has room for
+# the samples of the shortest period. Where there is no `ipywidgets`, one setting is flown and printed instead.
 
 
 # %%
 def fly(eta=3.0, delta=0.5, period=0.05):
     case = ptsmc.replace(flight, loop__period=period, controller__eta=eta, controller__delta=max(delta, period))
-    error, peak = measured(case, 64)
+    error, peak = measured(ptsmc.study(case, reach=ptsmc.reach_of(case, smallest_period=0.02, period=0.2)), 64)
     print(f"RMS error {error:.2e}, mean peak torque {peak:.3f} N m")
 
 

@@ -141,7 +141,11 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
 
 
 def trials(
-    what: Scenario | str | Path, count: int | pl.DataFrame = 1000, *, seed: int = 0, own: OwnMetrics | None = None
+    what: Scenario | Study | str | Path,
+    count: int | pl.DataFrame = 1000,
+    *,
+    seed: int = 0,
+    own: OwnMetrics | None = None,
 ) -> pl.DataFrame:
     """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
 
@@ -150,14 +154,13 @@ def trials(
     `plans`; raises RefusedError, with one sentence, where it cannot be flown.
     """
     _check_whole_number("seed", seed)
-    known = what if isinstance(what, Scenario) else scenario.read(what)
+    ready = _ready(what)
     if isinstance(count, pl.DataFrame):
-        ready = scenario.study(known)
         names = campaign.Campaign(ready, seed, own).own_names()
         asked = plans.checked(count, ready.parts, own=names)
         return campaign.of_plan(ready, seed, asked, own).fly(range(asked.count))
     _check_whole_number("count", count, 1)
-    return campaign.Campaign(scenario.study(known), seed, own).fly(range(count))
+    return campaign.Campaign(ready, seed, own).fly(range(count))
 
 
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
@@ -166,9 +169,13 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
     Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies.
     """
     _check_whole_number("seed", seed)
-    if not isinstance(what, Study):
-        what = scenario.study(what if isinstance(what, Scenario) else scenario.read(what))
-    return runs.floor(what, seed)
+    return runs.floor(_ready(what), seed)
+
+
+def _ready(what: Scenario | Study | str | Path) -> Study:
+    if isinstance(what, Study):
+        return what
+    return scenario.study(what if isinstance(what, Scenario) else scenario.read(what))
 
 
 def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:

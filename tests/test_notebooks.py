@@ -82,7 +82,7 @@ def test_every_slider_moves_to_both_ends(source, monkeypatch, capsys):
     monkeypatch.setattr("ipywidgets.interact", lambda function, **widgets: kept.append((function, widgets)))
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
     cells = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code"]
-    for old, new in {**SMALLER.get(source.stem, {}), "measured(case, 64)": "measured(case, 8)"}.items():
+    for old, new in {**SMALLER.get(source.stem, {}), "period=0.2)), 64)": "period=0.2)), 8)"}.items():
         cells = [cell.replace(old, new) for cell in cells]
     exec(compile("\n".join(cells), source.name, "exec"), {})
     plt.close("all")

@@ -50,6 +50,7 @@ class Pointing(Table, frozen=True):
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
+        kept = scenario.loop.mode == "sampled" and any(name.startswith(("rpe", "rke")) for name in timed)
         # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
-        samples = math.ceil(self.window / scenario.loop.period) + 2 if scenario.loop.mode == "sampled" else 0
+        samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
         return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

@@ -31,7 +31,7 @@ _SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
 @dataclass(frozen=True)
 class Reach:
-    """How far gains may move without another compilation: the clock's sizes are chosen for it."""
+    """How far gains and period may move without another compilation: the clock's sizes are chosen for it."""
 
     smallest_t_f: float  # [s]
     t_f: float  # largest [s]
@@ -42,6 +42,8 @@ class Reach:
     k1: float  # largest [1/s]
     sign_width: float  # smallest
     surface_rate: float  # largest [1/s]
+    smallest_period: float  # [s]; of no meaning in the continuous loop
+    period: float  # largest [s]
 
 
 def reach_of(scenario: Scenario, **farther: float) -> Reach:
@@ -55,7 +57,8 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
     table = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
     k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
-    own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate)
+    period = scenario.loop.period
+    own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
     return dataclasses.replace(own, **farther)
 
 
@@ -73,13 +76,15 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         for key in {"plant.system", "flexible.frequency"} & set(frequencies):
             frequencies[key] *= 2.0  # 0.15 rad a step: of a system nothing else is known, and modes ring for long
         return _grid(scenario, reach, setup, saves, frequencies, visited), 1
-    substeps = _substeps(scenario, frequencies)
+    substeps = _substeps(scenario, reach.period, frequencies)
     last = scenario.end + reach.t_f - scenario.controller.t_f
-    _check_steps(scenario, last, substeps)
+    _check_steps(scenario, last, reach.smallest_period, substeps)
     if loop.clock == "flight":
-        return dataclasses.replace(clock.flight(loop.period, last), t_end=vector(loop.t_end)), substeps
-    late = scenario.end - scenario.controller.t_f + reach.delta
-    return clock.anchored(loop.period, scenario.end, reach.t_f, late), substeps
+        made = clock.flight(reach.smallest_period, last)
+    else:
+        late = scenario.end - scenario.controller.t_f + reach.delta
+        made = clock.anchored(reach.smallest_period, scenario.end, reach.t_f, late)
+    return dataclasses.replace(made, period=vector(loop.period), t_end=vector(scenario.end)), substeps
 
 
 def steps(parts: Parts) -> int:
@@ -87,9 +92,9 @@ def steps(parts: Parts) -> int:
     return parts.clock.count * parts.substeps
 
 
-def _check_steps(scenario: Scenario, last: float, substeps: int) -> None:
-    """Refuse a sampled loop of more integration steps until `last` [s] than a sensible number."""
-    period, needed = scenario.loop.period, last / scenario.loop.period * substeps
+def _check_steps(scenario: Scenario, last: float, period: float, substeps: int) -> None:
+    """Refuse a sampled loop of more integration steps until `last` [s] than a sensible number; period [s]."""
+    needed = last / period * substeps
     if needed > MOST_STEPS:
         asks = (
             f"the sampled loop would take {needed:.6g} steps, {substeps} a period, and at most {MOST_STEPS} are allowed"
@@ -112,15 +117,15 @@ def _fastest(frequencies: Mapping[str, float]) -> float:
     return max(frequencies["disturbance.frequency"], others)
 
 
-def _substeps(scenario: Scenario, frequencies: Mapping[str, float]) -> int:
-    """Integration steps a control period: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
+def _substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float]) -> int:
+    """Integration steps a control period [s]: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
 
     At 0.1 rad of a disturbance, of a flexible mode, or of a system of one's own, 1e-7 of what it does.
     """
     frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
-    needed = scenario.loop.period * _fastest(frequencies) / 0.025
+    needed = period * _fastest(frequencies) / 0.025
     if needed > MOST_SUBSTEPS:
-        asks = f"loop.period = {scenario.loop.period} would take more than {MOST_SUBSTEPS} integration steps a period"
+        asks = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
     return max(MOVING if scenario.devices.moving else 1, math.ceil(needed))
 

@@ -16,7 +16,7 @@ from ptsmc_jax.dispersions import attitudes
 from ptsmc_jax.scenario import from_tables, parsing, read, reference_tables, replace, study, timing
 from ptsmc_jax.scenario.attitude_keys import quaternion
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.timing import Reach
+from ptsmc_jax.scenario.timing import reach_of
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import clock
 from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector
@@ -304,21 +304,33 @@ def test_kinds_of_dispersion():
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
 def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
-    parts = study(
-        scenario,
-        reach=Reach(30.0, 35.0, 4.0, 0.05, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3, surface_rate=1.0),
-    ).parts
+    parts = study(scenario, reach=reach_of(scenario, t_f=35.0, delta=4.0)).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
         ticks = parts.clock.ticks(vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
 
 
+@pytest.mark.parametrize("mode", ["anchored", "flight"])
+def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_end(mode):
+    found = []
+    for period in (0.02, 0.05, 0.2):
+        scenario = from_tables(
+            tomllib.loads(SAMPLED + f"loop.clock = '{mode}'\nloop.period = {period}\ncontroller.delta = 0.4")
+        )
+        parts = study(scenario, reach=reach_of(scenario, smallest_period=0.02, period=0.2)).parts
+        ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+        assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
+        lasts = np.asarray(ticks.t_next - ticks.t)
+        assert np.median(lasts[lasts > 1e-9]) == pytest.approx(period, rel=1e-9)
+        assert parts.substeps >= study(scenario).parts.substeps
+        found.append(jax.tree.structure(parts))
+    assert found[0] == found[1] == found[2]
+
+
 def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
     scenario = from_tables(tomllib.loads(SAMPLED + "loop.period = 0.5\ncontroller = { t_f = 6e4, delta = 1.0 }"))
-    reach = Reach(
-        6e4, 12e4, delta=1.0, smallest_delta=1.0, gain=1.0, largest_gain=9.0, k1=1.0, sign_width=1e-3, surface_rate=1.0
-    )
+    reach = reach_of(scenario, t_f=12e4)
     assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
     with pytest.raises(ScenarioError) as caught:
         study(scenario, reach=reach)

@@ -67,7 +67,8 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
     smallest_delta, delta = interval("delta", own.delta)
     smallest_t_f, t_f = interval("t_f", own.t_f)
     gain, largest_gain = interval("observer_gain", own.gain, own.largest_gain)
-    found = Reach(
+    found = dataclasses.replace(
+        own,
         smallest_t_f=smallest_t_f,
         t_f=t_f,
         delta=delta,
