@@ -172,12 +172,12 @@ def _cores() -> int:
 
 def _accepted(folder: Path | None) -> tuple[str, ...]:
     """The options that this machine's compiler takes and that leave the numbers as they are; kept in the cache."""
-    kept = None if folder is None else folder / f"options-{version('jaxlib')}.json"
-    if kept is not None and kept.is_file():
+    file = None if folder is None else folder / f"options-{version('jaxlib')}.json"
+    if file is not None and file.is_file():
         try:
-            told = json.loads(kept.read_text(encoding="utf-8"))
-            if told["tried"] == list(_OPTIONS):
-                return tuple(told["accepted"])
+            answer = json.loads(file.read_text(encoding="utf-8"))
+            if answer["tried"] == list(_OPTIONS):
+                return tuple(answer["accepted"])
         except (ValueError, KeyError, TypeError):
             pass  # not ours, or cut short: try again
     accepted: tuple[str, ...] = _OPTIONS
@@ -186,10 +186,10 @@ def _accepted(folder: Path | None) -> tuple[str, ...]:
         accepted = accepted if _tried(accepted) else ()
         refused = ", ".join(option for option in _OPTIONS if option not in accepted)
         warnings.warn(f"this version of XLA refuses {refused}: runs will be slower", RuntimeWarning, stacklevel=3)
-    if kept is not None:
+    if file is not None:
         try:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(json.dumps({"tried": _OPTIONS, "accepted": accepted}), encoding="utf-8")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps({"tried": _OPTIONS, "accepted": accepted}), encoding="utf-8")
         except OSError:
             pass  # a cache that cannot be written is none
     return accepted
@@ -245,7 +245,7 @@ def _processor() -> str:
     """What compiled code depends on: programs for one processor must not be loaded on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        told = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+        described = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
     except OSError:
-        told = [platform.processor()]
-    return "\n".join([platform.machine(), *told])
+        described = [platform.processor()]
+    return "\n".join([platform.machine(), *described])

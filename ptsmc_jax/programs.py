@@ -232,9 +232,9 @@ def _read(path: Path, said: str, inside: Any) -> Callable | None:
     """The program in a file, if it is ours, whole, and the one that is asked for."""
     try:
         for place in (path.parent, path):
-            known = place.lstat()
-            own = known.st_uid == os.geteuid() and not known.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-            if stat.S_ISLNK(known.st_mode) or not own:
+            status = place.lstat()
+            ours = status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+            if stat.S_ISLNK(status.st_mode) or not ours:
                 return None
         content = path.read_bytes()
         digest, body = content[:32], content[32:]
@@ -243,13 +243,13 @@ def _read(path: Path, said: str, inside: Any) -> Callable | None:
         payload, skeleton, count = pickle.loads(body)
         if b"lapack" in payload:
             _lapack()
-        found = serialize_executable.deserialize_and_load(
+        program = serialize_executable.deserialize_and_load(
             payload, inside, jax.tree.structure(skeleton), execution_devices=jax.local_devices()[:count]
         )
         os.utime(path)  # used
     except Exception:  # whatever is wrong with it, it can be compiled again
         return None
-    return found
+    return program
 
 
 def _write(path: Path, said: str, compiled: Any) -> None:

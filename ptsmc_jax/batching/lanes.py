@@ -163,15 +163,15 @@ class _Lanes:
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
         jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
-        known: dict = {}
+        values_of: dict = {}
 
         def write(variables: Sequence, values: Sequence) -> None:
             for variable, value in zip(variables, values, strict=True):
                 empty = isinstance(value, Lane) and 0 in value.shape  # nothing in it that could differ
-                known[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
+                values_of[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
 
         def read(atom: Any) -> Any:
-            return atom.val if isinstance(atom, core.Literal) else known[atom]
+            return atom.val if isinstance(atom, core.Literal) else values_of[atom]
 
         write([*jaxpr.constvars, *jaxpr.invars], [*consts, *args])
         for eqn in jaxpr.eqns:

@@ -109,18 +109,18 @@ def worst(
         low, high = near - np.where(unsure, off, 0.0), near + np.where(unsure, off, 0.0)
         by_trial = np.sort(low.reshape(len(names), count, -1).max(axis=(0, 2)))
         least = np.minimum(low.max(axis=1, keepdims=True), by_trial[-min(places, count)])
-        asked = unsure & ((high >= least) | ((low <= 1.0) & (high >= 1.0)))
-        order = np.argsort(-np.where(asked, high, -np.inf).max(axis=0), kind="stable")
-        some = order[: min(JUDGED, np.count_nonzero(asked.any(axis=0)))]
-        if not some.size:
+        unsettled = unsure & ((high >= least) | ((low <= 1.0) & (high >= 1.0)))
+        order = np.argsort(-np.where(unsettled, high, -np.inf).max(axis=0), kind="stable")
+        chosen = order[: min(JUDGED, np.count_nonzero(unsettled.any(axis=0)))]
+        if not chosen.size:
             return {name: _over(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
-        some = np.resize(some, JUDGED)  # one shape, one program
-        full = _of_some(loops, some, with_delay="delay_margin" in names)
-        found = np.stack([_over(name, full[name]) for name in names])
-        apart = np.abs(_nearness(found, limit, names) - near[:, some])
+        chosen = np.resize(chosen, JUDGED)  # one shape, one program
+        full = _of_some(loops, chosen, with_delay="delay_margin" in names)
+        exact = np.stack([_over(name, full[name]) for name in names])
+        apart = np.abs(_nearness(exact, limit, names) - near[:, chosen])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
         off = np.where(apart > off / 2.0, 2.0 * apart, off)
-        values[:, some], unsure[:, some] = found, False
+        values[:, chosen], unsure[:, chosen] = exact, False
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -109,21 +109,23 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
         raise RefusedError(f"{where} has no rows, but must have one for each trial")
     if table.height > MOST:
         raise RefusedError(f"{where} has {table.height} rows, but at most {MOST} are allowed")
-    there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
-    of = {column: name for name, columns in there.items() for column in columns}
+    columns_of = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
+    quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
     whose = [*OF_ROWS, *OF_ROWS.values()]
     for column in table.columns:
-        if column not in (*of, *whose, ANGLE, *RESULTS, *own):
-            close = parsing.nearest(column, (*of, *OF_ROWS))
+        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *own):
+            close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
             raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
     given = {}
-    for name in dict.fromkeys(of[column] for column in table.columns if column in of):
-        absent = [column for column in there[name] if column not in table.columns]
+    for name in dict.fromkeys(quantity_of[column] for column in table.columns if column in quantity_of):
+        absent = [column for column in columns_of[name] if column not in table.columns]
         if absent:
-            have = next(column for column in table.columns if of.get(column) == name)
-            raise RefusedError(f"{where} has the column {have}, but not {absent[0]}: {_all(there[name])} come together")
-        values = np.stack([_numbers(table, column, where) for column in there[name]], axis=1)
-        given[name] = _checked(values, name, there[name], where)
+            present = next(column for column in table.columns if quantity_of.get(column) == name)
+            raise RefusedError(
+                f"{where} has the column {present}, but not {absent[0]}: {_all(columns_of[name])} come together"
+            )
+        values = np.stack([_numbers(table, column, where) for column in columns_of[name]], axis=1)
+        given[name] = _checked(values, name, columns_of[name], where)
     whose_draws = {}
     for name, other in OF_ROWS.items():  # of rows that are flown again, `trial` is but their number
         column = other if other in table.columns else name

@@ -66,10 +66,10 @@ class Run:
         if log.wheels is not None:
             blocks["h"], blocks["v"] = log.wheels
         blocks |= self.parts.plant.hidden_columns(log.x)
-        found = {"t": np.asarray(log.t)}
+        columns = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
-            found |= numbered(name, block)
-        return found
+            columns |= numbered(name, block)
+        return columns
 
 
 def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:

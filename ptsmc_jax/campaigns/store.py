@@ -90,20 +90,20 @@ def _same(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any])
 
 def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> str | None:
     """What tells the run in the folder from this one, in words; None: nothing does."""
-    there = made(folder)
+    versions = made(folder)
     try:
-        known = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
+        old_tables = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
         return "files, but no scenario.toml of a run that can be read"
-    if not there or not all(isinstance(table, dict) for table in known.values()):
+    if not versions or not all(isinstance(table, dict) for table in old_tables.values()):
         return "files, but no versions.json of a run that can be read"
-    wanted = json.loads(json.dumps(_named(scenario)))
+    new_tables = json.loads(json.dumps(_named(scenario)))
     for name, value in made_by.items():
-        if there.get(name) != value:
-            return f"a run with {name} {there.get(name)}, not {value}"
-    for table in dict.fromkeys((*known, *wanted)):
-        for key in dict.fromkeys((*known.get(table, {}), *wanted.get(table, {}))):
-            old, new = (tables.get(table, {}).get(key, "absent") for tables in (known, wanted))
+        if versions.get(name) != value:
+            return f"a run with {name} {versions.get(name)}, not {value}"
+    for table in dict.fromkeys((*old_tables, *new_tables)):
+        for key in dict.fromkeys((*old_tables.get(table, {}), *new_tables.get(table, {}))):
+            old, new = (tables.get(table, {}).get(key, "absent") for tables in (old_tables, new_tables))
             if old != new:
                 return f"a run of another scenario: {table}.{key} is {old} there, and {new} here"
     return None

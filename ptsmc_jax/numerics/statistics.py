@@ -124,25 +124,25 @@ def drivers(
     known = {} if known is None else known
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
         return {}
-    rank, found = _ranked(metric), {}
+    rank, driving = _ranked(metric), {}
     for name, values in inputs.items():
         if np.ptp(values) == 0.0:
             continue
         if name not in known:
-            own = _ranked(values)
-            order = np.argsort(own, kind="stable")
-            alike = any(abs(np.mean(own * one)) > ALIKE for one, _ in filter(None, known.values()))
-            known[name] = () if alike else (own, order)
+            ranks = _ranked(values)
+            order = np.argsort(ranks, kind="stable")
+            alike = any(abs(np.mean(ranks * one)) > ALIKE for one, _ in filter(None, known.values()))
+            known[name] = () if alike else (ranks, order)
         if not known[name]:
             continue
-        own, order = known[name]
-        correlation = float(np.mean(own * rank))
+        ranks, order = known[name]
+        correlation = float(np.mean(ranks * rank))
         bins = np.array_split(rank[order], SOBOL_BINS)
         between = sum(part.size * part.mean() ** 2 for part in bins) / rank.size
         within = 1.0 - between
         by_chance = (SOBOL_BINS - 1) / (rank.size - SOBOL_BINS) * within
-        found[name] = {"rank_correlation": correlation, "first_order": max(0.0, float(between - by_chance))}
-    return found
+        driving[name] = {"rank_correlation": correlation, "first_order": max(0.0, float(between - by_chance))}
+    return driving
 
 
 def _ranked(values: np.ndarray) -> np.ndarray:

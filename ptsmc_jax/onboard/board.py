@@ -99,43 +99,43 @@ def board(parts: Parts) -> Board:
         "actuators": device,
         "period": period,
     }
-    made = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
+    computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
     if parameters["filter"] is not None:
-        _filter_parameters(made, parts.sensors, period)
-    made.about["period"] = "of the control loop [s]"
-    made.about["observer_matrix"] = _said(type(observer).update_matrix)
-    if not made.spacecraft:
-        _reading(made, parts)
+        _filter_parameters(computer, parts.sensors, period)
+    computer.about["period"] = "of the control loop [s]"
+    computer.about["observer_matrix"] = _said(type(observer).update_matrix)
+    if not computer.spacecraft:
+        _reading(computer, parts)
     elif parameters["filter"] is None:
-        _tracking(made)
+        _tracking(computer)
     else:
-        _filtering(made, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
-    _observing(made, observer, device)
-    _commanding(made, law, observer)
-    made.stages.append(Stage("begin", "What is remembered before the first sample.", (), _begin))
+        _filtering(computer, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
+    _observing(computer, observer, device)
+    _commanding(computer, law, observer)
+    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), _begin))
     if device is not None:
-        _acting(made, device, observer.model.inputs)
-    return made
+        _acting(computer, device, observer.model.inputs)
+    return computer
 
 
-def _filter_parameters(made: Board, sensors: Any, period: Any) -> None:
+def _filter_parameters(computer: Board, sensors: Any, period: Any) -> None:
     """What the filter's gains follow from."""
-    made.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
-    made.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
+    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
+    computer.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
     if sensors.own_times is not None:
-        made.parameters["star_tracker_interval"] = sensors.own_times.interval
-        made.about["star_tracker_interval"] = "between its samples [s]"
+        computer.parameters["star_tracker_interval"] = sensors.own_times.interval
+        computer.about["star_tracker_interval"] = "between its samples [s]"
 
 
 def _said(function: Any) -> str:
     return " ".join((function.__doc__ or "").strip().split("\n\n")[0].split()).rstrip(".")
 
 
-def _reading(made: Board, parts: Parts) -> None:
+def _reading(computer: Board, parts: Parts) -> None:
     """The states of a chain or a system as they are measured."""
-    made.inputs["x"] = made.state["x"] = real(*np.shape(parts.initial))
-    made.about["x"] = "the state as it is measured, in its own units"
-    made.stages.append(Stage("sense", "The state as the law sees it.", ("in.x",), lambda given, x: {"now.x": x}))
+    computer.inputs["x"] = computer.state["x"] = real(*np.shape(parts.initial))
+    computer.about["x"] = "the state as it is measured, in its own units"
+    computer.stages.append(Stage("sense", "The state as the law sees it.", ("in.x",), lambda given, x: {"now.x": x}))
 
 
 _MEASURED = {
@@ -156,26 +156,26 @@ def _signed(law: Law, target: Any, q: Any, w: Any, before: Any, tracking: Any) -
     return jnp.where(tracking != 0, going_on, law.align(AttitudeState(q, w), target).q)
 
 
-def _tracking(made: Board) -> None:
+def _tracking(computer: Board) -> None:
     """Star tracker and gyro as they are."""
-    made.inputs |= {"attitude": real(4), "rate": real(3)}
-    made.state |= {"attitude": real(4), "rate": real(3)}
-    made.about |= _MEASURED
+    computer.inputs |= {"attitude": real(4), "rate": real(3)}
+    computer.state |= {"attitude": real(4), "rate": real(3)}
+    computer.about |= _MEASURED
 
-    def sense(given: Any, measured: Any, rate: Any, before: Any, tracking: Any, t: Any) -> dict[str, Any]:
-        attitude = _signed(given["law"], given["reference"](t), _unit(measured), rate, before, tracking)
+    def sense(parameters: Any, measured: Any, rate: Any, before: Any, tracking: Any, t: Any) -> dict[str, Any]:
+        attitude = _signed(parameters["law"], parameters["reference"](t), _unit(measured), rate, before, tracking)
         return {"now.attitude": attitude, "now.rate": rate}
 
     reads = ("in.attitude", "in.rate", "before.attitude", "tracking", "t")
-    made.stages.append(Stage("sense", "Attitude and rate as the law sees them: as measured.", reads, sense))
+    computer.stages.append(Stage("sense", "Attitude and rate as the law sees them: as measured.", reads, sense))
 
 
-def _filtering(made: Board, filter_: Any, *, aged: bool) -> None:
+def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
     """Star tracker and gyro through the attitude filter; aged: the star tracker has times of its own."""
     age = {"attitude_age": real()} if aged else {}
-    made.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
-    made.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
-    made.about |= _MEASURED | {
+    computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
+    computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
+    computer.about |= _MEASURED | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
         "attitude_age": "how long before this sample that attitude was taken, from 0 to the time since the last [s]",
         "bias": "of the gyro, estimated [rad/s]",
@@ -183,121 +183,125 @@ def _filtering(made: Board, filter_: Any, *, aged: bool) -> None:
     }
 
     def sense(
-        given: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any, tracking: Any,
-        t: Any, *aged: Any,
+        parameters: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any,
+        tracking: Any, t: Any, *aged: Any,
     ) -> dict[str, Any]:  # fmt: skip
-        known, measured, one = given["filter"], _unit(star), jnp.ones_like(dt)
+        attitude_filter, measured, one = parameters["filter"], _unit(star), jnp.ones_like(dt)
         start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
         old = Estimate(start, bias)
         if aged:
             age = jnp.clip(aged[0], 0.0, dt)
-            found = jax.lax.cond(
+            estimate = jax.lax.cond(
                 valid != 0,
-                lambda: known.correct_between(old, gyro_before, gyro, dt, measured, age, one),
-                lambda: known.propagate(old, gyro_before, gyro, dt),
+                lambda: attitude_filter.correct_between(old, gyro_before, gyro, dt, measured, age, one),
+                lambda: attitude_filter.propagate(old, gyro_before, gyro, dt),
             )
         else:
-            ahead = known.propagate(old, gyro_before, gyro, dt)
-            found = jax.lax.cond(valid != 0, lambda: known.correct(ahead, measured, one), lambda: ahead)
-        rate = gyro - found.bias
-        attitude = _signed(given["law"], given["reference"](t), found.q, rate, start, tracking)
-        return {"now.attitude": attitude, "now.rate": rate, "now.bias": found.bias, "now.gyro": gyro}
+            ahead = attitude_filter.propagate(old, gyro_before, gyro, dt)
+            estimate = jax.lax.cond(valid != 0, lambda: attitude_filter.correct(ahead, measured, one), lambda: ahead)
+        rate = gyro - estimate.bias
+        attitude = _signed(parameters["law"], parameters["reference"](t), estimate.q, rate, start, tracking)
+        return {"now.attitude": attitude, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
 
     about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
              "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
-    made.stages.append(Stage("sense", about, reads, sense, (filter_,)))
+    computer.stages.append(Stage("sense", about, reads, sense, (filter_,)))
 
 
-def _observing(made: Board, observer: Observer, device: Actuators | None) -> None:
+def _observing(computer: Board, observer: Observer, device: Actuators | None) -> None:
     """The disturbance by what the last period's motion shows."""
     m, wheels = observer.model.inputs, None if device is None else device.wheels
-    made.state["observer"] = shapes(observer.begin())
-    made.outputs["d_hat"] = real(m)
-    made.about |= {"observer": "memory of the observer, which begins with the estimate",
-                   "d_hat": f"estimated disturbance{made.unit}"}  # fmt: skip
+    computer.state["observer"] = shapes(observer.begin())
+    computer.outputs["d_hat"] = real(m)
+    computer.about |= {"observer": "memory of the observer, which begins with the estimate",
+                   "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
     if wheels is not None:
-        made.inputs["wheel_momentum"] = made.state["wheel_momentum"] = real(*np.shape(wheels.initial))
-        made.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
+        computer.inputs["wheel_momentum"] = computer.state["wheel_momentum"] = real(*np.shape(wheels.initial))
+        computer.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
         acted = ("before.wheel_momentum", "in.wheel_momentum")
     elif device is not None and device.moves:
-        made.inputs["applied"] = real(m)
-        made.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
+        computer.inputs["applied"] = real(m)
+        computer.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
         acted = ("in.applied",)
     else:
         acted = ("last.command",) if device is None else ("last.torque",)
 
-    def observe(given: Any, t: Any, dt: Any, regular: Any, memory: Any, *read: Any) -> dict[str, Any]:
-        known, size = given["observer"], len(made.seen)
-        model, before, now = known.model, made.state_of(read[:size]), made.state_of(read[size : 2 * size])
+    def observe(parameters: Any, t: Any, dt: Any, regular: Any, memory: Any, *read: Any) -> dict[str, Any]:
+        known, size = parameters["observer"], len(computer.seen)
+        model, before, now = known.model, computer.state_of(read[:size]), computer.state_of(read[size : 2 * size])
 
         def updated() -> Any:
             applied = read[2 * size]
             if wheels is not None:
                 h_before, h_now = read[2 * size :]
-                axes = given["actuators"].wheels.axes
+                axes = parameters["actuators"].wheels.axes
                 stored = axes @ (0.5 * (h_before + h_now))
                 turning = (model.velocity(before) + model.velocity(now)) / 2
                 applied = axes @ ((h_before - h_now) / dt) - jnp.cross(turning, stored)
             impulse = model.unexplained_impulse(t, before, now, applied, dt)
-            return known.update(given["observer_matrix"], memory, impulse, t, dt)
+            return known.update(parameters["observer_matrix"], memory, impulse, t, dt)
 
         memory = jax.lax.cond(regular != 0, updated, lambda: memory)
-        found = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
-        return found if wheels is None else {**found, "now.wheel_momentum": read[-1]}
+        written = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
+        return written if wheels is None else {**written, "now.wheel_momentum": read[-1]}
 
-    states = [f"{when}.{name}" for when in ("before", "now") for name in made.seen]
+    states = [f"{when}.{name}" for when in ("before", "now") for name in computer.seen]
     reads = ("t", "dt", "regular", "before.observer", *states, *acted)
     about = "The disturbance that explains the motion since the last sample, through the observer."
-    made.stages.append(Stage("observe", about, reads, observe, (observer,)))
+    computer.stages.append(Stage("observe", about, reads, observe, (observer,)))
 
 
-def _commanding(made: Board, law: Law, observer: Observer) -> None:
+def _commanding(computer: Board, law: Law, observer: Observer) -> None:
     """The law, before and after its hand-over."""
     m, memory = observer.model.inputs, law.begin()
-    x = made.state_of(tuple(made.state[name] for name in made.seen))
-    target = jax.eval_shape(made.parameters["reference"], real())
+    x = computer.state_of(tuple(computer.state[name] for name in computer.seen))
+    target = jax.eval_shape(computer.parameters["reference"], real())
 
     def once(law: Law, x: Any, target: Any) -> Any:
         return law.command(memory, Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(())), x, target, jnp.zeros(m),
                            jnp.zeros(()))[1]  # fmt: skip
 
-    made.state["law"] = shapes(memory)
-    made.outputs |= {"command": real(m), "s": jax.eval_shape(once, law, x, target)}
-    made.about |= {"law": "memory of the law", "command": f"what the law asks for{made.unit}", "s": "sliding variable"}
+    computer.state["law"] = shapes(memory)
+    computer.outputs |= {"command": real(m), "s": jax.eval_shape(once, law, x, target)}
+    computer.about |= {
+        "law": "memory of the law",
+        "command": f"what the law asks for{computer.unit}",
+        "s": "sliding variable",
+    }
     singular = any(_depends(law.clearance, x, target))
     if singular:
-        made.state |= {"clearance": real(), "clearance_unit": real()}
-        made.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
+        computer.state |= {"clearance": real(), "clearance_unit": real()}
+        computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
                        "clearance_unit": "what that is counted in"}  # fmt: skip
 
-    def command(given: Any, t: Any, tracking: Any, d_hat: Any, kept: Any, *read: Any) -> dict[str, Any]:
-        known, period = given["law"], given["period"]
-        now, reference = made.state_of(read[: len(made.seen)]), given["reference"](t)
+    def command(parameters: Any, t: Any, tracking: Any, d_hat: Any, last_memory: Any, *read: Any) -> dict[str, Any]:
+        known, period = parameters["law"], parameters["period"]
+        now, reference = computer.state_of(read[: len(computer.seen)]), parameters["reference"](t)
         hold = t >= known.hand_over - ROUNDING * period
 
         def decided() -> Any:
-            return known.command(kept, Sample(t, hold, period), now, reference, d_hat, given["bound"](t))
+            return known.command(last_memory, Sample(t, hold, period), now, reference, d_hat, parameters["bound"](t))
 
         if not singular:
             u, s, after = decided()
             return {"out.command": u, "out.s": s, "now.law": after}
-        last_unit, last_u, last_s = read[len(made.seen) :]
+        last_unit, last_u, last_s = read[len(computer.seen) :]
         distance = known.clearance(now, reference)
         unit = jnp.where(tracking != 0, last_unit, known.clearance_unit(distance))
         clearance = distance / unit
-        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: (last_u, last_s, kept))
+        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: (last_u, last_s, last_memory))
         return {"out.command": u, "out.s": s, "now.law": after, "now.clearance": clearance, "now.clearance_unit": unit}
 
-    states = tuple(f"now.{name}" for name in made.seen)
+    states = tuple(f"now.{name}" for name in computer.seen)
     lasts = ("before.clearance_unit", "last.command", "last.s") if singular else ()
     reads = ("t", "tracking", "out.d_hat", "before.law", *states, *lasts)
     about = "The law: the input for the state as it is seen; the last one where the law is singular."
-    made.stages.append(Stage("command", about, reads, command, (law,)))
+    computer.stages.append(Stage("command", about, reads, command, (law,)))
 
 
-def _begin(given: Any) -> dict[str, Any]:
-    return {"now.observer": given["observer"].begin(), "now.law": given["law"].begin()}
+def _begin(parameters: Any) -> dict[str, Any]:
+    return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin()}
 
 
 def _depends(function: Callable, *args: Any) -> list[bool]:
@@ -306,35 +310,35 @@ def _depends(function: Callable, *args: Any) -> list[bool]:
     return [bool(found) for found in dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))]
 
 
-def _acting(made: Board, device: Actuators, m: int) -> None:
+def _acting(computer: Board, device: Actuators, m: int) -> None:
     """What of the command acts on the body: delay, limits, allocation to wheels."""
     wheels, reads, names = device.wheels, ["out.command"], []
     if device.delay:
-        made.state["queue"] = real(device.delay, m)
-        made.about["queue"] = "commands on their way, the oldest first [N m]"
+        computer.state["queue"] = real(device.delay, m)
+        computer.about["queue"] = "commands on their way, the oldest first [N m]"
         names.append("before.queue")
     if device.moves:
-        made.inputs["acting"] = real(m) if wheels is None else real(*np.shape(wheels.initial))
-        made.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
+        computer.inputs["acting"] = real(m) if wheels is None else real(*np.shape(wheels.initial))
+        computer.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
         names.append("in.acting")
-    made.outputs["torque"] = real(m)
-    made.about["torque"] = "on the body from this sample on, as far as it is known [N m]"
+    computer.outputs["torque"] = real(m)
+    computer.about["torque"] = "on the body from this sample on, as far as it is known [N m]"
     if wheels is not None:
-        made.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
-        made.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
+        computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
+        computer.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
         names += ["in.wheel_momentum", "now.rate"]
 
-    def act(given: Any, u: Any, *read: Any) -> dict[str, Any]:
-        found, known = dict(zip(names, read, strict=True)), given["actuators"]
-        state = ActuatorState(found.get("before.queue"), found.get("in.acting"), found.get("in.wheel_momentum"))
-        rate = found.get("now.rate", jnp.zeros_like(u))
-        drive, queue = known.command(state, u, rate, jnp.zeros(()), given["period"], jnp.ones(()))
-        made = {"limited": drive.limited}
+    def act(parameters: Any, u: Any, *read: Any) -> dict[str, Any]:
+        values, actuators = dict(zip(names, read, strict=True)), parameters["actuators"]
+        state = ActuatorState(values.get("before.queue"), values.get("in.acting"), values.get("in.wheel_momentum"))
+        rate = values.get("now.rate", jnp.zeros_like(u))
+        drive, queue = actuators.command(state, u, rate, jnp.zeros(()), parameters["period"], jnp.ones(()))
+        written = {"limited": drive.limited}
         if queue is not None:
-            made["now.queue"] = queue
+            written["now.queue"] = queue
         if wheels is None:
-            return {**made, "out.torque": drive.c}
-        return {**made, "out.torque": known.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
+            return {**written, "out.torque": drive.c}
+        return {**written, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
 
-    made.stages.append(Stage("act", "What of the command acts on the body: limits, delay, wheels.", (*reads, *names),
-                             act, (device,)))  # fmt: skip
+    what = "What of the command acts on the body: limits, delay, wheels."
+    computer.stages.append(Stage("act", what, (*reads, *names), act, (device,)))

@@ -85,8 +85,8 @@ def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
 
 def gain_of(part: Any, name: str) -> str:
     """What a gain of one's own says of itself."""
-    about = getattr(type(part), "__dataclass_fields__", {}).get(name)
-    gain = None if about is None else about.metadata.get("gain")
+    declared = getattr(type(part), "__dataclass_fields__", {}).get(name)
+    gain = None if declared is None else declared.metadata.get("gain")
     if gain is None:
         return ""
     return f"{gain.meaning or name.replace('_', ' ')} [{gain.unit or '-'}]"

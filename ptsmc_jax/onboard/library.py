@@ -100,17 +100,17 @@ class Library:
         self._made.ptsmc_set(_at(self.parameters))
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
-        glue, made = place / "glue.c", place / "controller.so"
+        glue, library = place / "glue.c", place / "controller.so"
         glue.write_text(GLUE.replace("@name@", self.name), encoding="utf-8")
         sources = [self.folder / f"ptsmc_{self.name}{end}.c" for end in ("", "_parameters")]
         command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{self.folder}", *map(str, sources)]
-        done = subprocess.run(
-            [*command, str(glue), "-o", str(made), "-lm"], capture_output=True, text=True, check=False
+        compiled = subprocess.run(
+            [*command, str(glue), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
         )
-        if done.returncode:
-            first = (done.stderr.strip().splitlines() or ["for no reason told"])[0]
+        if compiled.returncode:
+            first = (compiled.stderr.strip().splitlines() or ["for no reason told"])[0]
             raise ScenarioError(f"the controller in {self.folder} does not compile: {first}")
-        return made
+        return library
 
     def first(self) -> np.ndarray:
         """The state that `ptsmc_init` leaves."""
@@ -183,24 +183,24 @@ class InTheLoop:
             read, sensing = sensors.sample(
                 sensing, x, now, dt_before, *(() if period.within is None else (period.within,))
             )
-        known = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
+        inputs = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
-            known["applied"] = computer.applied[0]
+            inputs["applied"] = computer.applied[0]
         if self.board.spacecraft:
-            known |= {"attitude": read.q, "rate": read.w}
+            inputs |= {"attitude": read.q, "rate": read.w}
         if sensors is not None and hasattr(sensors, "star_weight"):
-            known["attitude_age"] = sensors.star_age(now.sample, dt_before)
-            known["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
-        given = jnp.concatenate([now.t[None], *(jnp.ravel(known[name]) for name in self.board.inputs)])
-        after, out = self._stepped(state, given)
+            inputs["attitude_age"] = sensors.star_age(now.sample, dt_before)
+            inputs["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
+        row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
+        after, out = self._stepped(state, row)
         after = jnp.where(period.length > 0.0, after, state)
-        found = self._trees(self.board.outputs, out, 0)
-        kept = self._trees(self.board.state, after, 3)
-        channels = found.get("wheel_torque", found.get("torque"))
-        seen = self.board.state_of(tuple(kept[name] for name in self.board.seen))
-        decision = Decision(parts.reference(now.t), found["d_hat"], found["command"], found["s"],
+        outputs = self._trees(self.board.outputs, out, 0)
+        memory = self._trees(self.board.state, after, 3)
+        channels = outputs.get("wheel_torque", outputs.get("torque"))
+        seen = self.board.state_of(tuple(memory[name] for name in self.board.seen))
+        decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
                             parts.plant.velocity(seen), channels)  # fmt: skip
-        return decision, Computer((sensing, after), seen, kept["observer"], kept["law"], computer.applied)
+        return decision, Computer((sensing, after), seen, memory["observer"], memory["law"], computer.applied)
 
     def _stepped(self, state: Any, given: Any) -> tuple[Any, Any]:
         shapes = (
@@ -220,7 +220,7 @@ class InTheLoop:
 
     def _trees(self, shapes: dict[str, Any], row: Any, at: int) -> dict[str, Any]:
         """Named trees from a row of numbers, from a place on."""
-        found = {}
+        trees = {}
         for name, shape in shapes.items():
             leaves, tree = jax.tree.flatten(shape)
             values = []
@@ -228,5 +228,5 @@ class InTheLoop:
                 size = int(np.prod(leaf.shape, dtype=int))
                 values.append(row[at : at + size].reshape(leaf.shape).astype(leaf.dtype))
                 at += size
-            found[name] = jax.tree.unflatten(tree, values)
-        return found
+            trees[name] = jax.tree.unflatten(tree, values)
+        return trees

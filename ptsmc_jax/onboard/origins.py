@@ -36,12 +36,12 @@ def frames(eqn: Any) -> list[Frame]:
     """The calls that led to an equation, the innermost first, without JAX's own."""
     trace = eqn.source_info.traceback
     codes, at = ((), ()) if trace is None else trace.raw_frames()
-    found = []
+    calls = []
     for code, where in zip(codes, at, strict=True):
         file = code.co_filename
         if not Path(file).is_relative_to(JAX) and not any(part in file for part in FOREIGN):
-            found.append(Frame(file, code.co_qualname, _spans(code)[where // 2]))
-    return found
+            calls.append(Frame(file, code.co_qualname, _spans(code)[where // 2]))
+    return calls
 
 
 @functools.cache
@@ -49,10 +49,10 @@ def _spans(code: Any) -> list[tuple[int, int, int, int]]:
     return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
 
 
-def line(found: list[Frame]) -> str:
+def line(calls: list[Frame]) -> str:
     """File and line as an error says them, the user's own where they are; empty where nothing is known."""
-    own = [frame for frame in found if not Path(frame.file).is_relative_to(LIBRARY)]
-    inside = own if own and found[0] in own else found  # who calls the library is not who is to blame
+    users = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
+    inside = users if users and calls[0] in users else calls  # who calls the library is not who is to blame
     return f"{inside[0].file}:{inside[0].span[0]}" if inside else ""
 
 
@@ -100,11 +100,11 @@ def _tree(file: str) -> ast.Module | None:
 @functools.cache
 def _values(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
     """What happens to the value of an expression: by its position ("assign" or "return", names, which of several)."""
-    found: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
+    uses: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
     tree = _tree(file)
     for node in ast.walk(tree) if tree is not None else ():
         if isinstance(node, ast.Call):  # SurfaceGains(c=.., e=..)
-            found |= {_span(word.value): ("assign", (word.arg,), None) for word in node.keywords if word.arg}
+            uses |= {_span(word.value): ("assign", (word.arg,), None) for word in node.keywords if word.arg}
         if isinstance(node, ast.Return) and node.value is not None:
             kind, names, value = "return", (), node.value
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
@@ -116,10 +116,10 @@ def _values(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, 
         if isinstance(value, ast.Tuple):
             for k, element in enumerate(value.elts):
                 if kind == "return" or len(names) == len(value.elts):
-                    found[_span(element)] = (kind, names, k)
+                    uses[_span(element)] = (kind, names, k)
         else:
-            found[_span(value)] = (kind, names, None)
-    return found
+            uses[_span(value)] = (kind, names, None)
+    return uses
 
 
 def _span(node: Any) -> tuple[int, int, int, int]:
@@ -142,20 +142,20 @@ def _about(file: str, at: int) -> str:
 
 def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
     """(class, docstring) of a part's class and of those it is derived from, up to the common ones."""
-    found = []
+    texts = []
     for cls in type(part).__mro__:
         if cls in until or cls.__module__ in ("builtins", "abc", "typing"):
             continue
         text = cls.__dict__.get("__doc__")
-        if text and not text.startswith(f"{cls.__name__}(") and text not in [said for _, said in found]:
-            found.append((cls.__name__, inspect.cleandoc(text)))
-    return found
+        if text and not text.startswith(f"{cls.__name__}(") and text not in [said for _, said in texts]:
+            texts.append((cls.__name__, inspect.cleandoc(text)))
+    return texts
 
 
 @functools.cache
 def comments(cls: type) -> dict[str, str]:
     """What stands beside each field of a class in the source: meaning and unit."""
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         try:
             source = textwrap.dedent(inspect.getsource(base))
@@ -169,8 +169,8 @@ def comments(cls: type) -> dict[str, str]:
                 above.append(alone[1])
                 continue
             if field and not text.strip().endswith(":"):
-                said = field[2] or " ".join(above)
-                if said:
-                    found[field[1]] = said.strip()
+                meaning = field[2] or " ".join(above)
+                if meaning:
+                    meanings[field[1]] = meaning.strip()
             above = []
-    return found
+    return meanings

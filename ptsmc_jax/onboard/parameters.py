@@ -57,11 +57,11 @@ class Parameters:
         """What the rules compute: a block, and by name what it gives."""
         pool = Pool()
         results = Translator(pool).evaluate(_traced(self, self.rules), self.nodes(pool, {}))
-        found: dict[str, np.ndarray] = {}
+        derived: dict[str, np.ndarray] = {}
         for made, result in zip(self.fields, results, strict=True):
             if made.name in self.derived:
-                found.setdefault(made.name, result)
-        return pool.block, found
+                derived.setdefault(made.name, result)
+        return pool.block, derived
 
 
 def nodes_of(pool: Pool, text: str, made: Field, places: dict[str, str], pointer: str) -> np.ndarray:

@@ -47,11 +47,11 @@ def filled(file: str, **values: str) -> str:
     return text
 
 
-def member(made: Field) -> list[str]:
+def member(field: Field) -> list[str]:
     """A line of a struct, with what the field is."""
-    size = "".join(f"[{n}]" for n in made.shape)
-    text = f"    {declared(made.kind).replace('real', 'ptsmc_real')} {made.name}{size};"
-    about = " ".join(made.about.split()).replace("*/", "* /")
+    size = "".join(f"[{n}]" for n in field.shape)
+    text = f"    {declared(field.kind).replace('real', 'ptsmc_real')} {field.name}{size};"
+    about = " ".join(field.about.split()).replace("*/", "* /")
     if not about:
         return [text]
     line = f"{text} /* {about} */"
@@ -61,17 +61,17 @@ def member(made: Field) -> list[str]:
 def struct(name: str, about: str, members: Sequence[Field], first: Sequence[str] = (), last: Sequence[str] = ()) -> str:
     """A struct of C."""
     lines = [*comment(about), "typedef struct {", *first]
-    for made in members:
-        lines += member(made)
+    for field in members:
+        lines += member(field)
     return "\n".join([*lines, *last, f"}} {name};"])
 
 
 def header(code: Code, about: About) -> str:
     """ptsmc_NAME.h."""
     guard = f"PTSMC_{about.name.upper()}_H"
-    listed = []
-    for k, (name, said) in enumerate(STATUS.items()):
-        listed += [*comment(said, "    "), f"    PTSMC_{name} = {k}{',' if k + 1 < len(STATUS) else ''}"]
+    statuses = []
+    for k, (name, meaning) in enumerate(STATUS.items()):
+        statuses += [*comment(meaning, "    "), f"    PTSMC_{name} = {k}{',' if k + 1 < len(STATUS) else ''}"]
     remembered = "What is remembered from sample to sample; ptsmc_init fills it."
     time = ["    double t; /* of the sample, from the start of the manoeuvre [s]; double, since it is subtracted */"]
     flags = ["    double t; /* of the last sample [s] */", "    int started; /* 0 until the first sample */",
@@ -86,7 +86,7 @@ def header(code: Code, about: About) -> str:
         "What follows from the parameters, and the parameters that it was computed from: ptsmc_init computes it, and "
         "ptsmc_step anew where they have changed."
     )
-    basis = [dataclasses.replace(made, name=f"of_{made.name}", about="") for made in code.basis]
+    basis = [dataclasses.replace(field, name=f"of_{field.name}", about="") for field in code.basis]
     last = ["    ptsmc_out last; /* good one */", *(["    ptsmc_derived derived;"] if code.derived else [])]
     return "\n\n".join([
         "\n".join(comment(f"ptsmc_{about.name}.h: {about.law}, from {about.scenario}.\nMade by ptsmc export; scenario "
@@ -97,7 +97,7 @@ def header(code: Code, about: About) -> str:
         "/* Numbers: double, or float with -DPTSMC_REAL=float. */\n#ifndef PTSMC_REAL\n#define PTSMC_REAL double\n"
         "#endif\ntypedef PTSMC_REAL ptsmc_real;",
         f'#define PTSMC_SCENARIO "{about.digest}"',
-        "\n".join(["/* What ptsmc_step returns, the gravest last. */", "enum ptsmc_status {", *listed, "};"]),
+        "\n".join(["/* What ptsmc_step returns, the gravest last. */", "enum ptsmc_status {", *statuses, "};"]),
         struct("ptsmc_params", parameters, code.parameters),
         struct("ptsmc_in", "What is measured at a sample.", code.inputs, time),
         struct("ptsmc_out", "What comes of it.", code.outputs),
@@ -117,8 +117,8 @@ def values(code: Code, about: About) -> str:
     lines = [*comment(f"The parameters of {about.scenario} (SHA-256 {about.digest})."),
              f'#include "ptsmc_{about.name}.h"', "", "#define R(x) ((ptsmc_real)(x))", "",
              "const ptsmc_params ptsmc_parameters = {"]  # fmt: skip
-    for made in code.parameters:
-        lines += [f"    {_initial(code.values[made.name], made.kind)}, /* {made.name} */"]
+    for field in code.parameters:
+        lines += [f"    {_initial(code.values[field.name], field.kind)}, /* {field.name} */"]
     lines[-1] = (
         lines[-1].replace("}, /*", "} /*") if lines[-1].startswith("    {") else lines[-1].replace("), /*", ") /*")
     )
@@ -174,17 +174,17 @@ HELPERS = {
 }
 
 
-def _within(made: Field, owner: str) -> str:
-    if not made.shape:
-        return f"within(&{owner}{made.name}, 1)"
-    return f"within(&{owner}{made.name}{'[0]' * len(made.shape)}, {made.size})"
+def _within(field: Field, owner: str) -> str:
+    if not field.shape:
+        return f"within(&{owner}{field.name}, 1)"
+    return f"within(&{owner}{field.name}{'[0]' * len(field.shape)}, {field.size})"
 
 
-def _finite(made: Field, owner: str) -> str:
-    if not made.shape:
-        return f"isfinite({owner}{made.name})"
-    first = owner + made.name + "[0]" * len(made.shape)
-    return f"finite(&{first}, {made.size})"
+def _finite(field: Field, owner: str) -> str:
+    if not field.shape:
+        return f"isfinite({owner}{field.name})"
+    first = owner + field.name + "[0]" * len(field.shape)
+    return f"finite(&{first}, {field.size})"
 
 
 def _all(terms: Sequence[str], indent: str) -> list[str]:
@@ -193,7 +193,7 @@ def _all(terms: Sequence[str], indent: str) -> list[str]:
 
 
 def _checks(code: Code, about: About) -> list[str]:
-    reals = [made for made in code.inputs if made.kind == REAL]
+    reals = [field for field in code.inputs if field.kind == REAL]
     lines = ["static int finite(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
              "        if (!isfinite(v[k])) {", "            return 0;", "        }", "    }", "    return 1;", "}", "",
              f"/* Finite and no larger than {'1e6' if about.spacecraft else '1e12'}: what is larger would stay in the "
@@ -205,8 +205,8 @@ def _checks(code: Code, about: About) -> list[str]:
     parameters = "const ptsmc_params *p, " if about.spacecraft else ""
     lines += [f"static int usable({parameters}const ptsmc_state *state, const ptsmc_in *in)", "{"]
     of_star = ("attitude", "attitude_age") if about.filtered else ()
-    required = [made for made in reals if made.name not in of_star]
-    aged = any(made.name == "attitude_age" for made in reals)
+    required = [field for field in reals if field.name not in of_star]
+    aged = any(field.name == "attitude_age" for field in reals)
     if about.spacecraft:
         lines += [
             "    const real *const q = in->attitude;", "    const real *const w = in->rate;",
@@ -226,11 +226,11 @@ def _checks(code: Code, about: About) -> list[str]:
     else:
         turned = []
     terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)",
-             *(_within(made, "in->") for made in required), *turned]  # fmt: skip
+             *(_within(field, "in->") for field in required), *turned]  # fmt: skip
     lines += [*_all(terms, "        "), "}", "", "/* Whether everything that is kept, and goes out, is finite. */",
               "static int sound(const ptsmc_state *now, const ptsmc_out *out)", "{"]  # fmt: skip
-    kept = [_finite(made, "now->") for made in code.state if made.kind == REAL]
-    lines += [*_all([*kept, *(_finite(made, "out->") for made in code.outputs)], "        "), "}"]
+    kept = [_finite(field, "now->") for field in code.state if field.kind == REAL]
+    lines += [*_all([*kept, *(_finite(field, "out->") for field in code.outputs)], "        "), "}"]
     return [*lines, *_current(code)] if code.derived else lines
 
 
@@ -253,7 +253,7 @@ def _current(code: Code) -> list[str]:
 
 def _step(code: Code, about: About) -> list[str]:
     call = code.calls
-    singular = any(made.name == "clearance" for made in code.state)
+    singular = any(field.name == "clearance" for field in code.state)
     derived = ["    derive(p, &state->derived);"] if code.derived else []
     again = (
         ["    if (!current(p, &state->derived)) {", *(f"    {line}" for line in derived), "    }"] if derived else []

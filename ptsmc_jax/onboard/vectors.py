@@ -55,7 +55,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = law.align(parts.initial, target)
     k2 = parts.observer.error_bound()
-    listed, about, started = schedule(parts, ticks)
+    listed, period_of, started = schedule(parts, ticks)
     walk = walk_stream(seed, trial)
     sensors, wheels = parts.sensors, actuators.wheels
 
@@ -68,14 +68,14 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             measured, _ = sensors.sample(sensing, there, now, dt_before, *(() if within is None else (within,)))
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
-        period = about(tick)._replace(within=within)
+        period = period_of(tick)._replace(within=within)
         (target, d_hat, u, s, w, _), computer = decide(parts, k2, period, computer, there)
         drive, queue = actuators.command(acting, u, w, now.t, dt, now.noise_weight)
         if pushed is not None:
             pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
         until = partial(_until, parts, now, x, drive, pushed)
         x_next, after = until(now.t_next), seen_within(parts, now, until)
-        known = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
+        brought = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.clearance_unit(distance), unit)
         row = Samples(
@@ -90,7 +90,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
         )  # fmt: skip
-        computer, acting = computer._replace(applied=known), actuators.end(acting, drive, queue, dt)
+        computer, acting = computer._replace(applied=brought), actuators.end(acting, drive, queue, dt)
         return (x_next, computer, acting, pushed, unit, after), row
 
     computer = boot(parts, seed, trial, parts.plant.seen(x0), started)
@@ -132,21 +132,21 @@ def one(samples: Samples, trial: int) -> Samples:
 
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
-    given = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
+    inputs = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
              "acting": samples.acting, "attitude_valid": samples.valid, "attitude_age": samples.age}  # fmt: skip
-    kept = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
+    state_by_name = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
             "wheel_momentum": samples.momentum, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
     if board.spacecraft:
-        given |= {"attitude": samples.measured.q, "rate": samples.measured.w}
-        kept |= {"attitude": samples.seen.q, "rate": samples.seen.w}
+        inputs |= {"attitude": samples.measured.q, "rate": samples.measured.w}
+        state_by_name |= {"attitude": samples.seen.q, "rate": samples.seen.w}
     if samples.estimate is not None:
-        kept |= {"bias": samples.estimate.bias, "gyro": samples.gyro}
-    came = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
+        state_by_name |= {"bias": samples.estimate.bias, "gyro": samples.gyro}
+    outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
     one = np.ones_like(samples.t)
-    outputs = _columns(board.outputs, came)
-    state = np.column_stack([samples.t, one, one, _columns(board.state, kept), outputs])
-    return np.column_stack([samples.t, _columns(board.inputs, given)]), outputs, state
+    outputs = _columns(board.outputs, outputs_by_name)
+    state = np.column_stack([samples.t, one, one, _columns(board.state, state_by_name), outputs])
+    return np.column_stack([samples.t, _columns(board.inputs, inputs)]), outputs, state
 
 
 def first_state(board: Board, samples: Samples) -> np.ndarray:

@@ -174,25 +174,25 @@ def system(
     """
     if not isinstance(n, int) or n < 1:
         raise ValueError(f"n is {n}, but must be a whole number of at least 1")
-    one = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    vector = jax.ShapeDtypeStruct((n,), one.dtype)
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    vector = jax.ShapeDtypeStruct((n,), number.dtype)
     z = _hidden(z0, Z)
     whole = (vector, vector) if Z is None else (vector, vector, z)
-    asked: list[tuple[str, Any, tuple, tuple]] = [
+    signatures: list[tuple[str, Any, tuple, tuple]] = [
         ("F(t, x_1, x_2)", F, (vector, vector), (n,)),
         ("H(t, x_1, x_2)" if Z is None else "H(t, x_1, x_2, z)", H, whole, (n,)),
         ("G(t, x_1, x_2)", G, (vector, vector), (n, n)),
         ("D(t, x_1, x_2)", D, (vector, vector), (n, n)),
         ("Z(t, x_1, x_2, z, u)", Z, (vector, vector, z, vector), z.shape),
     ]
-    for name, function, arguments, shape in asked:
+    for name, function, arguments, shape in signatures:
         if function is None:
             continue
         try:
-            returned = jax.eval_shape(function, one, *arguments)
+            returned = jax.eval_shape(function, number, *arguments)
         except Exception as error:
-            said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-            raise ValueError(f"{name} fails for x_1 and x_2 of shape ({n},): {said}") from error
+            failure = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            raise ValueError(f"{name} fails for x_1 and x_2 of shape ({n},): {failure}") from error
         got = getattr(returned, "shape", type(returned).__name__)
         if got != shape:
             raise ValueError(f"{name} returns {got}, but for n = {n} must return an array {shape}")
@@ -200,8 +200,8 @@ def system(
     definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
     if not definite:
         raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
-    made = called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
-    return System(*made) if Z is None else HiddenSystem(*made, called(Z), z)
+    arrays = called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
+    return System(*arrays) if Z is None else HiddenSystem(*arrays, called(Z), z)
 
 
 def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:

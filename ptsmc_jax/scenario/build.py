@@ -65,11 +65,11 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
     phases, amplitudes = (disturbances.values(parts.disturbance, what).size for what in ("phase", "amplitude"))
 
     def drawn(key: str, *how: Any) -> Any:
-        asked = getattr(table, key, None)
-        return None if asked is None else asked.build(*how)
+        kind = getattr(table, key, None)
+        return None if kind is None else kind.build(*how)
 
     levels = {key: drawn(key) for key in variation.LEVELS}
-    asked = {key: getattr(table, key, None) for key in MISFITS}
+    misfits = {key: getattr(table, key, None) for key in MISFITS}
     return variation.Dispersion(
         **scenario.spread(parts),
         phase=None if table.disturbance_phase is None else numbers.UniformPhase(phases),
@@ -80,7 +80,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         # one of no width is none, so that the program is the same, and every digit
         misfits={
             key: MISFITS[key](how, parts)
-            for key, how in asked.items()
+            for key, how in misfits.items()
             if how is not None and not getattr(how, "nothing", False)
         },
     )

@@ -120,12 +120,12 @@ def read(table: Any, name: str, code: object) -> Any:
     name: of the table in the scenario. Raises ScenarioError where there is no such class.
     """
     try:
-        found = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
+        item = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
         base = table.base()
-        if not (isinstance(found, type) and issubclass(found, base)):
-            said = f"a class {found.__name__}" if isinstance(found, type) else f"a {type(found).__name__}"
-            raise ValueError(f"it names {said}, which is not derived from ptsmc_jax.{base.__name__}")
-        return _with_keys(table, found)
+        if not (isinstance(item, type) and issubclass(item, base)):
+            what = f"a class {item.__name__}" if isinstance(item, type) else f"a {type(item).__name__}"
+            raise ValueError(f"it names {what}, which is not derived from ptsmc_jax.{base.__name__}")
+        return _with_keys(table, item)
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
         raise ScenarioError(f"{name}.code is {shown}: {error}") from None
@@ -143,29 +143,29 @@ def _with_keys(table: Any, found: Any) -> Any:
             except TypeError as error:  # such as a field without a default
                 raise ValueError(f"the class {cls.__name__} cannot have such fields: {error}") from None
     common = {field.name: field for field in dataclasses.fields(base)}
-    keys, gains, meanings = [], {}, []
+    key_types, gains, meanings = [], {}, []
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
         if field.name in table.__struct_fields__ and field.name not in common:
             raise ValueError(f"a field of the class {found.__name__} is called {field.name}, which has its meaning")
-        about = field.metadata.get("gain")
-        keys.append((field.name, *_key(field, about)))
-        meaning = "" if about is None else " ".join(about.meaning.split())
-        unit = f" [{about.unit}]" if about is not None and about.unit else ""
+        gain = field.metadata.get("gain")
+        key_types.append((field.name, *_key(field, gain)))
+        meaning = "" if gain is None else " ".join(gain.meaning.split())
+        unit = f" [{gain.unit}]" if gain is not None and gain.unit else ""
         meanings.append(f"    {field.name}: {meaning or 'of one of its own'}{unit}")
-        if about is not None and not table.tuned:
+        if gain is not None and not table.tuned:
             raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
-        if about is not None:
+        if gain is not None:
             if table.prefix + field.name == "observer_gain":
                 raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
-            gains[table.prefix + field.name] = _bounds(field.name, about)
-            _inside(field, about.usual)
-    first = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
+            gains[table.prefix + field.name] = _bounds(field.name, gain)
+            _inside(field, gain.usual)
+    summary = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
     return msgspec.defstruct(
-        found.__name__, keys, bases=(table,), frozen=True, kw_only=True,
+        found.__name__, key_types, bases=(table,), frozen=True, kw_only=True,
         namespace={
-            "__doc__": first + "\n\nAttributes:\n" + "\n".join(meanings),
+            "__doc__": summary + "\n\nAttributes:\n" + "\n".join(meanings),
             "__module__": found.__module__,
             "gains": {**table.gains, **gains},
             "free_by_default": tuple(gains),

@@ -194,14 +194,14 @@ def _law(parts: Parts, ask: _Asked) -> None:
     }
     own = type(law).__mro__[1]  # the class that the code names
     method = next(name for name in methods if getattr(own, name) is not getattr(AccelerationLaw, name))
-    function, given = methods[method]
-    returned = ask(method, function, *given)
-    wanted = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
-    wanted = wanted[: 2 if method == "acceleration" else 3]
-    if not isinstance(returned, tuple) or len(returned) != len(wanted):
-        raise ask.refused(method, _described(returned), ", ".join(wanted))
-    ask.check(method, wanted[0], returned[0], (m,))
-    ask.check(method, wanted[1], returned[1], (m,))
+    function, arguments = methods[method]
+    returned = ask(method, function, *arguments)
+    expected = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
+    expected = expected[: 2 if method == "acceleration" else 3]
+    if not isinstance(returned, tuple) or len(returned) != len(expected):
+        raise ask.refused(method, _described(returned), ", ".join(expected))
+    ask.check(method, expected[0], returned[0], (m,))
+    ask.check(method, expected[1], returned[1], (m,))
     if method != "acceleration":
         ask.same_memory(method, memory, returned[2])
 

@@ -71,9 +71,9 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     run: code of one's own may be run, for its keys.
     """
     _check_shape(raw)
-    known = {"requirements", *(key for layout in TABLES.values() for key in layout)}
+    names = {"requirements", *(key for layout in TABLES.values() for key in layout)}
     for name, table in raw.items():
-        if name in known and not isinstance(table, Mapping):
+        if name in names and not isinstance(table, Mapping):
             raise wrong(name, table, "a table")
     kind = _plant_kind(raw.get("plant", {}))
     kind_of_scenario, layout = SCENARIOS[kind], TABLES[kind]
@@ -86,28 +86,28 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
         if not isinstance(raw[name], Mapping):
             place = _place(name, layout)
             raise ScenarioError(f"{name} = {brief(raw[name])} stands outside a table; {place}")
-        known = (*layout, "requirements")
-        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, known, '[{}]')}")
+        names = (*layout, "requirements")
+        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, names, '[{}]')}")
 
     plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
     law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
     fallback = kind_of_scenario.fallback(plant, raw.get("plant", {}).keys(), law)
-    found: dict[str, Any] = {}
+    tables: dict[str, Any] = {}
     for name in layout:
         if name not in raw and name in layouts.OPTIONAL:
             continue
         given = raw.get(name, {})
         if name == "dispersion":
-            found[name] = _dispersion(given, kind, run)
+            tables[name] = _dispersion(given, kind, run)
         else:
-            found[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
+            tables[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
     for name in ("initial", "reference"):
-        if name in found:
-            attitude_keys.at_most_one(name, found[name])
-    found["requirements"] = {
+        if name in tables:
+            attitude_keys.at_most_one(name, tables[name])
+    tables["requirements"] = {
         key: _requirement(key, value, kind_of_scenario.metrics) for key, value in raw.get("requirements", {}).items()
     }
-    return kind_of_scenario(**found)
+    return kind_of_scenario(**tables)
 
 
 def _check_shape(raw: Mapping[str, Any]) -> None:
@@ -162,9 +162,9 @@ def dump(scenario: Scenario) -> dict[str, Any]:
 
 def as_parsed(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
-    found = plain(scenario)
+    written = plain(scenario)
     tables = [name for name in TABLES[scenario.plant.kind] if name != "tune"]
-    return {name: found[name] for name in (*tables, "requirements", "tune") if name in found}
+    return {name: written[name] for name in (*tables, "requirements", "tune") if name in written}
 
 
 def stated(scenario: Scenario) -> dict[str, Any]:
@@ -181,15 +181,15 @@ def stated(scenario: Scenario) -> dict[str, Any]:
 
 def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
     """What tables hold and raw ones do not, by the path of its key."""
-    found: dict[tuple[str, ...], Any] = {}
+    unsaid: dict[tuple[str, ...], Any] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):
             within = raw.get(key, {})
             inside = not_said(within if isinstance(within, Mapping) else {}, value)
-            found |= {(key, *path): one for path, one in inside.items()}
+            unsaid |= {(key, *path): one for path, one in inside.items()}
         elif key not in raw:
-            found[(key,)] = value
-    return found
+            unsaid[(key,)] = value
+    return unsaid
 
 
 def plain(table: Table) -> dict[str, Any]:
@@ -244,8 +244,8 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
             raise ScenarioError(f"{name}.code is {brief(code)}: {error}") from None
     if run or not isinstance(code, str):
         return _fields(name, raw, own.read(struct, name, code))
-    known = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
-    return _fields(name, {**known, "rest": {k: v for k, v in raw.items() if k not in known}}, own.waiting(struct))
+    own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
+    return _fields(name, {**own_keys, "rest": {k: v for k, v in raw.items() if k not in own_keys}}, own.waiting(struct))
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
@@ -261,15 +261,15 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
 
 def _dispersion(raw: Mapping[str, Any], kind: str, run: bool) -> Table:
     struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
-    found = {}
+    tables = {}
     for key, table in raw.items():
         if key not in struct.__struct_fields__:
             known = nearest(key, struct.__struct_fields__, "dispersion.{}")
             raise ScenarioError(f"dispersion.{key} is not a known key; {known}")
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        found[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], run)
-    return struct(**found)
+        tables[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], run)
+    return struct(**tables)
 
 
 def _requirement(metric: str, value: Any, metrics: Mapping[str, Any]) -> float | Limit:

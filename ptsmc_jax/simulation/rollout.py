@@ -145,7 +145,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     """Measured, computed and held over each control period; digital observer; plant by RK4 under what acts on it."""
     actuators = Actuators() if parts.actuators is None else parts.actuators
     k2 = parts.observer.error_bound()
-    listed, about, started = schedule(parts, ticks)
+    listed, period_of, started = schedule(parts, ticks)
     walk, jitter = walk_stream(seed, trial), jitter_stream(seed, trial)
 
     def late(t: Scalar, sample: Array) -> Scalar:
@@ -156,14 +156,14 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
 
     def period(carry: tuple[_State, _World], tick: tuple) -> tuple[tuple[_State, _World], Any]:
         (now, *_), (state, world) = tick, carry
-        told, pushed, after = now.t_next - now.t, world.pushed, None
+        nominal, pushed, next_late = now.t_next - now.t, world.pushed, None
         if parts.jitter is not None:  # flight software takes samples to come at their times
-            after = late(now.t_next, now.sample + 1)
-            now = now._replace(t=now.t + world.late, t_next=now.t_next + after)
+            next_late = late(now.t_next, now.sample + 1)
+            now = now._replace(t=now.t + world.late, t_next=now.t_next + next_late)
         dt = now.t_next - now.t
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w, channels), computer = software.decide(
-            parts, k2, about(tick)._replace(within=world.within), computer, parts.plant.seen(state.x), world.acting
+            parts, k2, period_of(tick)._replace(within=world.within), computer, parts.plant.seen(state.x), world.acting
         )
         drive, queue = actuators.command(world.acting, u, w, now.t, dt, now.noise_weight)
         drive = drive if channels is None else drive._replace(c=channels)
@@ -182,9 +182,9 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
 
         sight, flown = None if parts.sensors is None else computer.seen, until(now.t_next)
         state = _advance(parts, course, state, now, target, flown, torques, until, dt / parts.substeps, sight)
-        computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, told))
+        computer = computer._replace(applied=None if actuators.holds else brought_about(actuators, drive, nominal))
         acting, within = actuators.end(world.acting, drive, queue, dt), seen_within(parts, now, until)
-        return (state, _World(computer, acting, pushed, within, after)), row
+        return (state, _World(computer, acting, pushed, within, next_late)), row
 
     acting = actuators.begin(parts.plant.inputs)
     state = _begin(parts, course, acting.h)
@@ -340,27 +340,27 @@ def _finish(parts: Parts, course, first, state: _State, memory: Any, k2, rows, w
         target = parts.reference(criteria.t_end)
         hold = criteria.t_end >= parts.controller.hand_over
         d_hat = parts.observer.estimate(memory)
-        about = state.x, target, d_hat, k2(criteria.t_end)
+        at_end = state.x, target, d_hat, k2(criteria.t_end)
         if world is None:
-            u, s = parts.controller.torque(criteria.t_end, hold, *about)
+            u, s = parts.controller.torque(criteria.t_end, hold, *at_end)
         else:  # the input is held
             sample = Sample(criteria.t_end, hold, parts.period)
-            _, s, _ = parts.controller.command(world.computer.law, sample, *about)
+            _, s, _ = parts.controller.command(world.computer.law, sample, *at_end)
             u = state.u
         pushed = None if world is None else world.pushed
         wheels = None if acting is None or acting.h is None else (acting.h, acting.v)
         last = _row(parts, criteria.t_end, state.x, target, d_hat, u, u, s, jnp.asarray(True), pushed, wheels)
         log = jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
-    found = metrics.finish(state.running, criteria)
+    values = metrics.finish(state.running, criteria)
     start = _start(parts, first, None if acting is None else acting.h)
-    unbounded = (state.status == OK) & metrics.unbounded(found, metrics.begin(start, criteria))
+    unbounded = (state.status == OK) & metrics.unbounded(values, metrics.begin(start, criteria))
     missed = (state.status == OK) & (angle_at_t_f > jnp.maximum(LEFT * first.angle, SETTLED * criteria.settling_angle))
     cut = (state.status == OK) & ~jnp.isnan(course.gap)
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
     bad_time = jnp.where(cut, course.gap, bad_time)
-    return Result(found, status, bad_time, log)
+    return Result(values, status, bad_time, log)
 
 
 def _start(parts: Parts, snapshot: Snapshot, wheels: Array | None) -> Start:

@@ -27,18 +27,18 @@ def noise(parts: Parts) -> Noise:
     under the noise of s, E[sech^2(s / width)] / width (statistical linearisation): a few rounds find both.
     """
     run = linear.nominal_jit(parts)
-    found = _covariance(parts, run)
+    sizes = _covariance(parts, run)
     flown = getattr(parts.controller, "sign_width", None)
     if flown is None:
-        return found
+        return sizes
     width = float(flown)
     for _ in range(4):
-        before, width = width, _mean_width(float(flown), found.s)
+        before, width = width, _mean_width(float(flown), sizes.s)
         if np.isclose(width, before, rtol=0.01):
             break
         law = replace(parts.controller, sign_width=jnp.asarray(width))
-        found = _covariance(replace(parts, controller=law), run)
-    return found
+        sizes = _covariance(replace(parts, controller=law), run)
+    return sizes
 
 
 def _mean_width(width: float, sigma: float) -> float:
@@ -62,51 +62,51 @@ def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
     n, m, k, whole = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2], rows.error.shape[2]
     none = Reading(np.eye(k), np.zeros(k), np.ones(k, int), np.zeros(0), np.zeros(0))
     sensors = None if parts.sensors is None else parts.sensors.in_step()
-    said: Reading = none if sensors is None else sensors.reading(h)
-    waiting, own = loops.delay * m, said.own.size
+    reading: Reading = none if sensors is None else sensors.reading(h)
+    waiting, own = loops.delay * m, reading.own.size
     size = n + waiting + own + m
-    mine, walk = slice(n + waiting, n + waiting + own), slice(size - m, size)
+    own_states, walk = slice(n + waiting, n + waiting + own), slice(size - m, size)
     walked = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
     factor = np.zeros((size, own))
-    factor[mine] = np.diag(said.own)
-    if said.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
+    factor[own_states] = np.diag(reading.own)
+    if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
         start = np.zeros((size, 6))
-        kept = whole + k  # after x and what the computer saw of it
-        start[kept : kept + 6] = error_floor.root(said.start[1])
-        factor[kept + 3 : kept + 6] = np.diag(said.own)
+        first = whole + k  # after x and what the computer saw of it
+        start[first : first + 6] = error_floor.root(reading.start[1])
+        factor[first + 3 : first + 6] = np.diag(reading.own)
         factor = np.hstack([factor, start])
     p = factor @ factor.T
     reads = np.zeros((k, size))  # x_seen
-    seen = np.linalg.pinv(said.rows[:, :k])
-    reads[:, :k], reads[:, mine] = np.eye(k), seen @ said.rows[:, k:]
-    noisy = seen * said.noise
+    from_readings = np.linalg.pinv(reading.rows[:, :k])
+    reads[:, :k], reads[:, own_states] = np.eye(k), from_readings @ reading.rows[:, k:]
+    noisy = from_readings * reading.noise
     squares, torque = np.zeros((len(lasting), 2)), 0.0
     for j, index in enumerate(lasting):
         row = jax.tree.map(lambda v, j=j: v[j], rows)
-        one, dt = row.loop, float(ticks.t_next[index] - ticks.t[index])
+        loop, dt = row.loop, float(ticks.t_next[index] - ticks.t[index])
 
         def wide(by_z: np.ndarray, by_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """Rows by the whole state, and by this sample's noise."""
             return np.pad(by_z, [(0, 0), (0, size - n)]) + by_seen @ reads, by_seen @ noisy
 
         (sends, sent), (slides, slid), (moved, entered) = (
-            wide(*both) for both in ((one.command, one.direct), (row.s_command, row.s_direct), (one.a, one.seen))
+            wide(*both) for both in ((loop.command, loop.direct), (row.s_command, row.s_direct), (loop.a, loop.seen))
         )
         moves, enters = np.eye(size), np.zeros((size, noisy.shape[1]))
         moves[:n], enters[:n] = moved, entered
-        moves[:n, walk] += one.disturbed
+        moves[:n, walk] += loop.disturbed
         if waiting:
-            moves[:n, n + waiting - m : n + waiting] += one.new[0]
+            moves[:n, n + waiting - m : n + waiting] += loop.new[0]
             moves[n : n + waiting] = np.eye(size)[n - m : n + waiting - m]
             moves[n : n + m], enters[n : n + m] = sends, sent
         else:
-            moves[:n], enters[:n] = moves[:n] + one.new[0] @ sends, enters[:n] + one.new[0] @ sent
+            moves[:n], enters[:n] = moves[:n] + loop.new[0] @ sends, enters[:n] + loop.new[0] @ sent
         torque = max(torque, float(np.sqrt(np.diag(sends @ p @ sends.T + sent @ sent.T).max())))
         squares[j] = (
             np.trace(row.error @ p[:whole, :whole] @ row.error.T),
             np.mean(np.diag(slides @ p @ slides.T + slid @ slid.T)),
         )
-        drift = np.concatenate([np.zeros(n + waiting), said.own_drift * dt, walked * dt])
+        drift = np.concatenate([np.zeros(n + waiting), reading.own_drift * dt, walked * dt])
         p = moves @ p @ moves.T + enters @ enters.T + np.diag(drift**2)
     t, t_f = ticks.t[lasting], float(parts.controller.t_f)
     late = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))

@@ -94,14 +94,14 @@ def nominal(parts: Parts) -> Nominal:
     assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    listed, about, started = schedule(parts, ticks)
+    listed, period_of, started = schedule(parts, ticks)
     k2, actuators = parts.observer.error_bound(), _actuators(parts)
     x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     model = actuators.begin(parts.plant.inputs)
     computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.seen(x0), started)
 
     def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
-        period = about(tick)
+        period = period_of(tick)
         decision, computer, model = _computed(parts, k2, period, carry, parts.plant.seen(carry.x))
         wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
         x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])

@@ -63,8 +63,8 @@ def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Marg
     return jax.lax.map(partial(of, sensors=sensors, with_delay=with_delay), loops)
 
 
-class _Seen(NamedTuple):
-    """An opened loop, looked at from 0 to the Nyquist frequency."""
+class _Spectrum(NamedTuple):
+    """L of an opened loop from 0 to the Nyquist frequency."""
 
     finite: Array  # bool; of one that is not, numbers mean nothing
     loop: Loop
@@ -88,7 +88,7 @@ class _Seen(NamedTuple):
         return own_L.reshape(m, places), slope.reshape(m, places)
 
 
-def _look(loop: Loop, sensors: bool) -> _Seen:
+def _spectrum(loop: Loop, sensors: bool) -> _Spectrum:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(loop)]))
     loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
     opening = linear.at_sensors(loop) if sensors else linear.at_input(loop)
@@ -96,7 +96,7 @@ def _look(loop: Loop, sensors: bool) -> _Seen:
     quick, w = crossings.in_triangles(opening), crossings.grid(fixed, h)
     each = crossings.each_axis(quick.response(jnp.exp(1j * w * h))[0])
     stable = finite & (jnp.max(jnp.abs(jnp.linalg.eigvals(fixed.closed()))) < 1.0 + NEUTRAL)
-    return _Seen(finite, loop, opening, quick, stable, w, each.T)
+    return _Spectrum(finite, loop, opening, quick, stable, w, each.T)
 
 
 def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
@@ -104,17 +104,17 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
 
     NaN where the loop has a number that is not finite; with_delay: of delay too, else it is NaN.
     """
-    seen = _look(loop, sensors)
-    begin, there, elsewhere = jax.vmap(partial(crossings.brackets, seen.w))(seen.each)
-    root = jax.lax.stop_gradient(_closed_in(seen, begin, there))
-    L, slope = seen.at(jnp.append(root, elsewhere, axis=1), sloped=True)
-    found = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, there, seen.stable)
+    spectrum = _spectrum(loop, sensors)
+    begin, there, elsewhere = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
+    root = jax.lax.stop_gradient(_closed_in(spectrum, begin, there))
+    L, slope = spectrum.at(jnp.append(root, elsewhere, axis=1), sloped=True)
+    values = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, there, spectrum.stable)
     axes = jnp.arange(root.shape[0])
     delay = jnp.full(axes.size, jnp.nan)
     if with_delay and not sensors:
-        delay = jax.vmap(partial(_delay, seen.loop, seen.w))(seen.each, axes)
-    found = found._replace(delay=jnp.where(seen.stable, delay, 0.0))
-    return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(seen.finite, v, jnp.nan), found)
+        delay = jax.vmap(partial(_delay, spectrum.loop, spectrum.w))(spectrum.each, axes)
+    values = values._replace(delay=jnp.where(spectrum.stable, delay, 0.0))
+    return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(spectrum.finite, v, jnp.nan), values)
 
 
 def _crossed(L: Array) -> Array:
@@ -122,7 +122,7 @@ def _crossed(L: Array) -> Array:
     return jnp.append(L[..., : SPLIT[0]].imag, jnp.log(jnp.abs(L[..., SPLIT[0] : SPLIT[1]])), axis=-1)
 
 
-def _closed_in(seen: _Seen, begin: tuple[Array, Array, Array, Array], there: Array) -> Array:
+def _closed_in(spectrum: _Spectrum, begin: tuple[Array, Array, Array, Array], there: Array) -> Array:
     """Frequencies (m, places) [rad/s] of all crossings of all axes, from `crossings.brackets`.
 
     By Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), until none moves by more than the step of Newton's
@@ -133,7 +133,7 @@ def _closed_in(seen: _Seen, begin: tuple[Array, Array, Array, Array], there: Arr
         k, (a, b, f_a, f_b), _ = state
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
         c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
-        L, slope = seen.at(c, sloped=False)
+        L, slope = spectrum.at(c, sloped=False)
         f_c = jnp.append(_crossed(L), (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :], axis=1)
         between = f_c * f_b < 0.0
         moves = jnp.any(there & (jnp.abs(c - b) > 1e-9 * b))
@@ -152,17 +152,17 @@ def roughly(loop: Loop) -> dict[str, Array]:
 
     A tenth of the work of `of`.
     """
-    found = _look(loop, sensors=False)
-    gain, phase, modulus = jax.vmap(crossings.straight)(found.each)
-    delay = jnp.min(jax.vmap(partial(crossings.delay_at, found.w))(found.each)[0], axis=1)
-    sign = jnp.where(found.stable, 1.0, -1.0)
+    spectrum = _spectrum(loop, sensors=False)
+    gain, phase, modulus = jax.vmap(crossings.straight)(spectrum.each)
+    delay = jnp.min(jax.vmap(partial(crossings.delay_at, spectrum.w))(spectrum.each)[0], axis=1)
+    sign = jnp.where(spectrum.stable, 1.0, -1.0)
     each = {
-        "gain_margin": jnp.where(found.stable & (gain >= MOST), jnp.inf, sign * jnp.minimum(gain, MOST)),
+        "gain_margin": jnp.where(spectrum.stable & (gain >= MOST), jnp.inf, sign * jnp.minimum(gain, MOST)),
         "phase_margin": sign * phase,
-        "delay_margin": jnp.where(found.stable, delay, 0.0),
-        "modulus_margin": jnp.where(found.stable, modulus, MOST),
+        "delay_margin": jnp.where(spectrum.stable, delay, 0.0),
+        "modulus_margin": jnp.where(spectrum.stable, modulus, MOST),
     }
-    return {name: jnp.where(found.finite, v, jnp.nan) for name, v in each.items()}
+    return {name: jnp.where(spectrum.finite, v, jnp.nan) for name, v in each.items()}
 
 
 def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> Margins:
@@ -297,9 +297,9 @@ def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None 
     return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
 
 
-def judged_loops(parts: Parts, known: linear.Nominal | None = None) -> tuple[Loop, Array]:
+def judged_loops(parts: Parts, flown: linear.Nominal | None = None) -> tuple[Loop, Array]:
     """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s]."""
-    run = linear.nominal(parts) if known is None else known
+    run = linear.nominal(parts) if flown is None else flown
     indices = moments(parts, run, judged_times(parts))
     return linear.loops_at(parts, run, indices), run.period.now.hold[indices]
 
@@ -316,20 +316,20 @@ judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 
 def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
-    kept, run = judged_times(parts), linear.nominal_jit(parts)
+    judged, run = judged_times(parts), linear.nominal_jit(parts)
     period = float(parts.period)
-    found = at(parts, jnp.append(kept, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
-    known = {t: k for k, t in reversed(list(enumerate(found.t.tolist()))) if not found.hold[k]}
-    order = np.asarray([k for _, k in sorted(known.items())] + [len(found.t) - 1])
-    t, _, loops, margins = jax.tree.map(lambda v: v[order], found)
-    count = (order < kept.size) | (order == order[-1])
+    at_times = at(parts, jnp.append(judged, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
+    places = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
+    order = np.asarray([k for _, k in sorted(places.items())] + [len(at_times.t) - 1])
+    t, _, loops, margins = jax.tree.map(lambda v: v[order], at_times)
+    count = (order < judged.size) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
-    seen = of_each(last, sensors=True)
+    at_sensors = of_each(last, sensors=True)
     swing = rest.swing(parts, history(parts, run))
     at_once = together(jax.tree.map(lambda v: v[0], last)) if swing is None else dict.fromkeys(FIELDS, float("nan"))
     if swing is not None:
-        margins, seen = rest.none_left(margins, order == order[-1]), rest.none_left(seen, [True])
-    return Course(t, count, loops, margins, jax.tree.map(lambda v: np.asarray(v)[0], seen), at_once, swing)
+        margins, at_sensors = rest.none_left(margins, order == order[-1]), rest.none_left(at_sensors, [True])
+    return Course(t, count, loops, margins, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
@@ -369,18 +369,18 @@ def together(loop: Loop) -> dict[str, float]:
 
     if not all(np.isfinite(v).all() for v in jax.tree.leaves(loop)) or unstable():
         return dict.fromkeys(FIELDS, float("nan"))
-    seen, _ = _responses(loop)[1:]
-    least = np.linalg.svd(np.eye(seen.shape[1]) + np.asarray(seen), compute_uv=False)[:, -1].min()
+    response, _ = _responses(loop)[1:]
+    least = np.linalg.svd(np.eye(response.shape[1]) + np.asarray(response), compute_uv=False)[:, -1].min()
     decibels, degrees = np.arange(1.0, 81.0), np.arange(2.0, 181.0, 2.0)
     periods = np.unique(np.append(np.linspace(0.0, 10.0, 41)[1:], np.geomspace(10, 200, 40)))
-    found = (
+    each = (
         first(lambda dB: unstable(10.0 ** (dB / 20.0)), decibels),
         first(lambda dB: unstable(10.0 ** (-dB / 20.0)), decibels),
         first(lambda angle: unstable(np.exp(-1j * np.deg2rad(angle))), degrees),
         first(lambda delay: unstable(delay=delay), periods) * float(loop.period),
         float(-20.0 * np.log10(least)),
     )
-    return dict(zip(FIELDS, found, strict=True))
+    return dict(zip(FIELDS, each, strict=True))
 
 
 @programs.jit

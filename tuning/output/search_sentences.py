@@ -80,20 +80,20 @@ def _far(summary: Summary, metric: str, ratio: float | None) -> str:
 
 def advice(summary: Summary) -> Iterator[str]:
     """What to change where fresh trials break a requirement that the search kept."""
-    found = summary["search"]
-    kept = {metric for metric, ratio in found["largest_over_limit"].items() if ratio is not None and ratio <= 1.0}
-    for told in summary["verdicts"]:
-        over = told["margin"]
-        if told["met"] or told["metric"] not in kept or told.get("at_least") or not told["limit"]:
+    record = summary["search"]
+    kept = {metric for metric, ratio in record["largest_over_limit"].items() if ratio is not None and ratio <= 1.0}
+    for verdict in summary["verdicts"]:
+        over = verdict["margin"]
+        if verdict["met"] or verdict["metric"] not in kept or verdict.get("at_least") or not verdict["limit"]:
             continue
-        more = f"tune.trials = {4 * found.get('averaged', 256)}"
+        larger = f"tune.trials = {4 * record.get('averaged', 256)}"
         if over is None or not math.isfinite(over):
-            yield f"{told['metric']}: kept in the search, but fresh trials fail or lack it: tune with {more}"
+            yield f"{verdict['metric']}: kept in the search, but fresh trials fail or lack it: tune with {larger}"
         else:
-            limit = f"{told['limit'] / (1.02 * over):.3g}"
+            limit = f"{verdict['limit'] / (1.02 * over):.3g}"
             yield (
-                f"{told['metric']}: kept in the search, but fresh trials reach {over:.3g} times the limit: tune with "
-                f"{more}, or with requirements.{told['metric']} = {limit}, by which these gains would keep it"
+                f"{verdict['metric']}: kept in the search, but fresh trials reach {over:.3g} times the limit: tune "
+                f"with {larger}, or with requirements.{verdict['metric']} = {limit}, by which these gains would keep it"
             )
 
 
@@ -132,6 +132,6 @@ def shortest(summary: Summary) -> Iterator[str]:
     """The t_f that the limit on the torque would allow."""
     from tuning.search import design
 
-    found = summary.get("shortest_t_f")
-    if found is not None:
-        yield design.text(found["limit"], found["theory"], found["simulated"])
+    times = summary.get("shortest_t_f")
+    if times is not None:
+        yield design.text(times["limit"], times["theory"], times["simulated"])

@@ -179,14 +179,14 @@ class Descents:
 
         scales: of the descents, by turns.
         """
-        ranked, seen = list(starts), {k: dict[bytes, Sloped]() for k in starts}
-        before = {k: list(self._history.get(k, ())) for k in starts}
+        ranked, points = list(starts), {k: dict[bytes, Sloped]() for k in starts}
+        histories = {k: list(self._history.get(k, ())) for k in starts}
         for count, steps in rungs:
-            some = {k: _Start(starts[k], scales[k % len(scales)], seen[k], before[k]) for k in ranked[:count]}
-            self._descend_in_lockstep(problem, some, steps, what, afresh=afresh)
+            chosen = {k: _Start(starts[k], scales[k % len(scales)], points[k], histories[k]) for k in ranked[:count]}
+            self._descend_in_lockstep(problem, chosen, steps, what, afresh=afresh)
             afresh = False
-            known = [k for k in ranked if k in self._ends]
-            ranked = sorted(known, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
+            ended = [k for k in ranked if k in self._ends]
+            ranked = sorted(ended, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
         return ranked
 
     def _descend_in_lockstep(
@@ -211,16 +211,16 @@ class Descents:
 
         def tell() -> None:
             nonlocal told
-            known = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
-            best = min(known, key=lambda best: best.rank)
+            begun = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
+            best = min(begun, key=lambda best: best.rank)
             while told < len(bests):  # once for each that has begun
                 self._report(what, told, len(starts), *best.so_far)
                 told += 1
 
         def flown(points: list[np.ndarray]) -> list[Sloped]:
             tell()
-            found = self._evaluate.slopes(tightened, np.concatenate(points))
-            return [found.at(k) for k in range(len(points))]
+            measured = self._evaluate.slopes(tightened, np.concatenate(points))
+            return [measured.at(k) for k in range(len(points))]
 
         try:
             in_step([partial(from_start, k) for k in starts], flown, len(jax.local_devices()))
@@ -277,23 +277,23 @@ class Descents:
         if self._own is not None and others:
             self._take_back(problem, self._own, others)
 
-    def _take_back(self, problem: Problem, own: np.ndarray, some: Sequence[int]) -> None:
+    def _take_back(self, problem: Problem, own: np.ndarray, indices: Sequence[int]) -> None:
         """The scenario's own value for as many of some gains as make no difference together."""
-        tightened, found = self.tightened(problem), self.best
+        tightened, current = self.tightened(problem), self.best
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
-            share = np.stack([np.where(np.isin(np.arange(own.size), change), own, found.share) for change in changes])
+            share = np.stack([np.where(np.isin(np.arange(own.size), change), own, current.share) for change in changes])
             flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
-            made = [Best(one, len(problem.rows), self._margin) for one in share]
-            for k, best in enumerate(made):
+            bests = [Best(one, len(problem.rows), self._margin) for one in share]
+            for k, best in enumerate(bests):
                 best.offer(share[k : k + 1], flown.at(k))
-            return made
+            return bests
 
-        alone = dict(zip(some, judged([[k] for k in some]), strict=True))
-        order = sorted((k for k in some if self._as_good(alone[k])), key=lambda k: alone[k].f)
+        alone = dict(zip(indices, judged([[k] for k in indices]), strict=True))
+        order = sorted((k for k in indices if self._as_good(alone[k])), key=lambda k: alone[k].f)
         if order:
             together = judged([order[: k + 1] for k in range(len(order))])
-            self._best = next((best for best in reversed(together) if self._as_good(best)), found)
+            self._best = next((best for best in reversed(together) if self._as_good(best)), current)
 
     def _as_good(self, best: Best) -> bool:
         return best.over <= self.best.over and best.f <= self.best.f + SAME

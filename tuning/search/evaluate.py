@@ -84,22 +84,22 @@ class Evaluator:
     def _measured(
         self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, share: np.ndarray
     ) -> dict[str, np.ndarray]:
-        found = way(problem, share)
+        flown = way(problem, share)
         if problem.margins is None:
-            return found
+            return flown
         # slopes or not, by the one program: another takes longer to compile than most searches would save by it
         each = [margin_rows.sloped(problem.margins, self.bounds, one) for one in share]
         of_loop = {name: np.stack([np.asarray(one[name]) for one in each]) for name in each[0]}
-        wide = max(found["c"].shape[2], of_loop["c"].shape[2])
+        wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
 
-        def padded(c: np.ndarray, kept: float) -> np.ndarray:  # every row as long as the longest
+        def padded(c: np.ndarray, fill: float) -> np.ndarray:  # every row as long as the longest
             widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
-            return np.pad(c, widths, constant_values=kept)
+            return np.pad(c, widths, constant_values=fill)
 
-        both = {name: kept for name, kept in (("c", -1.0), ("c_slope", 0.0)) if name in found}
-        return found | {
-            name: np.concatenate([padded(found[name], kept), padded(of_loop[name], kept)], axis=1)
-            for name, kept in both.items()
+        both = {name: fill for name, fill in (("c", -1.0), ("c_slope", 0.0)) if name in flown}
+        return flown | {
+            name: np.concatenate([padded(flown[name], fill), padded(of_loop[name], fill)], axis=1)
+            for name, fill in both.items()
         }
 
     def _fly(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:

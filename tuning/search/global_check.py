@@ -30,13 +30,13 @@ class Check:
 
 
 def check(
-    evaluate: Evaluator, found: Search, seed: int, report: Report = lambda *_: None, *, sloped: bool = True
+    evaluate: Evaluator, searched: Search, seed: int, report: Report = lambda *_: None, *, sloped: bool = True
 ) -> Check:
     """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
 
     Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
     """
-    problem = found.problem.tightened(1.0 - found.margin)
+    problem = searched.problem.tightened(1.0 - searched.margin)
     before, generation = evaluate.rollouts, 0
 
     def merit(share: np.ndarray) -> np.ndarray:
@@ -64,17 +64,17 @@ def check(
         init="sobol",
         callback=tell,
     )
-    best = Best(result.x, len(problem.rows), found.margin)
+    best = Best(result.x, len(problem.rows), searched.margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
     if sloped:  # near a limit evolution goes slowly: from where it ends, along it
-        run = Descents(evaluate, found.margin, STEPS, np.random.default_rng(seed))
-        run.descend(found.problem, {0: result.x})
+        run = Descents(evaluate, searched.margin, STEPS, np.random.default_rng(seed))
+        run.descend(searched.problem, {0: result.x})
         best = run.best
-    own, seen = evaluate.fly(problem, found.share[None]), evaluate.fly(problem, best.share[None])
+    at_search, at_best = evaluate.fly(problem, searched.share[None]), evaluate.fly(problem, best.share[None])
     return Check(
-        gains=dict(zip(problem.names, seen.gains[0].tolist(), strict=True)),
+        gains=dict(zip(problem.names, at_best.gains[0].tolist(), strict=True)),
         value=best.value,
-        distance=float(own.f[0]) - best.f,
-        kept=bool(seen.c[0].max(initial=-1.0) <= SLACK),
+        distance=float(at_search.f[0]) - best.f,
+        kept=bool(at_best.c[0].max(initial=-1.0) <= SLACK),
         rollouts=evaluate.rollouts - before,
     )

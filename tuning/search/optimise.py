@@ -71,46 +71,48 @@ def search(
     rounds = Rounds(evaluate, problem, requirements, robust=robust)
     margin = max(margin, rounds.margin)
     report = Work(report, evaluate, *planned(rounds.problem, starts, steps, sloped=sloped))
-    run = Descents(evaluate, margin, steps, np.random.default_rng(seed), report)
+    descents = Descents(evaluate, margin, steps, np.random.default_rng(seed), report)
     interrupted = False
 
     def tell(what: str) -> None:
-        report(what, 0, 0, *run.best_so_far)
+        report(what, 0, 0, *descents.best_so_far)
 
     try:
         if sloped:
-            run.prepare(rounds.problem)
+            descents.prepare(rounds.problem)
             prepare()
-            run.set_out(rounds.problem, own)
+            descents.set_out(rounds.problem, own)
         else:
-            run.sweep(rounds.problem, own)
-        rounds.begin(run.gains)
+            descents.sweep(rounds.problem, own)
+        rounds.begin(descents.gains)
         if sloped:
-            run.descend(rounds.problem, run.explore(rounds.problem, starts, seed) if starts > 1 else {0: run.share})
+            descents.descend(
+                rounds.problem, descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
+            )
         else:
-            run.evolve(rounds.problem, run.share)
-        while np.all(run.best.worst <= HOPELESS) and rounds.harder(run.gains, tell):
+            descents.evolve(rounds.problem, descents.share)
+        while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
             tell(f"{ROUND}, round {rounds.count}")
             if sloped:
-                run.again(rounds.problem)
+                descents.again(rounds.problem)
             else:
-                run.evolve(rounds.problem, run.share, NEARBY)
+                descents.evolve(rounds.problem, descents.share, NEARBY)
         if judged:
-            rounds.judge(run.gains, tell)
+            rounds.judge(descents.gains, tell)
     except KeyboardInterrupt:
-        if not run.started:
+        if not descents.started:
             raise
         interrupted = True
     tell("done")
-    best = run.best
+    best = descents.best
     return Search(
-        gains=run.gains,
+        gains=descents.gains,
         share=best.share,
         value=best.value,
         worst=np.where(best.over >= BROKEN, np.inf, best.worst),
         ended=best.worst,
-        history=run.history,
-        problem=run.problem,
+        history=descents.history,
+        problem=descents.problem,
         rounds=rounds.count,
         margin=margin,
         hardest=rounds.hardest,

@@ -86,12 +86,12 @@ def hardest(
         y = np.asarray(optax.apply_updates(jnp.asarray(y), updates))
     first = int(np.argmax(best))
     reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
-    one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
-    metrics, code, _, values, _ = jax.tree.map(lambda v: v[0, 0], flights.fly(one, gains[None]))
+    fleet_of_one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
+    metrics, code, _, values, _ = jax.tree.map(lambda v: v[0, 0], flights.fly(fleet_of_one, gains[None]))
     reached = [
         float(over(getattr(metrics, name), limit, at_least=False)) for name, limit in zip(names, limits, strict=True)
     ]
-    ratios = [np.inf if np.isnan(one) else one for one in reached]  # it has no value: it never settles, say
+    ratios = [np.inf if np.isnan(ratio) else ratio for ratio in reached]  # it has no value: it never settles, say
     worst = int(np.argmax(ratios))
     return Hardest(
         metric=names[worst],
@@ -124,14 +124,14 @@ def climb(
     columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()])
     value, slopes = np.zeros(len(y)), list[np.ndarray]()
     for k in range(0, count, width):
-        some = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
-        seen = jax.tree.map(
-            lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, some)
+        shift = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
+        flown = jax.tree.map(
+            lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, shift)
         )
-        found = jnp.asarray(over(seen.metrics[:, columns], limit, at_least=False)), jnp.asarray(seen.status[:, None])
+        found = jnp.asarray(over(flown.metrics[:, columns], limit, at_least=False)), jnp.asarray(flown.status[:, None])
         ratios = np.asarray(judged(*found))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
-        slope = np.take_along_axis(seen.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
+        slope = np.take_along_axis(flown.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
         slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
     return value, np.concatenate(slopes, axis=1)[:, :count]
 

@@ -232,35 +232,35 @@ def _papers(flown: Scenario, fresh_seed: int) -> Contender:
     return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
 
 
-def figures_of(one: Contender) -> dict[str, Any]:
+def figures_of(contender: Contender) -> dict[str, Any]:
     """What is said of a contender: over the trials that were flown to the end, but for the counts."""
-    trials = one.trials
+    trials = contender.trials
     rank: Any = stats.spearmanr
-    angle, done = trials.drawn["initial_angle"], trials.finished
-    settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[done]
-    settled = done & np.isfinite(settling)
-    known, late = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
-    spread = known.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(known) > 0.0
-    mean = {name: float(np.mean(getattr(trials.metrics, name)[done])) if done.any() else None
+    angle, finished = trials.drawn["initial_angle"], trials.finished
+    settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[finished]
+    settled = finished & np.isfinite(settling)
+    times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
+    spread = times.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(times) > 0.0
+    mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
-        "gains": one.gains,
-        "at_bound": one.at_bound,
-        "met": one.met,
+        "gains": contender.gains,
+        "at_bound": contender.at_bound,
+        "met": contender.met,
         "counts": trials.counts(),
-        "window_error": float(trust.rms(errors)) if done.any() else None,
-        "floor": one.floor,
+        "window_error": float(trust.rms(errors)) if finished.any() else None,
+        "floor": contender.floor,
         "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
         **mean,
-        "largest_peak_torque": float(np.max(trials.metrics.peak_torque[done])) if done.any() else None,
-        "unsettled": int(trials.status.size - known.size),
-        "settling_time": {str(q): _quantile(late, q) for q in (0.01, 0.5, 0.99)},
+        "largest_peak_torque": float(np.max(trials.metrics.peak_torque[finished])) if finished.any() else None,
+        "unsettled": int(trials.status.size - times.size),
+        "settling_time": {str(q): _quantile(times_or_never, q) for q in (0.01, 0.5, 0.99)},
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
-        "settling_by_angle": float(rank(angle[settled], known)[0]) if spread else None,
-        "settling_near_far": _near_far(angle, late) if spread else None,
-        "margins": one.margins,
-        "untold": {name: _perturbed_figures(other) for name, other in one.changed.items()},
-        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in one.verdicts],
+        "settling_by_angle": float(rank(angle[settled], times)[0]) if spread else None,
+        "settling_near_far": _near_far(angle, times_or_never) if spread else None,
+        "margins": contender.margins,
+        "untold": {name: _perturbed_figures(other) for name, other in contender.changed.items()},
+        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in contender.verdicts],
     }
 
 
@@ -322,24 +322,24 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
             "settling_by_angle")  # fmt: skip
 
 
-def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+def _rows(scenario: Scenario, summary: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """Head and rows of `compare.csv`, a law each."""
-    asked = [name for name in catalogues.MARGINS if name in scenario.requirements]
-    others = [name for name in catalogues.MARGINS if name not in asked]  # of the nominal loop in hold
-    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *asked, *others,
+    required = [name for name in catalogues.MARGINS if name in scenario.requirements]
+    nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in hold
+    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *required, *nominal,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in UNTOLD), "gains"]  # fmt: skip
 
-    def row(law: str, found: Mapping[str, Any]) -> list[Any]:
-        worst = {v["metric"]: v["worst"] for v in found["verdicts"]}
-        hold = (found["margins"] or {}).get("hold", {})
+    def row(law: str, figures: Mapping[str, Any]) -> list[Any]:
+        worst = {v["metric"]: v["worst"] for v in figures["verdicts"]}
+        hold = (figures["margins"] or {}).get("hold", {})
         return [
-            law, *(found[name] for name in _COLUMNS), *((found["settling_time"] or {}).get(q) for q in _SHARES),
-            *map(worst.get, asked), *map(hold.get, others), *(found["window_error_interval"] or (None, None)),
-            *(found["untold"].get(name, {}).get("window_error") for name in UNTOLD),
-            "; ".join(f"{name} = {value:.6g}" for name, value in found["gains"].items()),
+            law, *(figures[name] for name in _COLUMNS), *((figures["settling_time"] or {}).get(q) for q in _SHARES),
+            *map(worst.get, required), *map(hold.get, nominal), *(figures["window_error_interval"] or (None, None)),
+            *(figures["untold"].get(name, {}).get("window_error") for name in UNTOLD),
+            "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
 
-    return head, [row(law, found) for law, found in said["laws"].items()]
+    return head, [row(law, figures) for law, figures in summary["laws"].items()]
 
 
 def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:

@@ -99,18 +99,18 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
         raise ScenarioError(f'{PERIOD} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     base = changed(scenario, tune=None)  # its bounds would not fit every pair
     pairs = [(a, b) for b in y.values for a in x.values]
-    ready: list[Study | str] = []
+    studies: list[Study | str] = []
     for a, b in pairs:
         try:
-            ready.append(study(_with(base, {x.key: a, y.key: b})))
+            studies.append(study(_with(base, {x.key: a, y.key: b})))
         except ScenarioError as error:
-            ready.append(str(error))
-    allowed = [one for one in ready if isinstance(one, Study)]
+            studies.append(str(error))
+    allowed = [one for one in studies if isinstance(one, Study)]
     if not allowed:
-        raise ScenarioError(str(ready[0]))
+        raise ScenarioError(str(studies[0]))
     common = _common([one.parts for one in allowed])
     cells = []
-    for k, ((a, b), one) in enumerate(zip(pairs, ready, strict=True)):
+    for k, ((a, b), one) in enumerate(zip(pairs, studies, strict=True)):
         cells.append(Cell(a, b, one) if isinstance(one, str) else _cell(a, b, one, common, seed, trials))
         tell(k + 1, len(pairs))
     return cells

@@ -95,8 +95,8 @@ def trace(
     limited, own_limit = _limited(scenario)
     table = limited.search
     posed = posing.pose(limited, seed, journal)
-    ready, problem, evaluate, own = posed.ready, posed.problem, posed.evaluate, posed.own
-    others, refused = judging.beside(limited)
+    ready, problem, evaluate, start = posed.ready, posed.problem, posed.evaluate, posed.own
+    beside, refused = judging.beside(limited)
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:
@@ -107,23 +107,23 @@ def trace(
 
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
-    free = search(evaluate, under(OFF), loose, own, table.starts, report=report_as("most torque"), **common)
+    free = search(evaluate, under(OFF), loose, start, table.starts, report=report_as("most torque"), **common)
     _unless_interrupted(free)
     problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
     tight = HARDLY * highest
-    least = search(evaluate, under(tight), (), own, FEWER, report=report_as("least torque"), **common)
+    least = search(evaluate, under(tight), (), start, FEWER, report=report_as("least torque"), **common)
     _unless_interrupted(least)
     lowest = least.ended[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
     best = _apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
-    found = {float(ladder[k]): one for k, one in best.items()}
+    by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
-    judged = _judge(limited, evaluate, found, fresh_seed, ready.requirements, tell)
+    judged = _judge(limited, evaluate, by_limit, fresh_seed, ready.requirements, tell)
     fixed = {}
-    for name, other in others.items():
+    for name, other in beside.items():
         trials, values = judging.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
         fixed[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
     count = next(iter(judged.values()))[1].status.size if judged else 0

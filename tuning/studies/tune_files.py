@@ -52,7 +52,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
 
 def summary(tuning: Tuning) -> dict[str, Any]:
     """What `summary.json` says."""
-    kind, found = tuning.tuned.plant.kind, tuning.search
+    kind, search = tuning.tuned.plant.kind, tuning.search
     groups = {
         name: {"gains": tuning.judged_gains[name], "floor": tuning.floors[name], **statistics(trials, kind)}
         for name, trials in tuning.fresh.items()
@@ -77,26 +77,29 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "cautions": cautions.of(tuning.tuned),
         "search": {
             "objective": tuning.tuned.search.objective,
-            "goal": found.value,
-            "starts": len({step.start for step in found.history}),
-            "steps": len(found.history),
-            "rounds_with_harder_trials": found.rounds,
-            "margin": found.margin,
+            "goal": search.value,
+            "starts": len({step.start for step in search.history}),
+            "steps": len(search.history),
+            "rounds_with_harder_trials": search.rounds,
+            "margin": search.margin,
             "earlier": [asdict(one) for one in tuning.earlier],
-            "largest_over_limit": dict(zip(found.problem.rows, found.worst.tolist(), strict=True)),
+            "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
             "confirmed": [
-                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in found.counts
+                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in search.counts
             ],
             "worst_case": tuning.tuned.search.worst_case,
             "hardest": None
-            if found.hardest is None
-            else {**asdict(found.hardest), **{name: getattr(found.hardest, name) for name in ("unbounded", "beyond")}},
-            "trials": np.asarray(found.problem.trials).tolist(),
-            "averaged": found.problem.averaged,
+            if search.hardest is None
+            else {
+                **asdict(search.hardest),
+                **{name: getattr(search.hardest, name) for name in ("unbounded", "beyond")},
+            },
+            "trials": np.asarray(search.problem.trials).tolist(),
+            "averaged": search.problem.averaged,
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
-            "seconds_by_step": found.seconds,
+            "seconds_by_step": search.seconds,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": checked,
@@ -182,8 +185,8 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Figures of a tuning run by name."""
     kind, names = scenario.plant.kind, gain_names.named(scenario)
-    known = gain_names.units_of(scenario)
-    units = [known[gain_names.base(name)] for name in names]
+    unit_of = gain_names.units_of(scenario)
+    units = [unit_of[gain_names.base(name)] for name in names]
     paths = _paths(tuning.search.history)
     longest = max(map(len, paths))
 
@@ -195,7 +198,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
     goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
-    found = {
+    figures = {
         "history": study_plots.tuning_history(
             {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
             over_steps(lambda step: step.value),
@@ -214,12 +217,12 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         ),
     }
     if tuning.trust is not None:
-        found["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
-        found["profiles"] = study_plots.profiles(
+        figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
+        figures["profiles"] = study_plots.profiles(
             {
                 name: (units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
             goal,
         )
-    return found
+    return figures

@@ -140,10 +140,10 @@ def tune(
     evaluate = posed.evaluate
     others, refused = judging.beside(scenario)
     judged, earlier = _search_and_judge(scenario, posed, seed, report, tries)
-    found, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
+    outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
-    if globally and not found.interrupted:
-        check = global_check.check(evaluate, found, seed, report, sloped=posed.sloped)
+    if globally and not outcome.interrupted:
+        check = global_check.check(evaluate, outcome, seed, report, sloped=posed.sloped)
     problem = posed.problem
     training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()]))
     candidates = {"tuned": judged.scenario} | {name: judging.as_flown(other) for name, other in others.items()}
@@ -151,15 +151,15 @@ def tune(
         name: judging.judge(other, judged.seed, posed.ready.requirements) for name, other in others.items()
     }
     shortest = _shortest(posed, judged)
-    believed, beyond, at_bound = None, {}, evaluate.bounds.at_bound(found.gains)
-    if trusted and not found.interrupted:
-        report("profiles, sensitivities and margins of the gains found", 0, 0, found.value, 0.0)
+    believed, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
+    if trusted and not outcome.interrupted:
+        report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, 0.0)
         believed = _trust(posed, judged)
         beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not believed.profiles[name].flat})
     return Tuning(
         tuned=judged.scenario,
         gains=judged.gains,
-        search=found,
+        search=outcome,
         earlier=earlier,
         at_bound=at_bound,
         training=training,
@@ -196,26 +196,26 @@ def _search_and_judge(
         robust=table.worst_case,
         report=report,
     )
-    found, earlier = look(posed.own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
+    outcome, earlier = look(posed.own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
     while True:
-        report("judging on fresh trials", 0, 0, found.value, 0.0)
-        judged = _judge(scenario, posed, found, judging.seed_of_judge(seed, len(earlier)))
-        over = _over(found, judged.verdicts)
-        if not over or found.interrupted or len(earlier) + 1 >= tries:
+        report("judging on fresh trials", 0, 0, outcome.value, 0.0)
+        judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
+        over = _over(outcome, judged.verdicts)
+        if not over or outcome.interrupted or len(earlier) + 1 >= tries:
             return judged, earlier
-        earlier.append(Try(judged.seed, judged.gains, found.margin, over))
-        reached = dict(zip(found.problem.rows, found.worst, strict=True))  # on the trials of the search
-        more = look(found.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
-        found = replace(more, history=[*found.history, *_after(found.history, more.history)])
+        earlier.append(Try(judged.seed, judged.gains, outcome.margin, over))
+        reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # on the trials of the search
+        more = look(outcome.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
+        outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
 
 
-def _judge(scenario: Scenario, posed: Posed, found: Search, fresh_seed: int) -> _Judged:
+def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
     """The gains that a search found, as they are handed over, on fresh trials."""
     begun = time.monotonic()
-    named = posed.evaluate.bounds.rounded(found.gains, DIGITS)
-    flown = judging.as_flown(gains.in_scenario(scenario, named))
+    rounded = posed.evaluate.bounds.rounded(outcome.gains, DIGITS)
+    flown = judging.as_flown(gains.in_scenario(scenario, rounded))
     trials = judging.judge(flown, fresh_seed, posed.ready.requirements)
-    return _Judged(found, named, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
+    return _Judged(outcome, rounded, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
 
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
@@ -229,21 +229,21 @@ def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
 
 def _trust(posed: Posed, judged: _Judged) -> Trust:
     """What makes the gains found believable."""
-    found, evaluate = judged.search, posed.evaluate
+    outcome, evaluate = judged.search, posed.evaluate
     slope_error = None
     if posed.sloped:
-        at_start = trust.slope_error(evaluate, found.problem, evaluate.bounds.share(posed.own))
-        slope_error = at_start, trust.slope_error(evaluate, found.problem, found.share)
-    metrics = tuple(dict.fromkeys([*SENSITIVE, *found.problem.metrics]))
+        at_start = trust.slope_error(evaluate, outcome.problem, evaluate.bounds.share(posed.own))
+        slope_error = at_start, trust.slope_error(evaluate, outcome.problem, outcome.share)
+    metrics = tuple(dict.fromkeys([*SENSITIVE, *outcome.problem.metrics]))
     return Trust(
         slope_error=slope_error,
-        profiles=trust.profiles(evaluate, found.problem, found.share),
-        sensitivities=trust.sensitivities(found.problem, evaluate.bounds, found.gains, metrics),
+        profiles=trust.profiles(evaluate, outcome.problem, outcome.share),
+        sensitivities=trust.sensitivities(outcome.problem, evaluate.bounds, outcome.gains, metrics),
         margins=stability.worst(study(judged.scenario)),
     )
 
 
-def _over(found: Search, verdicts: list[Verdict]) -> dict[str, float]:
+def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
     """How many times its limit each metric reached that broke it on fresh trials; empty: more distance is no help.
 
     It is one where the search kept every limit, came near those that are broken, and every value is a number.
@@ -251,8 +251,8 @@ def _over(found: Search, verdicts: list[Verdict]) -> dict[str, float]:
     # what is asked for a share of the time is searched for as a limit
     over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
             for one in verdicts if not one.met and one.limit}  # fmt: skip
-    helped = bool(np.all(found.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
-    reached = dict(zip(found.problem.rows, found.worst, strict=True))  # 0: trials of the search saw nothing of it
+    helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
+    reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: trials of the search saw nothing of it
     # a loop that swings by itself has no margin left, see `theory.rest`, whatever the search keeps
     swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
     return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
@@ -269,9 +269,9 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
 
     Of the sampled loop, where what is minimised is an error.
     """
-    found, tuned = dict[str, Beyond](), judged.scenario
+    beyond, tuned = dict[str, Beyond](), judged.scenario
     if tuned.loop.mode != "sampled" or tuned.search.objective == T_F:
-        return found
+        return beyond
     for name, side in at_bound.items():
         value = free_gains.beyond(tuned, gains.base(name), side)
         if value is None:
@@ -285,8 +285,8 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
         both = trials.finished & judged.trials.finished
         there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
         broken = _broken(judging.verdicts_of(other, trials, judged.seed), trials)
-        found[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, broken)
-    return found
+        beyond[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, broken)
+    return beyond
 
 
 def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
