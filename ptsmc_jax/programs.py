@@ -54,7 +54,7 @@ class Program:
         return getattr(self._jitted, name)  # lower, trace, clear_cache
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """As the jitted function."""
+        """Call it as the jitted function is called."""
         known = self._known(args, kwargs)
         if known is None:
             return self._jitted(*args, **kwargs)

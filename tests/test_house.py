@@ -43,7 +43,13 @@ HOUSE = {
             rollout
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
-        "theory": "borders error_floor linear rules solutions | covariance crossings envelopes | rest | margins | hold",
+        "theory": """
+            borders error_floor linear rules solutions
+            covariance crossings envelopes
+            rest
+            margins
+            hold run_margins
+        """,
         "scenario": """
             errors systems values
             attitude_keys dispersion_tables gain_record keys pointing_table scales

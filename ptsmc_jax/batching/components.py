@@ -67,7 +67,7 @@ class Shared:
 
 
 def object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
-    """An array of anything."""
+    """An array of this shape whose entries may be anything."""
     flat = np.empty(math.prod(shape), dtype=object)
     for k, item in zip(range(flat.size), items, strict=True):
         flat[k] = item
@@ -242,7 +242,7 @@ def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
         return None
 
     def operand(value: Any, own: Any) -> np.ndarray:
-        """Of the result's type."""
+        """Components of an operand, converted to the result's type."""
         parts = parts_of(value)
         return parts if own == kind else object_array(
             parts.shape, (lax.convert_element_type(part, kind) for part in parts.flat)

@@ -17,7 +17,7 @@ def called(eqn: Any) -> Any:
 
 
 def either(differs: Sequence[int]) -> int:
-    """All that any of them differs over."""
+    """What at least one of them differs over."""
     return reduce(operator.or_, differs, 0)
 
 

@@ -161,7 +161,7 @@ class _Held:
         return self._load(self.shape, self.first)
 
     def row(self, k: Any) -> Lane:
-        """Its k-th row."""
+        """The k-th row as components."""
         shape = self.shape[1:]
         return self._load(shape, np.int32(self.first) + k * np.int32(math.prod(shape)))
 
@@ -198,7 +198,7 @@ class _Inside:
         return [read(atom) for atom in jaxpr.outvars]
 
     def apply(self, eqn: Any, values: list) -> Sequence:
-        """One primitive."""
+        """The outputs of one primitive."""
         name, params = eqn.primitive.name, eqn.params
         if name == "scan":
             return self.scan(params, values)
@@ -263,7 +263,7 @@ class _Inside:
 
 
 def _unpacked(packed: Sequence, shapes: Sequence) -> list[Lane]:
-    """What `_Inside.pack` packed."""
+    """The components that `_Inside.pack` packed."""
     return [Lane(shape, object_array(shape, parts)) for parts, shape in zip(packed, shapes, strict=True)]
 
 

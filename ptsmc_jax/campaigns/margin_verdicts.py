@@ -18,7 +18,7 @@ from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
-from ptsmc_jax.theory import linear, margins, rest
+from ptsmc_jax.theory import linear, margins, rest, run_margins
 
 TRIALS = 256  # whose loops are looked at, where they differ
 # what a loop hangs on besides misfits: body, and where on its way it is
@@ -32,13 +32,13 @@ BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 
 
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
-    """One for each margin that is asked of the loop of these parts, see `margins.judged`.
+    """One for each margin that is asked of the loop of these parts, see `run_margins.judged`.
 
     None is left where the nominal run does not come to rest, see `rest`.
     """
     if not asked:
         return []
-    found, hold, history = margins.judged_jit(parts)
+    found, hold, history = run_margins.judged_jit(parts)
     if rest.swing(parts, history) is not None:
         found = rest.none_left(found, hold)
     return _verdicts(asked, found.worst())
@@ -60,7 +60,7 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
 
 
 def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Verdict]:
-    """From each margin by its name, of one loop or of many."""
+    """A verdict for each margin that is asked for, from its values by name, of one loop or of many."""
     values = [np.asarray(found[one.metric]) for one in asked]
     return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(asked, values, strict=True)]
 
@@ -150,7 +150,7 @@ def _look(
         return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
 
     def one(trial: Array | Row) -> linear.Loop:
-        return margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn)[0]
+        return run_margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = jax.vmap(one)(trials)

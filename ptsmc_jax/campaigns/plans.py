@@ -60,7 +60,7 @@ class Plan:
         return Row(seeds, trial, {name: values[numbers] for name, values in self.given.items()})
 
     def row(self, number: int, seed: int) -> int | Row:
-        """One row."""
+        """One row, as `rows` gives many."""
         many = self.rows(np.asarray([number]), seed)
         return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
 

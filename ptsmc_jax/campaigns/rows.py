@@ -24,7 +24,7 @@ _MAKING = ".making-"  # how the name of a file begins that is being written
 
 @dataclass(frozen=True, order=True)
 class Part:
-    """A whole part."""
+    """A part of a campaign's rows, whole and on the disk."""
 
     first: int  # trial
     count: int

@@ -112,7 +112,7 @@ class Actuators:
         return fits and not self.moves and self.wheels is None
 
     def begin(self, inputs: int) -> ActuatorState:
-        """At rest: no torque, no command on its way."""
+        """The state at rest: no torque acts, no command is on its way."""
         queue = jnp.zeros((self.delay, inputs)) if self.delay else None
         momentum = None if self.wheels is None else self.wheels.initial
         rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)

@@ -227,7 +227,7 @@ class Sensors(Sensor):
         return AttitudeState(estimate.q, read.w - estimate.bias), kept._replace(estimate=estimate, rate=read.w)
 
     def quiet(self) -> "Sensors":
-        """Without noise and bias; the filter's gains stay."""
+        """The sensors without noise and bias; the filter keeps its gains."""
         known = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
         none = jnp.zeros_like(jnp.asarray(self.attitude_noise))
         quiet = replace(self, attitude_noise=none, rate_noise=none, filter=known)
@@ -309,7 +309,7 @@ class StateSensor(Sensor):
         return x + guards.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
 
     def quiet(self) -> "StateSensor":
-        """Without noise."""
+        """The sensor without noise."""
         return replace(self, sigma=0.0 * self.sigma)
 
     def reading(self, period: float) -> Reading:

@@ -62,7 +62,7 @@ class RelativeInertia:
         r, std = guards.norm(jnp.stack([a, b])), jnp.where(self.std > 0.0, self.std, 1.0)
 
         def ends(s: Array) -> tuple[Array, Array]:
-            """Of the interval, as `_uniform` has them: twice W lies between."""
+            """Both ends of that interval, as `_uniform` has them: twice W lies between."""
             reach = c * (1.0 + std * s)
             return _uniform((b - a - reach) / (std * r)), _uniform((b - a + reach) / (std * r))
 

@@ -165,7 +165,7 @@ OF_MISFITS: dict[str, Quantity] = {
 
 @runtime_checkable
 class Misfit(Protocol):
-    """What every one has."""
+    """What every misfit has: how it is drawn, and what it makes of the drawn numbers."""
 
     @property
     def count(self) -> int:

@@ -54,16 +54,16 @@ class Board:
 
     @property
     def unit(self) -> str:
-        """Of inputs and disturbances."""
+        """The unit of inputs and disturbances, in brackets."""
         return " [N m]" if self.spacecraft else ""
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """What the state consists of that the law sees."""
+        """The names of what the law sees of the state."""
         return ("attitude", "rate") if self.spacecraft else ("x",)
 
     def state_of(self, values: tuple[Any, ...]) -> Any:
-        """That state."""
+        """The state that the law sees, from these values of `seen`."""
         return AttitudeState(*values) if self.spacecraft else values[0]
 
 
@@ -151,7 +151,7 @@ def _unit(q: Any) -> Any:
 
 
 def _signed(law: Law, target: Any, q: Any, w: Any, before: Any, tracking: Any) -> Any:
-    """Of q and -q, one attitude, the one next to the last sample's; at the start the one that the law can take."""
+    """The nearer of q and -q, which are one attitude, to the last sample's; at the start the law's choice."""
     going_on = jnp.where(jnp.dot(q, before) < 0.0, -q, q)
     return jnp.where(tracking != 0, going_on, law.align(AttitudeState(q, w), target).q)
 

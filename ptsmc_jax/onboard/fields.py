@@ -27,11 +27,11 @@ class Field:
         return int(np.prod(self.shape, dtype=int))
 
     def element(self, index: tuple[int, ...]) -> str:
-        """One of them, as C has it."""
+        """One of its numbers, as C has it."""
         return self.name + "".join(f"[{i}]" for i in index)
 
     def elements(self) -> list[str]:
-        """All of them, row by row."""
+        """All its numbers, as C has them, row by row."""
         return [self.element(index) for index in np.ndindex(*self.shape)]
 
 

@@ -46,7 +46,7 @@ class Controller:
 
     @property
     def period(self) -> float:
-        """Of control [s]."""
+        """The control period [s]."""
         return float(self.ready.parts.period)
 
 

@@ -36,7 +36,7 @@ class Parameters:
         return jax.tree.unflatten(self.structure, leaves)
 
     def pointer(self, made: Field) -> str:
-        """By which C has a field."""
+        """The name of the pointer by which C has a field."""
         return "d" if made.name in self.derived else "p"
 
     def listed(self, pointer: str) -> list[Field]:

@@ -68,7 +68,7 @@ class FlexibleSpacecraft(Spacecraft):
         return seen._replace(modes=Modes(jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency)))
 
     def moved(self, x: AttitudeState, by: Float[Array, " n"]) -> AttitudeState:
-        """As of a rigid body, then e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
+        """Moved as a rigid body is, then by e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
         n = self.frequency.shape[-1]
         near = super().moved(x, by[:6])
         return near._replace(modes=Modes(x.modes.e + by[6 : 6 + n], x.modes.rate + by[6 + n :]))

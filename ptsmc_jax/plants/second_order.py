@@ -141,7 +141,7 @@ class HiddenSystem(System):
         return x[: 2 * self.inputs]
 
     def at_rest(self, seen: Float[Array, " twice"]) -> Float[Array, " whole"]:
-        """With z at z0."""
+        """The state of these x_1 and x_2, with z at z0."""
         return jnp.append(seen, self.z0)
 
     def columns(self, x: Any) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class Actuators(Table, frozen=True):
 
     @property
     def gains(self) -> Mapping[str, GainBounds]:
-        """What tuning may move."""
+        """The gains that tuning may move."""
         return {} if self.command_filter is None else self.command_filter.gains
 
     @property
@@ -349,7 +349,7 @@ class PyramidWheels(WheelLimits, frozen=True):
     cant_deg: Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")] = 35.264389682754654
 
     def spin_axes(self) -> Any:
-        """Four, tilted."""
+        """The axes of four wheels, tilted toward +z."""
         return formulas.pyramid(np.deg2rad(self.cant_deg))
 
     def refused(self, error: ValueError) -> ScenarioError:

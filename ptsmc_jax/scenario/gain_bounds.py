@@ -10,7 +10,7 @@ from ptsmc_jax.scenario.values import MOST_STEPS
 
 
 def rounded(bound: float) -> float:
-    """To four digits."""
+    """A bound in four digits."""
     return float(f"{bound:.4g}")
 
 

@@ -22,7 +22,7 @@ class Key(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Meaning and unit."""
+        """Its meaning with its unit."""
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 
 

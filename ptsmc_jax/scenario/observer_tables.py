@@ -120,7 +120,7 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
         return t_o, min(shortest, t_o / 4) if self.delta_o is None else self.delta_o
 
     def written(self, scenario: Any) -> Any:
-        """With its times."""
+        """The table with both times filled in."""
         t_o, delta_o = self.times(scenario)
         return msgspec.structs.replace(self, t_o=t_o, delta_o=delta_o)
 

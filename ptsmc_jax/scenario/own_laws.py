@@ -37,7 +37,7 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
         return self.made
 
     def physics(self, motion: str) -> Any:
-        """On the error of this kind of plant, with what tuning may move."""
+        """The law that the code names, on the error of this kind of plant, with the gains that tuning may move."""
         made = super().physics(motion)
         made.tunable = tuple(self.gains)
         return made

@@ -73,7 +73,7 @@ class Flexible(Table, frozen=True):
     )
 
     def check(self, inertia: Any) -> None:
-        """As many numbers as modes, and a body that can have them; inertia: of the body that flies [kg m^2]."""
+        """Refuse lists of other lengths, and modes that no body can have; inertia: of the body that flies [kg m^2]."""
         lists = {key: getattr(self, key) for key in self.__struct_fields__}
         modes = sorted(map(len, lists.values()))[1]  # two of the three say it
         for key, value in lists.items():

@@ -82,7 +82,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
 
     def check_plant(self) -> None:
-        """Lists as long as there are inputs, or states."""
+        """Refuse lists that are not as long as there are inputs, or states."""
         several = len(self.terms) > 1
         for k, term in enumerate(self.terms):
             self._check_each(f"disturbance.terms[{k}]" if several else "disturbance", term)
@@ -135,11 +135,11 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 
     @property
     def order(self) -> int:
-        """As many as there are states."""
+        """The number of states."""
         return self.plant.order
 
     def check_plant(self) -> None:
-        """As many states as its order."""
+        """Refuse an initial state of another length than the chain's order."""
         n = self.plant.order
         if len(self.plant.x0) != n:
             raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
@@ -171,7 +171,7 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
 
     @property
     def inputs(self) -> int:
-        """As many as x_1 has components."""
+        """The number of components of x_1."""
         return len(self.plant.x0) // 2
 
     def check_plant(self) -> None:

@@ -196,7 +196,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def window(self) -> float:
-        """After t_f, `loop.window` [s]."""
+        """How long the window after t_f is, `loop.window` [s]."""
         assert self.loop.window is not None, "a scenario that is not resolved"
         return self.loop.window
 

@@ -77,7 +77,7 @@ class Interval(NamedTuple):
 
     @property
     def length(self) -> Array:
-        """In s."""
+        """The length of the interval [s]."""
         return self.t_next - self.t
 
 

@@ -85,7 +85,7 @@ class Verdict:
 
     @property
     def met(self) -> bool:
-        """As many trials within the limit as are asked for, or as much of the time."""
+        """Whether as many trials keep the limit as are asked for, or for as much of the time."""
         if self.interpretation == "mixed" and self.shown is not None:
             return self.quantile is not None and self.shown >= self.quantile
         if self.interpretation == "temporal":
@@ -100,7 +100,7 @@ class Verdict:
         return cls(**{"worst": math.nan, "margin": math.nan, **known})
 
     def __str__(self) -> str:
-        """In one line."""
+        """The verdict in one line."""
         return self._of_trials() if self.share_of_time is None else self._of_time(self.share_of_time)
 
     def _of_time(self, share: float) -> str:

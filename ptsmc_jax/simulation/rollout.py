@@ -149,7 +149,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     walk, jitter = walk_stream(seed, trial), jitter_stream(seed, trial)
 
     def late(t: Scalar, sample: Array) -> Scalar:
-        """By how much a sample comes after its time t [s]; the first and the end of the run are where they are."""
+        """How much later than t a sample comes [s]; the first one and the end of the run are not moved."""
         assert parts.jitter is not None
         most = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return most * (2.0 * draws.uniforms(jitter, 1, sample)[0] - 1.0)

@@ -53,7 +53,7 @@ def _mean_width(width: float, sigma: float) -> float:
 
 
 def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
-    """Of z, the commands on their way, the sensor's own states and the random walk's torque, sample by sample."""
+    """Propagated: z, the commands on their way, the sensor's own states and the random walk's torque."""
     ticks = jax.tree.map(np.asarray, run.period.now)
     h = float(parts.period)
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * h)

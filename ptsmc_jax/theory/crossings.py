@@ -171,7 +171,7 @@ def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
 
 
 def ends_at(ends: Array) -> Array:
-    """At which ends of the grid L [-] is real as well, bool: a pole comes to 1 there, or to -1."""
+    """Whether L [-] is real at the ends of the grid too, bool: a pole comes to 1 there, or to -1."""
     return jnp.abs(ends.imag) < 1e-2 * jnp.abs(ends.real)
 
 

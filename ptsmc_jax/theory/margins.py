@@ -16,17 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
-from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.theory import crossings, linear, rest
+from ptsmc_jax.theory import crossings, linear
 from ptsmc_jax.theory.crossings import MOST, SPLIT, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
-from ptsmc_jax.theory.rest import History, history
 
 Scalar = Float[Array, ""]
 
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
-SLOWEST = 10  # periods to go: from one to the next the gains before the hand-over change by a tenth
-TIMES, SHARE = 4, 0.25  # to go at which margins are judged, and the longest as a share of t_f
 
 
 class Margins(NamedTuple):
@@ -216,134 +212,6 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     _, root, _ = jax.lax.while_loop(lambda at: (at[0] < 12) & at[2], newton, jax.lax.stop_gradient(first))
     root = jax.lax.stop_gradient(root)
     return jnp.where(known, (root - step(root))[1] * loop.period, jnp.inf)
-
-
-class Course(NamedTuple):
-    """Margins along a nominal run."""
-
-    t: np.ndarray  # (times,) [s], the last in hold, those before it before the hand-over
-    judged: np.ndarray  # (times,) bool: where the frozen loop means something, see `judged_times`
-    loops: Loop  # arrays over the times first
-    at_input: Margins  # (times, m)
-    at_sensors: Margins  # (k,) in hold
-    together: dict[str, float]  # the same of all axes of the input at once, in hold
-    swing: rest.Swing | None = None  # by which the run does not come to rest in hold
-
-    @property
-    def hold(self) -> tuple[Loop, Margins]:
-        """The loop in hold, and its margins (m,)."""
-        return jax.tree.map(lambda v: v[-1], (self.loops, self.at_input))
-
-    @property
-    def before(self) -> Margins:
-        """(times, m) before the hand-over."""
-        return jax.tree.map(lambda v: v[:-1], self.at_input)
-
-    def worst(self) -> dict[str, float]:
-        """`catalogues.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
-        kept = jax.tree.map(lambda v: v[self.judged], self.at_input)
-        return {name: float(v) for name, v in kept.worst().items()}
-
-
-def judged_times(parts: Parts) -> Float[Array, " times"]:
-    """Times to go [s] at which frozen gains mean something, the shortest first, evenly spaced by their logarithms.
-
-    From the hand-over, where gains are largest, but no nearer than where they change by a tenth from one sample to the
-    next; to where the loop takes as long to settle as it has left. They move with t_f and delta, and with them slopes.
-    """
-    law = parts.controller
-    shortest = jnp.maximum(law.delta, SLOWEST * parts.period)
-    longest = jnp.maximum(SHARE * law.t_f, shortest)
-    return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
-
-
-def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
-    """Numbers of the whole control periods nearest to so long before t_f [s], and then of one in hold.
-
-    Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
-    it is no farther off than at the hand-over.
-    """
-    ticks, law = run.period.now, parts.controller
-    whole = linear.whole(parts, run)
-    off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
-    size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
-    first = jnp.argmax(hold)
-    near = hold & (size <= 2.0 * size[first])
-    last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
-    before = whole & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
-    left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
-    nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)
-    return jnp.append(jnp.where(jnp.any(before), nearest, last), last)
-
-
-_moments = programs.jit(moments)
-
-
-class Found(NamedTuple):
-    """Margins at times of a nominal run, the last of them in hold."""
-
-    t: np.ndarray  # (times,) [s]
-    hold: np.ndarray  # (times,) bool: in hold
-    loops: Loop  # arrays over the times first
-    margins: Margins  # (times, m)
-
-
-def at(parts: Parts, left: Float[Array, " times"], known: linear.Nominal | None = None) -> Found:
-    """Margins of sampled parts at these times to go [s], (times,), and in hold."""
-    run: linear.Nominal = linear.nominal_jit(parts) if known is None else known
-    indices = np.asarray(_moments(parts, run, left))
-    loops = linear.loops_in(parts, run, indices)
-    ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
-    return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, of_each(loops)))
-
-
-def judged_loops(parts: Parts, flown: linear.Nominal | None = None) -> tuple[Loop, Array]:
-    """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s]."""
-    run = linear.nominal(parts) if flown is None else flown
-    indices = moments(parts, run, judged_times(parts))
-    return linear.loops_at(parts, run, indices), run.period.now.hold[indices]
-
-
-def judged(parts: Parts) -> tuple[Margins, Array, History]:
-    """Margins of `judged_loops`, (times + 1, m), which are in hold, and the run; for any transformation."""
-    run = linear.nominal(parts)
-    loops, hold = judged_loops(parts, run)
-    return of_each(loops), hold, history(parts, run)
-
-
-judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
-
-
-def along(parts: Parts, times: int = 24) -> Course:
-    """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides."""
-    judged, run = judged_times(parts), linear.nominal_jit(parts)
-    period = float(parts.period)
-    at_times = at(parts, jnp.append(judged, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
-    places = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
-    order = np.asarray([k for _, k in sorted(places.items())] + [len(at_times.t) - 1])
-    t, _, loops, margins = jax.tree.map(lambda v: v[order], at_times)
-    count = (order < judged.size) | (order == order[-1])
-    last = jax.tree.map(lambda v: v[-1:], loops)
-    at_sensors = of_each(last, sensors=True)
-    swing = rest.swing(parts, history(parts, run))
-    at_once = together(jax.tree.map(lambda v: v[0], last)) if swing is None else dict.fromkeys(FIELDS, float("nan"))
-    if swing is not None:
-        margins, at_sensors = rest.none_left(margins, order == order[-1]), rest.none_left(at_sensors, [True])
-    return Course(t, count, loops, margins, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
-
-
-def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
-    """Margins at the last whole period before the "hand_over" and in "hold", and the largest modulus of the poles.
-
-    Without a whole period before the hand-over those in hold are both.
-    """
-    run = linear.nominal_jit(parts)
-    before = linear.full_periods(parts, run, hold=False)[-1:]
-    left = float(parts.controller.t_f) - np.asarray(run.period.now.t)[before]
-    found = at(parts, jnp.asarray(left), run)
-    ends = {"hand_over": 0, "hold": -1}
-    each = {name: jax.tree.map(lambda v, k=k: v[k], (found.margins, found.loops)) for name, k in ends.items()}
-    return {name: (margins, linear.radius(loop)) for name, (margins, loop) in each.items()}
 
 
 def together(loop: Loop) -> dict[str, float]:

@@ -13,7 +13,7 @@ from ptsmc_jax import explore, programs, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
-from ptsmc_jax.theory import margins
+from ptsmc_jax.theory import margins, run_margins
 from tests.helpers import short
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
@@ -83,7 +83,7 @@ def drawn_parts(parts, dispersion, seed, trials):
 def all_of(parts, dispersion, seed, count):
     """Each margin of each of the first trials' loops, (count, times): by the program of a single run, one by one."""
     drawn = drawn_parts(parts, dispersion, jnp.uint32(seed), jnp.arange(24, dtype=jnp.uint32))
-    each = [margins.judged_jit(jax.tree.map(lambda v, k=k: v[k], drawn))[0].each() for k in range(count)]
+    each = [run_margins.judged_jit(jax.tree.map(lambda v, k=k: v[k], drawn))[0].each() for k in range(count)]
     return {name: np.stack([farthest(name, one[name], 1) for one in each]) for name in each[0]}
 
 
@@ -196,7 +196,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
         apart = np.abs(every[name] - rough[name])[some] / (period if name == "delay_margin" else 1.0)
         assert apart.max(initial=0.0) < off / 2, name
     each = worst_of(every)
-    nominal = {name: float(v) for name, v in margins.judged_jit(parts)[0].worst().items()}
+    nominal = {name: float(v) for name, v in run_margins.judged_jit(parts)[0].worst().items()}
     judged = []
 
     def counted(loops, **how):

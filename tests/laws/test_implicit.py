@@ -17,7 +17,7 @@ from ptsmc_jax.plants import rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import borders, linear, margins
+from ptsmc_jax.theory import borders, linear, margins, run_margins
 from tests.helpers import FULL_INERTIA, vector
 from tuning.search.gains import with_gains
 
@@ -194,7 +194,7 @@ def test_the_stable_region_extends_past_the_border_of_explicit_sampling(clock):
     radius = {}
     for sampling in ("explicit", "implicit"):
         parts = study(eta=4.0, delta=H, sampling=sampling, clock=clock)
-        radius[sampling] = margins.at_ends(parts)["hand_over"][1]
+        radius[sampling] = run_margins.at_ends(parts)["hand_over"][1]
         law, run = parts.controller, linear.nominal(parts)
         last = linear.full_periods(parts, run, hold=False)[-1]
         tau = float(law.t_f - run.period.now.t[last]) / H

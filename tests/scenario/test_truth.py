@@ -14,7 +14,7 @@ from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import linear, margins
+from ptsmc_jax.theory import linear, margins, run_margins
 
 FILE = """
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def test_a_truth_with_a_state_that_nobody_sees():
     told = run.columns()
     np.testing.assert_array_equal(told["z1"], x[:, 2])
     assert [name for name in told if name[0] == "x"] == ["x1", "x2"]
-    loop = jax.tree.map(lambda v: np.asarray(v)[-1], margins.at(parts, jnp.ones(1)).loops)  # with z
+    loop = jax.tree.map(lambda v: np.asarray(v)[-1], run_margins.at(parts, jnp.ones(1)).loops)  # with z
     poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
     closed = block[:3, :3] + np.outer(block[:3, 3], [-2.0, -1.5, 0.0])
     slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is

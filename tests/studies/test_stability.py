@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.theory import margins
+from ptsmc_jax.theory import run_margins
 from tests.helpers import SHORT, short
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
@@ -111,10 +111,10 @@ def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(p
     noise = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
     tables = {"controller": law, "loop": loop, "hardware": noise}
     parts = scenario.study(scenario.from_tables(tables)).parts
-    ends = margins.at_ends(parts)
+    ends = run_margins.at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
         np.testing.assert_array_equal(one, other)
-    course = margins.along(parts)
+    course = run_margins.along(parts)
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
     assert np.isnan(course.at_sensors.delay).all()  # what comes late is a command

@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import covariance, linear, margins
+from ptsmc_jax.theory import covariance, linear, margins, run_margins
 
 # one mode about x that a late loop of some bandwidth drives; no noise, no switching term, small angles: it is linear
 SPILLS = {
@@ -27,7 +27,7 @@ def test_margins_see_the_mode_and_sensors_see_the_body_alone():
     parts = scenario.study(
         scenario.from_tables({**SPILLS, "controller": {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}})
     ).parts
-    course = margins.along(parts)
+    course = run_margins.along(parts)
     loop, hold = course.hold
     assert loop.seen.shape[1] == 6
     assert course.at_sensors.gain_up.shape == (6,)
@@ -63,10 +63,10 @@ def slowest_pair(y):
 @pytest.mark.parametrize(("damping", "grows"), [(0.02, True), (0.06, False)])
 def test_a_flown_mode_grows_or_decays_as_the_poles_of_its_loop_say(damping, grows):
     """The last 70 periods of hold, in which faster motions are gone; the rigid design is stable either way."""
-    rigid = margins.at_ends(parts_of(flexible=None))["hold"][1]
+    rigid = run_margins.at_ends(parts_of(flexible=None))["hold"][1]
     assert rigid < 1.0 + margins.NEUTRAL
     parts = parts_of(flexible={**SPILLS["flexible"], "damping": [damping]})
-    loop = jax.tree.map(lambda v: np.asarray(v)[-1], margins.at(parts, jnp.ones(1)).loops)
+    loop = jax.tree.map(lambda v: np.asarray(v)[-1], run_margins.at(parts, jnp.ones(1)).loops)
     poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
     radius = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
     assert radius > 1.01 if grows else radius < 0.99

@@ -79,7 +79,7 @@ class _File:
         self.values["tune"] = {**default, **self.values.get("tune", {})}
 
     def lines(self) -> Iterator[str]:
-        """All of them."""
+        """The file's lines."""
         yield from _prose(INTRODUCTION)
         for name, table in layouts.TABLES[self.plant].items():
             if name == "tune":

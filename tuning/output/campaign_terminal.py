@@ -71,7 +71,7 @@ def worst(frame: Any, by: str, folder: Path, kind: str, *, own_code: bool = Fals
 
 
 def why(told: list[dict[str, Any]]) -> None:
-    """Of each worst trial the inputs that its metric goes with, as percentiles of all trials.
+    """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
     """

@@ -131,7 +131,7 @@ class Answer:
 
 
 def answers(summary: Summary) -> list[Answer]:
-    """To each question that any law has a number for."""
+    """An answer to each question that some law has a number for."""
     laws = summary["laws"]
     known = [q for q in QUESTIONS if any(value.of(law) is not None for value in q.values for law in laws.values())]
     return [Answer(one.title, _table(one, laws), _chart(one, laws), one.note) for one in known]
@@ -178,7 +178,7 @@ def _table(question: Question, laws: Summary) -> Table:
 
 
 def _broken(told: Summary) -> str:
-    """In how many trials a requirement is broken, and whether that is too many."""
+    """How many trials break a requirement, and whether these are too many."""
     return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
 
 

@@ -11,7 +11,7 @@ OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "against", "times", "m
 
 
 def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:
-    """As it is typed; scenario: its tables, none where there was no file."""
+    """The call as it is typed; scenario: its tables, none where there was no file."""
     command = ["ptsmc", versions["command"], *(["scenario.toml"] if scenario else [])]
     for key in OPTIONS:
         if key == "trials" and versions.get("plan") is not None:

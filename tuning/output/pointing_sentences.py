@@ -25,7 +25,7 @@ def angle(value: float | None) -> str:
 
 
 def tables(summary: Summary) -> list[Table]:
-    """Both, as far as they are there."""
+    """The budget and the compliance, as far as there are such."""
     return [table for table in (budget(summary), compliance(summary)) if table is not None]
 
 
@@ -50,7 +50,7 @@ def budget(summary: Summary) -> Table | None:
 
 
 def heading(summary: Summary) -> Iterator[str]:
-    """What the budget says."""
+    """What the numbers of the budget mean."""
     from ptsmc_jax.simulation.requirements import fewest_trials
 
     told = summary.get("pointing")

@@ -116,7 +116,7 @@ def tuning(summary: Summary) -> Table:
 
 
 def tuning_heading(summary: Summary) -> str:
-    """On what the gains were judged."""
+    """What the gains were judged on."""
     judged = summary.get("judged_on", "flight clock")
     return f"the gains are judged on {summary['fresh']['trials']} fresh trials ({judged})"
 

@@ -27,7 +27,7 @@ def evolve(
     keep: Callable[[Measured], None],
     size: tuple[int, float] = WIDELY,
 ) -> None:
-    """Better points around these shares, (gains,), kept in `best`; tell(generation, generations) is called.
+    """Look for better points around these shares, (gains,), and keep them in `best`; tell(generation, generations).
 
     Covariance matrix adaptation (Hansen and Ostermeier, Evol. Comput. 9(2), 2001). keep is called with the best point
     of each generation, as it was measured.

@@ -55,7 +55,7 @@ class Best:
 
 
 class _EnoughError(Exception):
-    """As many points as a descent may look at."""
+    """A descent has looked at as many points as it may."""
 
 
 def descend(
@@ -71,7 +71,7 @@ def descend(
     fixed: Sequence[int] = (),
     seen: dict[bytes, Sloped] | None = None,
 ) -> None:
-    """From these shares, (gains,), downhill inside the bounds; what is best is kept in `best`.
+    """Go downhill from these shares, (gains,), inside the bounds, and keep the best point in `best`.
 
     At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
     slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the

@@ -110,7 +110,7 @@ class Descents:
 
     @property
     def best(self) -> Best:
-        """The best point."""
+        """The best point so far."""
         assert self._best is not None
         return self._best
 
@@ -132,7 +132,7 @@ class Descents:
 
     @property
     def history(self) -> list[Step]:
-        """In the order of the starts, and of each start's steps."""
+        """The points gone through, in the order of the starts and of each start's steps."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
     def prepare(self, problem: Problem) -> None:
@@ -140,7 +140,7 @@ class Descents:
         self._evaluate.prepare(problem)
 
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
-        """From the scenario's own gains, (gains,), on a few trials."""
+        """Descend from the scenario's own gains, (gains,), on a few trials."""
         self._own = self._evaluate.bounds.share(own)
         self._report(SETTING_OUT, 0, 2, *self.best_so_far)
         self._descend(_few_trials(problem), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
@@ -160,7 +160,7 @@ class Descents:
         return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {0: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
-        """From each of these shares part of the way, and from the most promising one to the optimum next to it."""
+        """Descend part of the way from each of these shares, and from the best end to the optimum next to it."""
         half, self._ends = max(2, self._steps // 2), {}
         self._race(problem, starts, ((len(starts), half), (1, self._steps)), FOLLOWING, afresh=True)
         self._finish(problem)
@@ -198,7 +198,7 @@ class Descents:
         *,
         afresh: bool,
     ) -> None:
-        """From each of these starts; as many at a time as there are devices."""
+        """Descend from each of these starts, as many at a time as there are devices."""
         tightened, bests, told = self.tightened(problem), dict[int, Best](), 0
 
         def from_start(k: int, ask: Ask) -> None:
@@ -232,13 +232,13 @@ class Descents:
                     afresh = False
 
     def again(self, problem: Problem) -> None:
-        """On from where the best starts ended, with what has joined the problem."""
+        """Go on from where the best starts ended, with what has joined the problem."""
         ranked = sorted(self._ends.items(), key=lambda item: item[1].rank)[:AGAIN]
         self._instead(problem, [(start, end.share) for start, end in ranked])
         self._finish(problem)
 
     def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]], fixed: Sequence[int] = ()) -> None:
-        """From each of these (start, shares): the best of what is found takes the place of the best so far."""
+        """Descend from each of these (start, shares); the best point found takes the place of the best so far."""
         for k, (start, share) in enumerate(ends):
             self._descend(problem, share, start, self._steps, scale=CAREFUL, fixed=fixed, afresh=k == 0)
 
@@ -252,7 +252,7 @@ class Descents:
         self._take(best, tightened, 0, afresh=True)
 
     def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
-        """Better points around these shares, without slopes."""
+        """Look for better points around these shares, without slopes."""
         best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
         best.offer(share[None], self._evaluate.fly(tightened, share[None]))
         try:
@@ -341,7 +341,7 @@ class Descents:
             self._take(best, tightened, start, afresh=afresh)
 
     def _take(self, best: Best, tightened: Problem, start: int, *, afresh: bool) -> None:
-        """What was found, if it is better; afresh: than nothing, of another problem than the best so far."""
+        """Take what was found where it is better than the best so far; afresh: whatever it is, of another problem."""
         if np.isfinite(best.f):
             self._ends[start] = best
         if self._best is None or (np.isfinite(best.f) and (afresh or best.rank < self._best.rank)):

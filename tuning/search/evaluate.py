@@ -40,7 +40,7 @@ class Measured:
         return largest.argmax(axis=1) if largest.shape[1] else np.zeros(len(largest), int)
 
     def at(self: M, point: int) -> M:
-        """One of the points."""
+        """What was measured at one of the points."""
         return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})
 
 
@@ -66,13 +66,13 @@ class Evaluator:
         self.rollouts, self.gradients = 0, 0  # trials flown without and with slopes
 
     def fly(self, problem: Problem, share: np.ndarray) -> Measured:
-        """Without slopes."""
+        """F, constraints and goal at these points."""
         self.rollouts += len(share) * problem.trials.size
         asked = _question(b"fly", problem, share)
         return Measured(**self._journal.get(asked, lambda: self._measured(self._fly, problem, share)))
 
     def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
-        """With slopes."""
+        """The same with their slopes."""
         self.gradients += len(share) * problem.trials.size
         asked = _question(b"slopes", problem, share)
         return Sloped(**self._journal.get(asked, lambda: self._measured(self._slopes, problem, share)))

@@ -26,7 +26,7 @@ ROWS, SLOPED = 64, 8  # rows in one call, of each device; with slopes
 
 
 class Fleet(NamedTuple):
-    """What is flown."""
+    """The trials that are flown at every point, and with what."""
 
     parts: Parts
     dispersion: Dispersion

@@ -19,7 +19,7 @@ from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import over
-from ptsmc_jax.theory import margins
+from ptsmc_jax.theory import margins, run_margins
 from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.shares import Bounds
@@ -93,10 +93,10 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
 
     if asked.coordinates:
-        each = jax.vmap(lambda c: margins.judged_loops(asked.dispersion.at(parts, c))[0])(asked.coordinates)
+        each = jax.vmap(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c))[0])(asked.coordinates)
         loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     else:
-        loops, _ = margins.judged_loops(parts)
+        loops, _ = run_margins.judged_loops(parts)
     found = margins.of_each(loops, with_delay="delay_margin" in asked.metrics).each()
     shares = [
         over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])

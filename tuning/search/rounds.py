@@ -109,7 +109,7 @@ class Rounds:
         return worst_case.screen(self.problem, self._every, gains)
 
     def _count(self, gains: np.ndarray) -> list[confirm.Count]:
-        """Each time on other trials."""
+        """Count, each time on other trials."""
         first = self.problem.averaged + worst_case.SCREENED
         found = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
         self._counted += 1
@@ -132,12 +132,12 @@ class Rounds:
 
 
 def _with_room(problem: Problem, places: int) -> Problem:
-    """With so many places more, that hold the first trial again: it must keep what every trial must keep, twice."""
+    """The problem with so many places more, which hold the first trial again until others join."""
     return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], places))
 
 
 def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
-    """With the loops whose margins are least by these gains, and whether one of them breaks a limit."""
+    """The problem with the loops whose margins are least by these gains, and whether one of them breaks a limit."""
     if problem.margins is None:
         return problem, False
     asked, near = margin_rows.hardest(problem.margins, gains)
@@ -151,7 +151,7 @@ def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
-    """With limits, by their rows, kept among these trials, in the last places, in stead of by the averaged ones."""
+    """The problem with limits, by their rows, kept among these trials in its last places, not by the averaged ones."""
     for turn, (row, band) in enumerate(bands.items(), start=1):
         at = problem.trials.size - turn * BAND + np.arange(band.size)
         problem = _placed(problem, at, band)
@@ -166,7 +166,7 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
 def _placed(
     problem: Problem, at: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
 ) -> Problem:
-    """With other trials in these places; coordinates: of a single one, where they are not its own."""
+    """The problem with other trials in these places; coordinates: of a single one, where they are not its own."""
     if coordinates is None:
         own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:

@@ -56,7 +56,7 @@ def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: int, tell: Callable) -> np.ndarray:
-    """So many of the points, (points, gains), by F with breaches of a limit charged: those far apart first.
+    """Choose so many of the points, (points, gains), by F with breaches of a limit charged, those far apart first.
 
     By turns charged little and much: what is far beyond a limit may lead to better gains, and what keeps it is near.
     """
@@ -76,7 +76,7 @@ def distances(share: np.ndarray) -> np.ndarray:
 
 
 def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
-    """So many of the points in this order, those first that lie far from all before them.
+    """Choose so many of the points in this order, those first that lie far from all before them.
 
     With few gains, or many points to choose, they cannot all lie far apart: then nearer ones, step by step.
     """

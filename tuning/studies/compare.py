@@ -277,7 +277,7 @@ def _perturbed_figures(trials: Trials) -> dict[str, Any]:
 
 
 def _quantile(late: np.ndarray, q: float) -> float | None:
-    """Of settling times [s], infinite where a trial never settles; None: that is never."""
+    """A quantile of settling times [s], infinite where a trial never settles; None: never."""
     found = value_at(np.sort(late), q)
     return found if np.isfinite(found) else None
 

@@ -20,7 +20,7 @@ class AgainstTorque:
         self.known_by = pareto.identity(scenario, seed, points)
 
     def trace(self, tell: Report, journal: Journal) -> pareto.Front:
-        """Look for it."""
+        """Look for the front."""
         return pareto.trace(self._scenario, self._seed, self._points, tell, journal)
 
     def summary(self, found: pareto.Front) -> dict[str, Any]:
@@ -43,7 +43,7 @@ class AgainstTime:
         self.known_by = slew_times.identity(scenario, seed, self._times)
 
     def trace(self, tell: Report, journal: Journal) -> slew_times.Slews:
-        """Look for it."""
+        """Look for the front."""
         return slew_times.trace(self._scenario, self._seed, self._times, tell, journal)
 
     def summary(self, found: slew_times.Slews) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
-from ptsmc_jax.theory import borders, covariance, margins
+from ptsmc_jax.theory import borders, covariance, margins, run_margins
 
 PERIOD, DELTA = "loop.period", "controller.delta"
 WHOLE_NUMBERS = ("hardware.delay", "hardware.star_tracker_every")
@@ -35,7 +35,7 @@ class Axis:
 
     @property
     def text(self) -> str:
-        """As `axis` reads it."""
+        """The axis as `axis` reads it."""
         return f"{self.key}={self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}"
 
     @property
@@ -161,7 +161,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
         }
     parts = common(ready.parts)
     if ready.scenario.loop.mode == "sampled" and parts.controller.prescribed:
-        ends = margins.at_ends(parts)
+        ends = run_margins.at_ends(parts)
         (at, radius), (hold, after) = ends["hand_over"], ends["hold"]
         known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
         known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
@@ -174,7 +174,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 
 
 def _factor(found: margins.Margins) -> float:
-    """On the gain of the worst axis, up to which the loop is stable; below 1 where it is not."""
+    """The factor on the gain of the worst axis up to which the loop is stable; below 1 where it is not."""
     return float(10.0 ** (found.gain_up.min() / 20.0))
 
 

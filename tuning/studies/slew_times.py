@@ -63,7 +63,7 @@ class Slews:
 
 
 def usual_times(scenario: Scenario) -> tuple[float, ...]:
-    """From half to twice the scenario's own [s]."""
+    """Prescribed times from half to twice the scenario's own [s]."""
     return tuple(float(f"{share * scenario.controller.t_f:.3g}") for share in SPAN)
 
 

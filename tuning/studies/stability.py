@@ -12,9 +12,10 @@ from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.catalogues import CATALOGUES
-from ptsmc_jax.theory import margins, rest
-from ptsmc_jax.theory.margins import FIELDS, Course
+from ptsmc_jax.theory import margins, rest, run_margins
+from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.rest import Swing
+from ptsmc_jax.theory.run_margins import Course
 
 _NO_SIGN = "the exact sign has no slope: these margins are those of the loop without its switching term"
 
@@ -24,7 +25,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     if scenario.loop.mode != "sampled":
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
-    course = margins.along(ready.parts)
+    course = run_margins.along(ready.parts)
     if np.isnan(course.hold[1].modulus).any():
         raise ScenarioError(
             f"margins need slopes of the loop by all that it carries, but with controller.kind = "
@@ -41,7 +42,7 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if ready.scenario.loop.mode != "sampled":
         return None
-    found, hold, history = jax.tree.map(np.asarray, margins.judged_jit(ready.parts))
+    found, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
     if np.isnan(found.modulus[-1]).any():
         return None
     swing = rest.swing(ready.parts, history)

@@ -13,7 +13,7 @@ from ptsmc_jax.scenario import free_gains, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Verdict
-from ptsmc_jax.theory import margins
+from ptsmc_jax.theory import run_margins
 from tuning.search import flights, gains, global_check, trust
 from tuning.search.descents import Step
 from tuning.search.design import ShortestTime, shortest_time
@@ -53,7 +53,7 @@ class Beyond:
 
     @property
     def better(self) -> bool:
-        """More accurate there by more than what counts as nothing, with every requirement kept."""
+        """Whether it is more accurate there, by more than counts as nothing, with every requirement kept."""
         return self.broken is None and self.times is not None and self.times < 1.0 - trust.FLAT
 
 
@@ -94,12 +94,12 @@ class Tuning:
 
     @property
     def met(self) -> bool:
-        """Every requirement met on the fresh trials, and no fresh trial failed."""
+        """Whether the fresh trials meet every requirement, and none of them failed."""
         return all(v.met for v in self.verdicts) and bool(np.all(self.fresh["tuned"].ok))
 
     @property
     def status(self) -> str:
-        """In a word."""
+        """How it ended, in a word."""
         return "interrupted" if self.search.interrupted else "met" if self.met else "not met"
 
 
@@ -303,4 +303,4 @@ def _prepare(scenario: Scenario) -> None:
     flown = study(judging.as_flown(scenario))
     montecarlo.prepare(flown.parts, flown.dispersion)
     if scenario.loop.mode == "sampled":
-        margins.judged_jit.prepare(flown.parts)
+        run_margins.judged_jit.prepare(flown.parts)
