@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ptsmc_jax.scenario.tables import Scenario
 from tuning.search.journal import Journal
@@ -10,49 +10,38 @@ from tuning.search.progress import Report
 from tuning.studies import pareto, slew_times
 
 
-class AgainstTorque:
-    """The front against the peak torque."""
+class Front(NamedTuple):
+    """A front to be looked for."""
 
-    def __init__(self, scenario: Scenario, seed: int, points: int, times: tuple[float, ...]):
-        """Raises ScenarioError where there is none to look for."""
-        pareto.check(scenario)
-        self._scenario, self._seed, self._points = scenario, seed, points
-        self.known_by = pareto.identity(scenario, seed, points)
-
-    def trace(self, tell: Report, journal: Journal) -> pareto.Front:
-        """Look for the front."""
-        return pareto.trace(self._scenario, self._seed, self._points, tell, journal)
-
-    def summary(self, found: pareto.Front) -> dict[str, Any]:
-        """What `summary.json` says."""
-        return pareto.summary(found, self._scenario)
-
-    def write(self, folder: Path, found: pareto.Front, figures: bool) -> None:
-        """Fill a result folder."""
-        pareto.write(folder, self._scenario, found, figures, self.known_by)
+    known_by: dict[str, Any]  # see `store.begin`
+    trace: Callable[[Report, Journal], Any]  # looks for it
+    summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of what was found
+    write: Callable[[Path, Any, bool], None]  # fills a result folder with it, and with figures or not
 
 
-class AgainstTime:
-    """What a faster slew costs."""
-
-    def __init__(self, scenario: Scenario, seed: int, points: int, times: tuple[float, ...]):
-        """Times [s], the usual ones if there are none; raises ScenarioError where one cannot be flown."""
-        self._times = times or slew_times.usual_times(scenario)
-        slew_times.check(scenario, self._times)
-        self._scenario, self._seed = scenario, seed
-        self.known_by = slew_times.identity(scenario, seed, self._times)
-
-    def trace(self, tell: Report, journal: Journal) -> slew_times.Slews:
-        """Look for the front."""
-        return slew_times.trace(self._scenario, self._seed, self._times, tell, journal)
-
-    def summary(self, found: slew_times.Slews) -> dict[str, Any]:
-        """What `summary.json` says."""
-        return slew_times.summary(found, self._scenario)
-
-    def write(self, folder: Path, found: slew_times.Slews, figures: bool) -> None:
-        """Fill a result folder."""
-        slew_times.write(folder, self._scenario, found, figures, self.known_by)
+def against_torque(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
+    """The front against the peak torque; raises ScenarioError where there is none to look for."""
+    pareto.check(scenario)
+    known_by = pareto.identity(scenario, seed, points)
+    return Front(
+        known_by,
+        lambda tell, journal: pareto.trace(scenario, seed, points, tell, journal),
+        lambda found: pareto.summary(found, scenario),
+        lambda folder, found, figures: pareto.write(folder, scenario, found, figures, known_by),
+    )
 
 
-KINDS: dict[str, Callable[..., Any]] = {"torque": AgainstTorque, "t_f": AgainstTime}
+def against_time(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
+    """What a faster slew costs; times [s]: the usual ones if there are none. Raises ScenarioError if one cannot fly."""
+    times = times or slew_times.usual_times(scenario)
+    slew_times.check(scenario, times)
+    known_by = slew_times.identity(scenario, seed, times)
+    return Front(
+        known_by,
+        lambda tell, journal: slew_times.trace(scenario, seed, times, tell, journal),
+        lambda found: slew_times.summary(found, scenario),
+        lambda folder, found, figures: slew_times.write(folder, scenario, found, figures, known_by),
+    )
+
+
+KINDS: dict[str, Callable[..., Front]] = {"torque": against_torque, "t_f": against_time}

@@ -1,18 +1,19 @@
 """Gains judged as they are flown: on fresh trials and the flight clock, beside the paper's and those before."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo, runs
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.numerics import draws
+from ptsmc_jax.numerics import draws, statistics
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
-from tuning.search import confirm, gains
+from tuning.search import confirm, gains, trust
 
 
 def seed_of_judge(seed: int, turn: int = 0) -> int:
@@ -55,6 +56,25 @@ def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Ver
 
     flown = requirements.verdicts(ready.requirements, values, trials.finished[one])
     return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
+
+
+def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, Any]:
+    """What fresh trials say of gains: RMS window error with its interval, failures, and whether all limits are met."""
+    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+    return {
+        "rms": float(trust.rms(errors)) if errors.size else np.nan,
+        "interval": trust.interval(errors, trust.rms),
+        "failures": int(np.sum(~trials.ok)),
+        "meets": all(v.met for v in verdicts_of(scenario, trials, fresh_seed)) and bool(np.all(trials.ok)),
+    }
+
+
+def largest(name: str, scenario: Scenario, trials: Trials) -> float:
+    """What a metric stays below in the share of trials that its requirement asks for, or in all; NaN: none ended."""
+    values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
+    asked = scenario.requirements.get(name)
+    share = (asked.share if isinstance(asked, Limit) else None) or 1.0
+    return statistics.value_at(values, share) if values.size else np.nan
 
 
 def as_flown(scenario: Scenario) -> Scenario:

@@ -16,7 +16,6 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
@@ -31,13 +30,14 @@ from tuning.search.objective import T_F, Problem
 from tuning.search.optimise import Search, search
 from tuning.search.progress import Report
 from tuning.search.rounds import MARGIN
-from tuning.studies import judging, posing, tuner
+from tuning.studies import judging, posing
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
 HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that nothing keeps
 FEWER = 4  # starts of the search for the least torque
 WARM = 3  # of the gains known so far, from which each step of the ladder starts
+NEARLY = 0.05  # of a limit: known gains that are beyond it by less are as good a start as those that keep it
 STEPS = 40  # points looked at from each of them, at most
 APART = 1e-3  # of the bounds' intervals between two points, at least
 RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
@@ -121,7 +121,7 @@ def trace(
     best = _apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
-    judged = _judge(limited, evaluate, by_limit, fresh_seed, ready.requirements, tell)
+    judged = _judge(limited, posed, by_limit, fresh_seed, tell)
     fixed = {}
     for name, other in beside.items():
         trials, values = judging.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
@@ -184,7 +184,7 @@ def _apart(best: dict[int, Best]) -> dict[int, Best]:
 def _step(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
     """The best gains that keep these limits, from the most promising known ones."""
     flown = posed.evaluate.fly(problem, known)
-    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - 0.05, 0.0)))[:WARM]]
+    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - NEARLY, 0.0)))[:WARM]]
     run = Descents(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
     if posed.sloped:
         run.descend(problem, dict(enumerate(chosen)))
@@ -193,33 +193,30 @@ def _step(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | No
     return run.best if run.started and run.best.over == 0.0 else None
 
 
-def _judge(scenario, evaluate, found, fresh_seed, requirements, tell) -> dict[float, tuple[Point, Trials]]:
+def _judge(
+    scenario: Scenario, posed: posing.Posed, by_limit: dict[float, Best], fresh_seed: int, tell: Report
+) -> dict[float, tuple[Point, Trials]]:
     judged = {}
-    for k, (limit, best) in enumerate(found.items()):
-        tell("judging on fresh trials", k, len(found), np.nan, 0.0)
-        named = evaluate.bounds.rounded(np.asarray(evaluate.bounds.gains(jnp.asarray(best.share))), tuner.DIGITS)
+    for k, (limit, best) in enumerate(by_limit.items()):
+        tell("judging on fresh trials", k, len(by_limit), np.nan, 0.0)
+        named = posed.named(best.share)
         tuned = gains.in_scenario(scenario, named)
-        trials = judging.judge(tuned, fresh_seed, requirements)
+        trials = judging.judge(tuned, fresh_seed, posed.ready.requirements)
         judged[limit] = _point(limit, named, best.value, trials, tuned, fresh_seed), trials
     return judged
 
 
-def _point(limit, named, trained, trials: Trials, scenario: Scenario, fresh_seed: int) -> Point:
-    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+def _point(
+    limit: float, named: dict[str, float], trained: float, trials: Trials, scenario: Scenario, fresh_seed: int
+) -> Point:
     peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
-    asked = scenario.requirements[TORQUE]
-    quantile = (asked.quantile if isinstance(asked, Limit) else None) or 1.0
-    verdicts = judging.verdicts_of(scenario, trials, fresh_seed)
     return Point(
         limit=limit,
         gains=dict(named),
         trained=trained,
-        rms=float(trust.rms(errors)) if errors.size else np.nan,
-        interval=trust.interval(errors, trust.rms),
-        peak=statistics.value_at(np.sort(peaks), quantile) if peaks.size else np.nan,
+        peak=judging.largest(TORQUE, scenario, trials),
         mean_peak=float(np.mean(peaks)) if peaks.size else np.nan,
-        failures=int(np.sum(~trials.ok)),
-        meets=all(v.met for v in verdicts) and bool(np.all(trials.ok)),
+        **judging.figures(scenario, trials, fresh_seed),
     )
 
 

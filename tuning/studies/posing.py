@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.scenario import Study, study, tables
@@ -16,6 +17,8 @@ from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
 from tuning.studies import judging
 
+DIGITS = 6  # of the gains handed over; what is judged is what is handed over
+
 
 @dataclass(frozen=True)
 class Posed:
@@ -27,6 +30,11 @@ class Posed:
     own: np.ndarray  # (gains,) of the scenario
     sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
     asked: list[Requirement]  # what the search keeps
+
+    def named(self, share: np.ndarray) -> dict[str, float]:
+        """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
+        gains = np.asarray(self.evaluate.bounds.gains(jnp.asarray(share)))
+        return self.evaluate.bounds.rounded(gains, DIGITS)
 
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:

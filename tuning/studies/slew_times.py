@@ -9,13 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import montecarlo, store
-from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Limit, Scenario
@@ -25,7 +22,7 @@ from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.optimise import search
 from tuning.search.progress import Report
-from tuning.studies import judging, pareto, posing, tuner
+from tuning.studies import judging, pareto, posing
 
 # what a faster slew may cost: of those metrics that a scenario has, the largest of the fresh trials
 COSTS = ("peak_torque", "peak_momentum", "peak_wheel_torque", "peak_wheel_momentum", "peak_rate", "effort")
@@ -123,29 +120,15 @@ def trace(
     ready = study(judging.as_flown(base), reach=posing.reach(base, table, t_f=times[-1]))
     for done, k in enumerate(sorted(best)):
         tell("judging on fresh trials", done, len(best), np.nan, 0.0)
-        share = jnp.asarray(best[k].share)
-        named = posed.evaluate.bounds.rounded(np.asarray(posed.evaluate.bounds.gains(share)), tuner.DIGITS)
+        named = posed.named(best[k].share)
         parts = gains.with_gains(ready.parts, {**named, "t_f": times[k]})
         count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements))
         trials = montecarlo.run(parts, ready.dispersion, fresh_seed, np.arange(count))
-        chosen = {**named, "t_f": times[k]}
-        slews.append(_slew(times[k], named, trials, gains.in_scenario(scenario, chosen), fresh_seed))
+        tuned = gains.in_scenario(scenario, {**named, "t_f": times[k]})
+        costs = {name: judging.largest(name, tuned, trials) for name in _costs(tuned)}
+        slews.append(Slew(times[k], dict(named), costs=costs, **judging.figures(tuned, trials, fresh_seed)))
     without = [t_f for k, t_f in enumerate(times) if k not in best]
     return Slews(slews, without, fresh_seed, count, posed.evaluate.rollouts, posed.evaluate.gradients)
-
-
-def _slew(t_f: float, named: dict[str, float], trials: Trials, scenario: Scenario, fresh_seed: int) -> Slew:
-    errors = np.asarray(trials.metrics.window_error)[trials.finished]
-    verdicts = judging.verdicts_of(scenario, trials, fresh_seed)
-    return Slew(
-        t_f=t_f,
-        gains=dict(named),
-        rms=float(trust.rms(errors)) if errors.size else np.nan,
-        interval=trust.interval(errors, trust.rms),
-        costs={name: _largest(name, trials, scenario) for name in _costs(scenario)},
-        failures=int(np.sum(~trials.ok)),
-        meets=all(v.met for v in verdicts) and bool(np.all(trials.ok)),
-    )
 
 
 def _costs(scenario: Scenario) -> list[str]:
@@ -153,13 +136,6 @@ def _costs(scenario: Scenario) -> list[str]:
     known = scenario.metrics
     tables = {name: known[name].table for name in COSTS if name in known}
     return [name for name, table in tables.items() if table is None or getattr(scenario, table, None) is not None]
-
-
-def _largest(name: str, trials: Trials, scenario: Scenario) -> float:
-    values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
-    asked = scenario.requirements.get(name)
-    quantile = (asked.share if isinstance(asked, Limit) else None) or 1.0
-    return statistics.value_at(values, quantile) if values.size else np.nan
 
 
 def identity(scenario: Scenario, seed: int, times: Sequence[float]) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from tuning.studies import judging, posing, stability
 from tuning.studies.posing import Posed
 
 GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
-DIGITS = 6  # of the gains handed over; what is judged is what is handed over
 TRIES = 3  # searches at most, each of whose gains are judged on fresh trials of their own
 FARTHER = 1.02  # a further search keeps so much more from the limits than what fresh trials found too little
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
@@ -212,7 +211,7 @@ def _search_and_judge(
 def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
     """The gains that a search found, as they are handed over, on fresh trials."""
     begun = time.monotonic()
-    rounded = posed.evaluate.bounds.rounded(outcome.gains, DIGITS)
+    rounded = posed.named(outcome.share)
     flown = judging.as_flown(gains.in_scenario(scenario, rounded))
     trials = judging.judge(flown, fresh_seed, posed.ready.requirements)
     return _Judged(outcome, rounded, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
