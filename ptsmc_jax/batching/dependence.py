@@ -1,4 +1,4 @@
-"""What the values of a trace differ over, told from its inputs without evaluating it: for `lanes` and `kernel`."""
+"""What the values of a trace differ over, and which of them count, without evaluating it: for `lanes` and `kernel`."""
 
 import operator
 from collections.abc import Sequence
@@ -6,6 +6,7 @@ from functools import reduce
 from typing import Any
 
 from jax.extend import core
+from jax.interpreters import partial_eval
 
 _CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
 
@@ -69,3 +70,9 @@ def _dependence_through(eqn: Any, depends: list[int]) -> list[int]:
         (each,) = dependence(params["cond_jaxpr"].jaxpr, [*depends[:first], *settled])
         return [own | each for own in settled]
     return [every] * len(eqn.outvars)
+
+
+def used(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+    """The trace without what no output hangs on."""
+    used, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    return core.ClosedJaxpr(used, closed.consts)

@@ -29,6 +29,7 @@ from ptsmc_jax.batching.dependence import called, dependence, settle
 
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
+MAPPED = 256  # the same of loops that carry nothing from step to step, whose results are stacked
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
 
@@ -222,7 +223,7 @@ class _Inside:
         xs = values[constants + carried :]
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
-        if length <= UNROLLED or (carried == 0 and length <= components.LARGEST):
+        if length <= UNROLLED or (carried == 0 and length <= MAPPED):
             rows = []
             for k in range(length):
                 results = self.evaluate(body, [*consts, *state, *(_row(x, k) for x in xs)])

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend import core
-from jax.interpreters import partial_eval
 from jaxtyping import Array
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, parts_of, plain
-from ptsmc_jax.batching.dependence import called, dependence, either, settle
+from ptsmc_jax.batching.dependence import called, dependence, either, settle, used
 
 
 class LanesWarning(UserWarning):
@@ -42,7 +41,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Calla
     def mapped(*args: Any) -> Any:
         trials, one, values = _mapped(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
-        results = _Lanes(trials, strict).evaluate(closed, values)
+        results = _Lanes(trials, strict).evaluate(used(closed), values)
         return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, (trials,)) for value in results])
 
     return mapped
@@ -76,9 +75,8 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callab
         # an argument that stays has a place among the values, but none here
         inner = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         slopes = [_slope(leaf, shape) for leaf, shape in zip(along, inner, strict=True)]
-        used, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
         lanes = _Lanes(trials, strict, directions=along[0].shape[0])
-        results = lanes.evaluate(core.ClosedJaxpr(used, closed.consts), [*values, *slopes])
+        results = lanes.evaluate(used(closed), [*values, *slopes])
         half = len(results) // 2
         leads = [(trials,)] * half + [(lanes.directions, trials)] * half
         return jax.tree.unflatten(jax.tree.structure(out), [*map(dense_of, results, leads)])

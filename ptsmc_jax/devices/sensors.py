@@ -143,11 +143,8 @@ class Sensors(Sensor):
 
     def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key]:
         """Streams of a trial's noise: attitude, rate, change of the bias."""
-        return (
-            draws.stream(seed, trial, ATTITUDE_NOISE),
-            draws.stream(seed, trial, RATE_NOISE),
-            draws.stream(seed, trial, BIAS_WALK),
-        )
+        attitude, rate, walk = draws.streams(seed, trial, (ATTITUDE_NOISE, RATE_NOISE, BIAS_WALK))
+        return attitude, rate, walk
 
     def noise(self, keys: tuple, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""

@@ -6,15 +6,16 @@ moves them: value = at(coordinates).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.simulation.rollout import Parts
 
 Numbers = Float[Array, " n"]
-Drawn = Literal["uniform", "normal"]
+Drawn = draws.Law
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
 
 # names of what is drawn, and of the streams that it is drawn from

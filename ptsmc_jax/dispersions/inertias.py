@@ -36,13 +36,19 @@ class RelativeInertia:
     def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Inertia [kg m^2] and its inverse, (3, 3) each."""
         first, turn, rest = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
-        shares = [(share, True) for share in first.reshape(CANDIDATES, 3)]
-        shares += zip(*jax.vmap(self._slender)(rest.reshape(SLENDER, 4)), strict=True)
-        found = self.moments
-        for share, counts in shares[::-1]:  # so that the first one stays
-            moments = self.moments * (1.0 + self.std * share)
-            physical = (2.0 * jnp.max(moments) <= jnp.sum(moments)) & (jnp.min(moments) > 0.0)
-            found = jnp.where(counts & physical & (jnp.max(jnp.abs(share)) <= FARTHEST), moments, found)
+        first = first.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)
+        # loops over the draws: the same work, but a fraction of the code to compile
+        later = jax.lax.map(self._slender, rest.reshape(SLENDER, 4))
+        listed = jax.tree.map(lambda *both: jnp.concatenate(both), first, later)
+
+        def look(known: tuple[Array, Array], draw: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+            (found, moments), (share, counts) = known, draw
+            tried = self.moments * (1.0 + self.std * share)
+            physical = (2.0 * jnp.max(tried) <= jnp.sum(tried)) & (jnp.min(tried) > 0.0)
+            fits = counts & physical & (jnp.max(jnp.abs(share)) <= FARTHEST)
+            return (found | fits, jnp.where(fits & ~found, tried, moments)), None
+
+        (_, found), _ = jax.lax.scan(look, (jnp.asarray(False), self.moments), listed)
         q = attitude.from_rotation_vector(self.turn * turn)
         axes = self.axes @ jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
         return (axes @ jnp.diag(found)) @ axes.T, (axes @ jnp.diag(1.0 / found)) @ axes.T

@@ -81,12 +81,11 @@ class Dispersion:
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
         """Coordinates of a trial; each name has a stream of its own, so one more of them changes no other."""
-        return {
-            name: (draws.normals if kind.drawn == "normal" else draws.uniforms)(
-                draws.stream(seed, trial, name), kind.count
-            )
-            for name, kind in self.kinds.items()
-        }
+        kinds, found = self.kinds, {}
+        for law in draws.LAWS:
+            counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == law}
+            found |= draws.several(seed, trial, law, counts) if counts else {}
+        return {name: found[name] for name in kinds}
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
         """The parts of the trial that has these coordinates."""

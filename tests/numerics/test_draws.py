@@ -139,6 +139,9 @@ def test_uniforms_stay_inside_the_interval_and_normals_finite_in_32_bits():
         assert np.all((np.asarray(u) > 0) & (np.asarray(u) < 1))
 
 
+DRAWING = {f"draws.{name}" for name in ("stream", "streams", "several", "derive")}
+
+
 def stream_names():
     """Names given to `stream` and `derive` anywhere in the source, constants of the module looked up."""
     names = []
@@ -147,13 +150,15 @@ def stream_names():
         constants = {k: v for k, v in known.items() if k.isupper() and isinstance(v, str)}
         tree = ast.parse(path.read_text())
         for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("draws.stream", "draws.derive"):
-                name = node.args[-1]
+            if not isinstance(node, ast.Call) or ast.unparse(node.func) not in DRAWING:
+                continue
+            last = node.args[-1]
+            for name in last.elts if isinstance(last, ast.Tuple) else [last]:
                 if isinstance(name, ast.Constant):
                     names.append(name.value)
                 elif ast.unparse(name) in constants:
                     names.append(constants[ast.unparse(name)])
-                else:  # one of all the names that the file has
+                else:  # of all the names that the file has
                     names += [value for value in constants.values() if isinstance(value, str)]
     return names
 
