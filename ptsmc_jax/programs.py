@@ -259,16 +259,16 @@ def _write(path: Path, said: str, compiled: Any) -> None:
         devices = {device for way in jax.tree.leaves(compiled.output_shardings) for device in way.device_set}
         body = pickle.dumps((payload, jax.tree.unflatten(outside, range(outside.num_leaves)), len(devices)))
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, made = tempfile.mkstemp(dir=path.parent)
+        handle, temporary = tempfile.mkstemp(dir=path.parent)
         try:
             with open(handle, "wb") as file:
                 file.write(hashlib.sha256(said.encode() + body).digest() + body)
-            os.replace(made, path)
+            os.replace(temporary, path)
         except BaseException:
-            Path(made).unlink(missing_ok=True)
+            Path(temporary).unlink(missing_ok=True)
             raise
-        kept = sorted(path.parent.glob("*.program"), key=lambda p: p.stat().st_mtime)
-        for old in kept[:-KEPT]:
+        programs = sorted(path.parent.glob("*.program"), key=lambda p: p.stat().st_mtime)
+        for old in programs[:-KEPT]:
             old.unlink(missing_ok=True)
     except Exception:
         pass

@@ -8,6 +8,7 @@ not depend on the trial stays as it is: its loops keep a scalar, its branches st
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -317,31 +318,22 @@ class _Lanes:
     def branch(self, eqn: Any, values: list) -> list:
         """lax.cond and lax.switch: a branch where all trials agree, else all of them and a choice for each trial."""
         index, *operands = values
-        branches = eqn.params["branches"]
-        if isinstance(index, Lane):
-            (chosen,), given = _which([index]), _which(operands)
-            found = [dependence(branch.jaxpr, given) for branch in branches]
-            differs = [either(some) | chosen for some in zip(*found, strict=True)]
-            each = _Packed(eqn.outvars, differs, self.leads)
-            cases = [each.pack(self.evaluate(branch, operands)) for branch in branches]
-            which = index.dense(self.leads[chosen])
-            which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
-            return each.unpack(
-                tuple(
-                    jax.tree.map(
-                        lambda *c, own=own: lax.select_n(
-                            jnp.broadcast_to(self._along(which, c[0], own), c[0].shape), *c
-                        ),
-                        *one,
-                    )
-                    for *one, own in zip(*cases, differs, strict=True)
-                )
-            )
-        operands = [_apart(value) for value in operands]
+        agree, branches = not isinstance(index, Lane), eqn.params["branches"]
+        operands = [_apart(value) for value in operands] if agree else operands
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
-        one = _Packed(eqn.outvars, [either(d) for d in zip(*depends, strict=True)], self.leads)
-        choices = [lambda branch=branch: one.pack(self.evaluate(branch, operands)) for branch in branches]
-        return one.unpack(lax.switch(plain(index), choices))
+        differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
+        results = _Packed(eqn.outvars, differs, self.leads)
+        cases = [lambda branch=branch: results.pack(self.evaluate(branch, operands)) for branch in branches]
+        if agree:
+            return results.unpack(lax.switch(plain(index), cases))
+        which = index.dense(self.leads[index.differs])
+        which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
+
+        def choice(differs: int, *case: Array) -> Array:
+            return lax.select_n(jnp.broadcast_to(self._along(which, case[0], differs), case[0].shape), *case)
+
+        outputs = zip(differs, *(case() for case in cases), strict=True)
+        return results.unpack([jax.tree.map(partial(choice, over), *output) for over, *output in outputs])
 
     def custom(self, eqn: Any, values: list) -> list:
         """A function with a derivative rule of its own (custom_jvp), which is kept."""

@@ -179,17 +179,17 @@ def _shortened(body: list[str]) -> list[str]:
     """Lines in which an array of a struct that is read often has a name of its own."""
     text = "\n".join(body)
     reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\](?: =(?!=)|\[))", text))
-    found, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
+    short_names, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
     for place, count in sorted(reads.items(), key=lambda item: (item[0].startswith("before"), item[0])):
         name = re.split(r"->|\.", place)[-1]
         name = f"{name}_before" if place.startswith("before") else name
         name = f"{name}_now" if name in taken else name
         if count >= 4 and name not in taken:
             taken.add(name)
-            found[place] = name
-    for place, name in found.items():
+            short_names[place] = name
+    for place, name in short_names.items():
         body = [re.sub(rf"(?<![\w>]){re.escape(place)}\[(?!\d+\] =(?!=))", f"{name}[", line) for line in body]
-    heads = [f"    const real *const {name} = {place};" for place, name in sorted(found.items())]
+    heads = [f"    const real *const {name} = {place};" for place, name in sorted(short_names.items())]
     return [*heads, *body]
 
 

@@ -74,8 +74,8 @@ class Translator:
         name, inner = eqn.primitive.name, called(eqn)
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
-            told = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
-            known = KNOWN_FUNCTIONS.get(getattr(told, "func_name", ""))
+            debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
+            known = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
             if known is not None and len(eqn.outvars) == 1:
                 return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
         if inner is not None:

@@ -14,8 +14,8 @@ COARSE = np.deg2rad(5.0)  # of noise [rad], from which on it is likely another u
 
 def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
-    found = disturbance_bounds.of(scenario, scenario.inputs)
-    bounded = [] if found is None else [*_far_off(scenario, *found), *_noisy(scenario, found[0])]
+    bounds = disturbance_bounds.of(scenario, scenario.inputs)
+    bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
     return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario)]
 
 

@@ -32,16 +32,16 @@ def of(struct: type[Table]) -> list[Key]:
     for base in reversed(struct.__mro__):
         meanings |= _attributes(base.__dict__.get("__doc__") or "")
     hints = typing.get_type_hints(struct, include_extras=True)
-    found = []
+    keys = []
     for field in msgspec.structs.fields(struct):
         if field.name != "kind":
             parts = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name])
             assert parts is not None
             meaning, unit = parts.groups()
-            made = field.default_factory
-            default = field.default if made is msgspec.NODEFAULT else made()
-            found.append(Key(field.name, meaning, unit or "", allowed(hints[field.name]), default))
-    return found
+            factory = field.default_factory
+            default = field.default if factory is msgspec.NODEFAULT else factory()
+            keys.append(Key(field.name, meaning, unit or "", allowed(hints[field.name]), default))
+    return keys
 
 
 def about(struct: type[Table]) -> str:

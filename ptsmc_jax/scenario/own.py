@@ -225,24 +225,24 @@ def _inside(field: dataclasses.Field, usual: Any) -> None:
         )
 
 
-def _bounds(name: str, about: Any) -> GainBounds:
-    usual = about.usual
+def _bounds(name: str, gain: Any) -> GainBounds:
+    usual = gain.usual
     if usual is None:
         raise ValueError(f"the gain {name} has no bounds; allowed is ptsmc_jax.gain(.., usual=(lower, upper))")
-    given: Callable = usual if callable(usual) else lambda t_f, period: usual
+    bounds_of: Callable = usual if callable(usual) else lambda t_f, period: usual
 
     def interval(choice: Choice) -> tuple[float, float]:
         try:
-            low, high = (float(v) for v in given(choice.t_f, choice.scenario.loop.period))
+            low, high = (float(v) for v in bounds_of(choice.t_f, choice.scenario.loop.period))
         except Exception as error:
             said = f"{type(error).__name__}: {error}"
             raise ScenarioError(f"the usual bounds of controller.{name} fail: {said}") from None
-        if not (about.above <= low < high <= about.below and math.isfinite(high)):
-            between = f"between {about.above:g} and {about.below:g}"
+        if not (gain.above <= low < high <= gain.below and math.isfinite(high)):
+            between = f"between {gain.above:g} and {gain.below:g}"
             raise ScenarioError(
                 f"the usual bounds of controller.{name} are [{low:g}, {high:g}], but must be two numbers {between}, "
                 "the lower one first"
             )
         return low, high
 
-    return GainBounds(interval, lambda _: Allowed(about.above, about.below))
+    return GainBounds(interval, lambda _: Allowed(gain.above, gain.below))

@@ -9,7 +9,7 @@ import csv
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -203,14 +203,8 @@ def _simulate(result: Result) -> tuple[Heading, list[Section]]:
     if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would lie on each other
         del marks["t_f - delta"]
     drawn = page_charts.history(columns, spacecraft, marks)
-    charts = [
-        result.chart(
-            "history",
-            drawn,
-            "Drag to zoom, double-click to see all; dotted are the hand-over and t_f.",
-            "tall",
-        )
-    ]
+    caption = "Drag to zoom, double-click to see all; dotted are the hand-over and t_f."
+    charts = [result.chart("history", drawn, caption, "tall")]
     if spacecraft:
         q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
         caption = "The body with its axes as it turns; dashed: the inertial axes. Drag to look from elsewhere."
@@ -269,26 +263,35 @@ def _distance(verdict: dict[str, Any]) -> str:
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     from ptsmc_jax.simulation.catalogues import CATALOGUES
 
+    if "slews" in result.summary:
+        return _slew_times(result)
     summary, units = result.summary, {name: entry.unit for name, entry in CATALOGUES[result.kind].items()}
-    if "slews" in summary:
-        blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
-        lines, wanted = [sentences.slew_times_heading(summary)], bool(summary["requirements"])
-        heading = _verdict(summary, lines, wanted)
-        met, asked = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
-        said = f"At {met} of {asked} prescribed times gains meet every requirement" if wanted else heading.headline
-        return Heading(heading.mood, said, heading.lines), [Section("What a faster slew costs", blocks)]
-    known = result.scenario.get("requirements", {}).get("peak_torque")
-    limit = known.get("limit") if isinstance(known, dict) else known
+    requirement = result.scenario.get("requirements", {}).get("peak_torque")
+    limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
     caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."
     sections = [
         Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
         Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
     ]
-    wanted = bool(summary["requirements"])
-    heading = _verdict(summary, [sentences.front_heading(summary)], wanted)
-    some = {"met": "Gains", "not met": "No gains"}.get(summary["status"]) if wanted else None
-    said = heading.headline if some is None else f"{some} on the front meet every requirement"
-    return Heading(heading.mood, said, heading.lines), sections
+    gains = {"met": "Gains", "not met": "No gains"}.get(summary["status"])
+    said = None if gains is None else f"{gains} on the front meet every requirement"
+    return _with_headline(summary, sentences.front_heading(summary), said), sections
+
+
+def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
+    met, times = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
+    said = f"At {met} of {times} prescribed times gains meet every requirement"
+    heading = _with_headline(summary, sentences.slew_times_heading(summary), said)
+    return heading, [Section("What a faster slew costs", blocks)]
+
+
+def _with_headline(summary: dict[str, Any], line: str, said: str | None) -> Heading:
+    """What a front says first; said: its headline where requirements are asked for."""
+    asked = bool(summary["requirements"])
+    heading = _verdict(summary, [line], asked)
+    return replace(heading, headline=said) if asked and said is not None else heading
 
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:

@@ -97,9 +97,9 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
         loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     else:
         loops, _ = run_margins.judged_loops(parts)
-    found = margins.of_each(loops, with_delay="delay_margin" in asked.metrics).each()
+    values = margins.of_each(loops, with_delay="delay_margin" in asked.metrics).each()
     shares = [
-        over(found[name].reshape(-1), wanted, at_least=MARGINS[name][2])
+        over(values[name].reshape(-1), wanted, at_least=MARGINS[name][2])
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
     ]
     near = jnp.stack([jnp.where(jnp.isnan(share), WITHOUT, share) for share in shares])

@@ -75,7 +75,7 @@ class Rounds:
         if not (self._every or self._shares or self.problem.margins is not None):
             return False
         joining = list[Joining]()
-        others, beyond = _harder_margins(self.problem, gains)
+        nearer_loops, beyond = _harder_margins(self.problem, gains)
         if self._shares:  # each time on other trials, which those screened are not among
             tell("confirming on other trials")
             joining += self._confirmed(gains)
@@ -91,7 +91,7 @@ class Rounds:
                 joining.append(Joining(_hardest(self.problem, *self._known), kept_by_every_trial(self.problem)))
         if not (joining or beyond) or self.count == ROUNDS:
             return False
-        self.problem = others if beyond else self.problem
+        self.problem = nearer_loops if beyond else self.problem
         for more in joining:
             self._join(more)
         self.hardest = None  # it was the worst case of gains that are searched on from

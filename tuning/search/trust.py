@@ -85,8 +85,8 @@ def sensitivities(
     finished = np.isin(flown.status, rollout.FINISHED)
     metrics = (getattr(flown.metrics, name) for name in names)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = [[rms(one[ended]) for one, ended in zip(metric, finished, strict=True)] for metric in metrics]
-        below, above = np.split(np.transpose(found), 2)
+        metric_rms = [[rms(one[ended]) for one, ended in zip(metric, finished, strict=True)] for metric in metrics]
+        below, above = np.split(np.transpose(metric_rms), 2)
         rows = np.log(above / below) / np.log(np.diag(more) / np.diag(less))[:, None]
     return {
         metric: dict(zip(problem.names, row.tolist(), strict=True))

@@ -103,19 +103,19 @@ def trace(
     posed = posing.pose(base, seed, journal, t_f=times[-1])
     ladder = [replace(posed.problem, parts=gains.with_gains(posed.problem.parts, {"t_f": t_f})) for t_f in times]
     common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
-    known = []
+    shares = []
     for k, what, starts in ((-1, "longest", table.starts), (0, "shortest", pareto.FEWER)):
 
         def told(doing: str, *numbers: Any, what: str = what) -> None:
             tell(f"{what} time: {doing}", *numbers)
 
-        found = search(posed.evaluate, ladder[k], posed.asked, posed.own, starts, report=told, **common)
-        if found.interrupted:
+        outcome = search(posed.evaluate, ladder[k], posed.asked, posed.own, starts, report=told, **common)
+        if outcome.interrupted:
             raise KeyboardInterrupt
-        known.append(found.share)
+        shares.append(outcome.share)
         # the hardest trials that joined are asked for at every time
-        ladder = [replace(found.problem, parts=one.parts) for one in ladder]
-    best = pareto.climbed(ladder, known, posed, tell)
+        ladder = [replace(outcome.problem, parts=one.parts) for one in ladder]
+    best = pareto.climbed(ladder, shares, posed, tell)
     fresh_seed, slews, count = judging.seed_of_judge(seed), [], 0
     ready = study(judging.as_flown(base), reach=posing.reach(base, table, t_f=times[-1]))
     for done, k in enumerate(sorted(best)):
