@@ -11,58 +11,71 @@ AGREE = 0.01  # slopes off from differences by more than this share say little
 
 def search(summary: Summary) -> Iterator[str]:
     """How the search went."""
-    found = summary["search"]
-    for metric, ratio in found.get("largest_over_limit", {}).items():
+    record = summary["search"]
+    for metric, ratio in record.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
             far = _far(summary, metric, ratio)
             yield f"no gains found within the bounds keep every limit: with the best ones {far}"
-    earlier = found.get("earlier", [])
-    kept = [*(one["margin"] for one in earlier[1:]), found.get("margin", 0.0)]
-    for one, margin in zip(earlier, kept, strict=False):
-        reached = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in one["over"].items())
-        yield (
-            f"gains that kept every limit in the search reached {reached} on fresh trials (seed {one['fresh_seed']}): "
-            f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
-            f"{100 * one['margin']:.2g} %, and what it found is judged on other trials"
-        )
-    for one in found.get("confirmed", []):
+    yield from _went_on(record)
+    for one in record.get("confirmed", []):
         most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
         yield (
             f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
             f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
             f"probability of {100 * one['probability']:.3g} %"
         )
-    hardest = found.get("hardest")
-    if hardest is not None and hardest["unbounded"]:
+    if record.get("hardest") is not None:
+        yield _worst_case(record["hardest"], tuned_for=record.get("worst_case", False))
+    if "rollouts" in record:
+        steps = record.get("seconds_by_step", {}).items()
+        yield (
+            f"the search flew {record['rollouts']} trials without and {record['gradients']} with gradients in "
+            f"{record['seconds']:.0f} s" + "".join(f", {what} {spent:.0f} s" for what, spent in steps if spent >= 1.0)
+        )
+    if summary.get("differential_evolution") is not None:
+        yield _globally(summary["differential_evolution"], record)
+
+
+def _went_on(record: Summary) -> Iterator[str]:
+    """That gains broke a limit on fresh trials, and the search went on."""
+    earlier = record.get("earlier", [])
+    margins = [*(one["margin"] for one in earlier[1:]), record.get("margin", 0.0)]
+    for one, margin in zip(earlier, margins, strict=False):
+        reached = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in one["over"].items())
+        yield (
+            f"gains that kept every limit in the search reached {reached} on fresh trials (seed {one['fresh_seed']}): "
+            f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
+            f"{100 * one['margin']:.2g} %, and what it found is judged on other trials"
+        )
+
+
+def _worst_case(hardest: Summary, *, tuned_for: bool) -> str:
+    """How far the worst case inside the dispersions goes."""
+    if hardest["unbounded"]:
         moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
         reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
-        yield (
+        return (
             f"the worst case of {hardest['metric']} inside the dispersions has no bound: over {moved} some trial "
             f"{reach}; ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
-    elif hardest is not None:
-        far = "without a value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
-        advice = "" if found["worst_case"] or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
-        yield f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
-    if "rollouts" in found:
-        yield (
-            f"the search flew {found['rollouts']} trials without and {found['gradients']} with gradients in "
-            f"{found['seconds']:.0f} s"
-            + "".join(
-                f", {what} {spent:.0f} s" for what, spent in found.get("seconds_by_step", {}).items() if spent >= 1.0
-            )
-        )
-    checked = summary.get("differential_evolution")
-    if checked is not None:
-        kept = all(ratio is not None and ratio <= 1.0 for ratio in found["largest_over_limit"].values())
-        beside = {
-            (True, True): f"and the goal of the tuned gains is {100 * checked['distance']:+.2f} % off that",
-            (True, False): "with gains that break a limit, which the tuned gains keep",
-            (False, True): "with gains that keep every limit, unlike the tuned ones",
-            (False, False): "with gains that do not keep every limit, as the tuned ones do not",
-        }[kept, checked["kept"]]
-        found = f"{checked['value']:.4e}, {beside}"
-        yield f"differential evolution, a global search with {checked['rollouts']} rollouts, found {found}"
+    far = "without a value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+    advice = "" if tuned_for or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
+    return f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
+
+
+def _globally(checked: Summary, record: Summary) -> str:
+    """What differential evolution found, beside the search."""
+    kept = all(ratio is not None and ratio <= 1.0 for ratio in record["largest_over_limit"].values())
+    beside = {
+        (True, True): f"and the goal of the tuned gains is {100 * checked['distance']:+.2f} % off that",
+        (True, False): "with gains that break a limit, which the tuned gains keep",
+        (False, True): "with gains that keep every limit, unlike the tuned ones",
+        (False, False): "with gains that do not keep every limit, as the tuned ones do not",
+    }[kept, checked["kept"]]
+    return (
+        f"differential evolution, a global search with {checked['rollouts']} rollouts, found {checked['value']:.4e}, "
+        f"{beside}"
+    )
 
 
 def _far(summary: Summary, metric: str, ratio: float | None) -> str:

@@ -27,7 +27,7 @@ from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
-from tuning.search.optimise import Search, search
+from tuning.search.optimise import Search
 from tuning.search.progress import Report
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing
@@ -93,9 +93,8 @@ def trace(
 ) -> Front:
     """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""
     limited, own_limit = _limited(scenario)
-    table = limited.search
     posed = posing.pose(limited, seed, journal)
-    ready, problem, evaluate, start = posed.ready, posed.problem, posed.evaluate, posed.own
+    ready, problem, evaluate, starts = posed.ready, posed.problem, posed.evaluate, limited.search.starts
     beside, refused = judging.beside(limited)
     at = problem.metrics.index(TORQUE)
 
@@ -105,14 +104,13 @@ def trace(
     def report_as(what: str) -> Report:
         return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
 
-    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
-    free = search(evaluate, under(OFF), loose, start, table.starts, report=report_as("most torque"), **common)
+    free = posed.search(under(OFF), posed.own, starts, loose, judged=False, report=report_as("most torque"))
     _unless_interrupted(free)
     problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
     tight = HARDLY * highest
-    least = search(evaluate, under(tight), (), start, FEWER, report=report_as("least torque"), **common)
+    least = posed.search(under(tight), posed.own, FEWER, (), judged=False, report=report_as("least torque"))
     _unless_interrupted(least)
     lowest = least.ended[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)

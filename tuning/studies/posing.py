@@ -1,7 +1,9 @@
 """The tuning problem of a scenario over its training trials, and what evaluates it."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from tuning.search import shares as gain_bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
+from tuning.search.optimise import Search, search
 from tuning.studies import judging
 
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
@@ -30,6 +33,18 @@ class Posed:
     own: np.ndarray  # (gains,) of the scenario
     sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
     asked: list[Requirement]  # what the search keeps
+    seed: int
+
+    def search(
+        self, problem: Problem, gains: np.ndarray, starts: int, asked: Sequence[Requirement] | None = None, **how: Any
+    ) -> Search:
+        """Look for the best gains of this problem from these gains, (gains,), and so many starts in all.
+
+        asked: what is kept, where it is other than the scenario asks for; how: see `optimise.search`.
+        """
+        table, asked = self.ready.scenario.search, self.asked if asked is None else asked
+        how = {"sloped": self.sloped, "robust": table.worst_case, **how}
+        return search(self.evaluate, problem, asked, gains, starts, table.steps, self.seed, **how)
 
     def named(self, share: np.ndarray) -> dict[str, float]:
         """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
@@ -61,7 +76,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
-    return Posed(ready, problem, Evaluator(bounds, journal), own, sloped=not exact, asked=asked)
+    return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed)
 
 
 def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:

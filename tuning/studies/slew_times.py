@@ -20,7 +20,6 @@ from ptsmc_jax.simulation import catalogues
 from tuning.search import confirm, gains, trust
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
-from tuning.search.optimise import search
 from tuning.search.progress import Report
 from tuning.studies import judging, pareto, posing
 
@@ -102,14 +101,13 @@ def trace(
     table = base.search
     posed = posing.pose(base, seed, journal, t_f=times[-1])
     ladder = [replace(posed.problem, parts=gains.with_gains(posed.problem.parts, {"t_f": t_f})) for t_f in times]
-    common: dict[str, Any] = {"steps": table.steps, "seed": seed, "judged": False, "sloped": posed.sloped}
     shares = []
     for k, what, starts in ((-1, "longest", table.starts), (0, "shortest", pareto.FEWER)):
 
         def told(doing: str, *numbers: Any, what: str = what) -> None:
             tell(f"{what} time: {doing}", *numbers)
 
-        outcome = search(posed.evaluate, ladder[k], posed.asked, posed.own, starts, report=told, **common)
+        outcome = posed.search(ladder[k], posed.own, starts, judged=False, report=told)
         if outcome.interrupted:
             raise KeyboardInterrupt
         shares.append(outcome.share)

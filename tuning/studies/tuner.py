@@ -20,7 +20,7 @@ from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.global_check import Check
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
-from tuning.search.optimise import Search, search
+from tuning.search.optimise import Search
 from tuning.search.progress import Report
 from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
@@ -183,19 +183,9 @@ def _search_and_judge(
     scenario: Scenario, posed: Posed, seed: int, report: Report, tries: int
 ) -> tuple[_Judged, list[Try]]:
     """Search and judge; again, with more distance from the limits, where fresh trials break what the search kept."""
-    table = scenario.search
-    look = partial(
-        search,
-        posed.evaluate,
-        posed.problem,
-        posed.asked,
-        steps=table.steps,
-        seed=seed,
-        sloped=posed.sloped,
-        robust=table.worst_case,
-        report=report,
-    )
-    outcome, earlier = look(posed.own, table.starts, prepare=partial(_prepare, scenario)), list[Try]()
+    look = partial(posed.search, posed.problem, report=report)
+    outcome = look(posed.own, scenario.search.starts, prepare=partial(_prepare, scenario))
+    earlier = list[Try]()
     while True:
         report("judging on fresh trials", 0, 0, outcome.value, 0.0)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
