@@ -577,6 +577,10 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     read = checked(tmp_path / "out" / "map-s")
     assert again in read.text
     assert "linear_torque [N m]" in read.text
+    assert "gain_margin [" not in read.text  # a factor
+    first = out.splitlines()[0]
+    assert first.startswith("the smallest RMS window error is ")
+    assert read.text.index(first[1:]) < read.text.index("Pairs")
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.k1=0.8:1.6:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
         status, out, err = command("map", "s.toml", *pairs, "--out", "bad", *bad)

@@ -72,6 +72,11 @@ def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
     assert found["worst"]["gain_margin"] < 0.0
 
 
+def test_the_page_opens_with_what_is_left():
+    known = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": 0.05, "modulus_margin": 5.0}
+    assert margin_sentences.left({"worst": known}) == "gain 6.1 dB, phase 40 deg, delay 0.05 s, modulus 5 dB"
+
+
 def test_margins_need_the_sampled_loop(command, tmp_path):
     (tmp_path / "smooth.toml").write_text("[controller]\nt_f = 5.0\n")
     status, out, err = command("margins", "smooth.toml")

@@ -247,7 +247,7 @@ def test_where_there_is_no_floor_nothing_is_said(least):
     run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
     flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
     for known in ({}, {"floor": least}):
-        assert sentences.run_lines({**run, **known}) == ["status: ok"]
+        assert sentences.run_lines({**run, **known}) == ["status: ok", "window error 1.000e-05"]
         assert list(sentences.campaign_error({**flown, **known})) == []
         assert list(sentences.front_lines({**front, **known})) == []
         assert "times the floor" not in sentences.front({**front, **known}).head

@@ -49,9 +49,14 @@ def lines(summary: Summary) -> Iterator[str]:
             "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
         )
     if summary["stable"]:
-        yield f"the worst margins in hold, and before the hand-over where judged: {_shown(summary['worst'])}"
+        yield f"the worst margins in hold, and before the hand-over where judged: {left(summary)}"
     if summary["said"]:
         yield summary["said"]
+
+
+def left(summary: Summary) -> str:
+    """The least margins where they are judged, in words."""
+    return _shown(summary["worst"])
 
 
 def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:

@@ -20,6 +20,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
 from tuning.output import (
+    cells,
     law_sentences,
     made_again,
     margin_sentences,
@@ -180,11 +181,11 @@ def _limits(verdicts: list[dict[str, Any]]) -> list[Section]:
 def _verdict(summary: dict[str, Any], lines: Iterable[str], requirements: bool) -> Heading:
     status = summary["status"]
     headline = {
-        "met": "Every requirement is met" if requirements else "Done",
+        "met": "Every requirement is met" if requirements else "Every trial ended well; nothing was required",
         "not met": "NOT every requirement is met" if requirements else "NOT every trial ended well",
         "interrupted": "Interrupted: the best so far",
         "unfinished": "NOT finished",
-        "ok": "Done",
+        "ok": "The run ended well; nothing was required",
     }.get(status, f"The run failed: {status}")
     lines = [*lines, *sentences.cautions(summary)]
     mood = {"met": "good", "ok": "calm"}.get(status, "bad")
@@ -333,34 +334,31 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     head = tuple(sentences.with_unit(name, result.kind) for name in rows[0])
-    table = sentences.Table(head, [tuple(_short(cell) for cell in row) for row in rows[1:]])
-    heading = Heading("calm", "Accuracy and peak torque over two keys", [f"{len(rows) - 1} pairs of values"])
+    table = sentences.Table(head, [tuple(map(cells.short, row)) for row in rows[1:]])
+    pairs = [dict(zip(("x", "y", *rows[0][2:]), map(cells.number, row), strict=True)) for row in rows[1:]]
+    first, *others = sentences.grid(pairs, (rows[0][0], rows[0][1]))
+    heading = Heading("calm", first[0].upper() + first[1:], others)
     return heading, [Section("Pairs", [_table(table, page_captions.MAP)])]
 
 
 def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    said = ("calm", "What the loop leaves") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
+    left = margin_sentences.left(summary)
+    said = ("calm", f"The loop is stable: {left}") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
     return Heading(*said, list(margin_sentences.lines(summary))), [
         Section("Margins", [_table(margin_sentences.table(summary))])
     ]
 
 
-def _short(cell: str) -> str:
-    try:
-        return f"{float(cell):.4g}"
-    except ValueError:
-        return cell
-
-
 def _reproduce(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    counted = ", ".join(f"{count} {word}" for word, count in summary["verdicts"].items())
+    counted = ", ".join(f"{count}: {word}" for word, count in summary["verdicts"].items())
     sections = [
         Section("Claims of the paper", [_table(sentences.claims(summary))]),
         Section("Slips of the paper, and what shows them", [_table(sentences.slips(summary))]),
     ]
-    return Heading("calm", "The paper's claims beside what was measured", [counted]), sections
+    held, claims = summary["verdicts"].get("holds", 0), len(summary["claims"])
+    return Heading("calm", f"{held} of {claims} claims of the paper hold as they are written", [counted]), sections
 
 
 SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {

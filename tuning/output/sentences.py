@@ -1,6 +1,7 @@
 """What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
@@ -46,20 +47,31 @@ def run(summary: Summary, kind: str) -> Table:
 
 
 def with_unit(name: str, kind: str) -> str:
-    """A column of rows, or of a map, with its unit; kind: of the plant.
+    """A column of rows, or of a map, with its unit; kind: of the plant. A map's gain margins are factors.
 
     >>> with_unit("largest_peak_torque", "spacecraft"), with_unit("delay_margin", "chain"), with_unit("status", "chain")
     ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
     """
     from ptsmc_jax.simulation.catalogues import CATALOGUES
 
-    metric = name.removeprefix("hold_") if name.removeprefix("hold_") in MARGINS else name
-    for prefix in ("linear_", "largest_"):
-        metric = metric.removeprefix(prefix)
-    metric = "peak_torque" if metric == "torque" else metric
-    known = {**CATALOGUES[kind], **MARGINS}
-    unit = "rad" if name == "initial_angle" and kind == "spacecraft" else known[metric][0] if metric in known else "-"
+    units = {metric: entry.unit for metric, entry in CATALOGUES[kind].items()}
+    units |= {"torque": units["peak_torque"], "delay_margin": "s"}
+    units |= {"initial_angle": "rad"} if kind == "spacecraft" else {}
+    unit = units.get(re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name), "-")
     return name if unit == "-" else f"{name} [{unit}]"
+
+
+def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str]) -> Iterator[str]:
+    """What was flown over two keys, across and up; pairs: a map's rows by column, x and y those of the keys."""
+    flown = [pair for pair in pairs if pair["status"] == "flown"]
+    known = [pair for pair in flown if pair["window_error"] == pair["window_error"]]
+    if known:
+        best = min(known, key=lambda pair: (pair["failures"], pair["window_error"]))
+        where = f"{keys[0]} = {best['x']:.4g} and {keys[1]} = {best['y']:.4g}"
+        failed = f", where {best['failures']:.0f} trials failed" if best["failures"] else ""
+        peak = f"where the mean peak of the input is {best['peak_torque']:.3g}"
+        yield f"the smallest RMS window error is {best['window_error']:.3g}, at {where}, {peak}{failed}"
+    yield f"{len(flown)} of {len(pairs)} pairs flown, {sum(pair['failures'] > 0 for pair in flown)} with failed trials"
 
 
 def run_lines(summary: Summary) -> list[str]:
@@ -68,7 +80,7 @@ def run_lines(summary: Summary) -> list[str]:
     when = "" if bad_time is None or bad_time != bad_time else f", at {bad_time:.4g} s"
     what = f", {summary['reason']}{when}" if summary["reason"] else ""
     beside = floor(summary.get("window_error"), summary.get("floor"))
-    error = [f"window error {summary['window_error']:.3e}{beside}"] if beside else []
+    error = [f"window error {summary['window_error']:.3e}{beside}"] if summary.get("window_error") is not None else []
     return [f"status: {summary['status']}{what}", *error]
 
 

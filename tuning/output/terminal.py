@@ -1,5 +1,6 @@
 """What the commands print: progress while they work, results when they are done."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,16 +40,7 @@ def reproduction(summary: dict[str, Any], folder: Path) -> None:
 
 def grid(cells: list[Any], keys: tuple[str, str], folder: Path) -> None:
     """What was flown over two keys, across and up."""
-    flown = [cell for cell in cells if cell.status == "flown"]
-    print(f"{len(flown)} of {len(cells)} pairs flown, {sum(cell.failures > 0 for cell in flown)} with failed trials")
-    known = [cell for cell in flown if cell.window_error == cell.window_error]
-    if known:
-        best = min(known, key=lambda cell: (cell.failures, cell.window_error))
-        where = f"{keys[0]} = {best.x:.4g} and {keys[1]} = {best.y:.4g}"
-        failed = f", where {best.failures} trials failed" if best.failures else ""
-        peak = f"where the mean peak of the input is {best.peak_torque:.3g}"
-        print(f"the smallest RMS window error is {best.window_error:.3g}, at {where}, {peak}{failed}")
-    print(f"results in {folder}")
+    say(*sentences.grid([asdict(cell) for cell in cells], keys), f"results in {folder}")
 
 
 def margins(summary: dict[str, Any], folder: Path) -> None:
