@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers import short, tree
 from tests.output.pages import Page, checked
-from tuning.output import made_again, page, page_charts
+from tuning.output import made_again, page, page_charts, search_sentences
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -104,6 +104,21 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     summary["verdicts"]["peak_torque"] = {"limit": 0.01, "margin": None, "met": False}
     (flown / "summary.json").write_text(json.dumps(summary))
     assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
+
+
+def test_a_front_says_its_ends_and_a_faster_slew_the_shortest_that_will_do():
+    points = [{"rms": 1e-3, "peak": 0.2, "knee": False, "dominated": False},
+              {"rms": 5e-4, "peak": 0.3, "knee": True, "dominated": False},
+              {"rms": 9e-4, "peak": 0.4, "knee": False, "dominated": True},
+              {"rms": 4e-4, "peak": 0.5, "knee": False, "dominated": False}]  # fmt: skip
+    (said,) = search_sentences.along_the_front({"points": points})
+    assert said == (
+        "from an RMS window error of 0.001 at 0.2 to 0.0004 at 0.5 of largest peak torque; the knee is 0.0005 at 0.3"
+    )
+    slews = [{"t_f": t_f, "rms": 1e-3 / t_f, "meets": t_f > 4.0} for t_f in (4.0, 5.0, 8.0)]
+    (said,) = search_sentences.fastest({"slews": slews, "requirements": ["peak_torque"]})
+    assert said == "the shortest of them is t_f = 5 s, with an RMS window error of 0.0002"
+    assert not list(search_sentences.fastest({"slews": slews[:1], "requirements": ["peak_torque"]}))
 
 
 @pytest.mark.parametrize(("status", "asked", "mood"), [

@@ -276,7 +276,8 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     ]
     gains = {"met": "Gains", "not met": "No gains"}.get(summary["status"])
     said = None if gains is None else f"{gains} on the front meet every requirement"
-    return _with_headline(summary, sentences.front_heading(summary), said), sections
+    lines = [*search_sentences.along_the_front(summary), sentences.front_heading(summary)]
+    return _with_headline(summary, lines, said), sections
 
 
 def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
@@ -284,14 +285,15 @@ def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
     blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
     met, times = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
     said = f"At {met} of {times} prescribed times gains meet every requirement"
-    heading = _with_headline(summary, sentences.slew_times_heading(summary), said)
+    lines = [*search_sentences.fastest(summary), sentences.slew_times_heading(summary)]
+    heading = _with_headline(summary, lines, said)
     return heading, [Section("What a faster slew costs", blocks)]
 
 
-def _with_headline(summary: dict[str, Any], line: str, said: str | None) -> Heading:
+def _with_headline(summary: dict[str, Any], lines: list[str], said: str | None) -> Heading:
     """What a front says first; said: its headline where requirements are asked for."""
     asked = bool(summary["requirements"])
-    heading = _verdict(summary, [line], asked)
+    heading = _verdict(summary, lines, asked)
     return replace(heading, headline=said) if asked and said is not None else heading
 
 
@@ -345,7 +347,7 @@ def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     left = margin_sentences.left(summary)
     said = ("calm", f"The loop is stable: {left}") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
-    return Heading(*said, list(margin_sentences.lines(summary))), [
+    return Heading(*said, [line for line in margin_sentences.lines(summary) if not line.endswith(f": {left}")]), [
         Section("Margins", [_table(margin_sentences.table(summary))])
     ]
 

@@ -148,3 +148,19 @@ def shortest(summary: Summary) -> Iterator[str]:
     times = summary.get("shortest_t_f")
     if times is not None:
         yield design.text(times["limit"], times["theory"], times["simulated"])
+
+
+def along_the_front(summary: Summary) -> Iterator[str]:
+    """What the least torque, the most, and the knee give."""
+    kept = sorted((p for p in summary["points"] if not p["dominated"] and p["rms"]), key=lambda p: p["peak"])
+    if len(kept) > 1:
+        ends = (f"{p['rms']:.3g} at {p['peak']:.3g}" for p in (kept[0], kept[-1]))
+        knee = next((f"; the knee is {p['rms']:.3g} at {p['peak']:.3g}" for p in kept if p["knee"]), "")
+        yield f"from an RMS window error of {' to '.join(ends)} of largest peak torque{knee}"
+
+
+def fastest(summary: Summary) -> Iterator[str]:
+    """The shortest of the prescribed times whose gains meet every requirement."""
+    found = min((slew for slew in summary["slews"] if slew["meets"]), key=lambda slew: slew["t_f"], default=None)
+    if found is not None and summary["requirements"]:
+        yield f"the shortest of them is t_f = {found['t_f']:g} s, with an RMS window error of {found['rms']:.3g}"

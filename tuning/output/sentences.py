@@ -229,7 +229,7 @@ def front(summary: Summary) -> Table:
         rows.append((name, *numbers, within, *cells, ", ".join(marks)))
     torque, error = units["peak_torque"][0], units["window_error"][0]
     beside = ("times the floor",) if summary.get("floor") else ()
-    return Table(("", f"largest peak {torque}", "mean peak", f"RMS error {error}", "+-", *beside, *names, ""), rows)
+    return Table(("", f"largest peak [{torque}]", "mean peak", f"RMS error [{error}]", "+-", *beside, *names, ""), rows)
 
 
 def front_lines(summary: Summary) -> Iterator[str]:
@@ -266,8 +266,8 @@ def slew_times(summary: Summary) -> Table:
         numbers = (f"{slew['t_f']:g}", _digits(slew["rms"], ".3e"), within)
         numbers += tuple(_digits(slew["costs"][name], ".4g") for name in costs)
         rows.append((*numbers, *(f"{slew['gains'][name]:.4g}" for name in names), ", ".join(marks)))
-    head = (f"{name.replace('_', ' ')} {units[name][0]}" for name in costs)
-    return Table(("t_f s", f"RMS error {units['window_error'][0]}", "+-", *head, *names, ""), rows)
+    head = (f"{name.replace('_', ' ')} [{units[name][0]}]" for name in costs)
+    return Table(("t_f [s]", f"RMS error [{units['window_error'][0]}]", "+-", *head, *names, ""), rows)
 
 
 def slew_times_lines(summary: Summary) -> Iterator[str]:
@@ -354,7 +354,8 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
         own = scenario.get(table, {}).get("kind") == "own"  # its class, which reading does not run, has the units
         for key, value in scenario.get(table, {}).items():
             numbers = value if isinstance(value, list) else [value]
-            said = ", ".join(f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers)
+            each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]
+            said = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
             unit = "" if own and key not in ("t_f", "delta") else known.get(prefix + key, "").replace("-", "")
             rows.append((f"{table}.{key}", said, unit))
     return Table(("key", "value", "unit"), rows)
