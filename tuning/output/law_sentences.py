@@ -202,7 +202,7 @@ def lines(summary: Summary) -> Iterator[str]:
         for which, other in found["untold"].items():
             if other["lost"]:
                 yield f"  {WORDS[which]} {other['lost']} of {summary['trials']} trials fail or miss t_f"
-    yield f"a trial has settled from when on its angle stays below {summary['settling_angle']:g} rad"
+    yield f"a trial has settled when its angle stays below {summary['settling_angle']:g} rad from then on"
 
 
 WORDS = {
