@@ -68,7 +68,7 @@ def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
 class TurningFunction(Function):
     """A plain function of time [s] as a reference attitude: of a `Target`, or of a quaternion (4,) of any length."""
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Time) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Target at t [s]; a quaternion's rates are its derivatives. Raises TypeError where it is neither."""
         found = self.function(t)
         if isinstance(found, Target):

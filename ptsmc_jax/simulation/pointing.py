@@ -138,19 +138,19 @@ class Path(NamedTuple):
 
     ends: Array  # (segments, 2, 5) at the start and the end of each [rad]
     lengths: Array  # (segments,) [s], 0 of those to come
-    count: Array  # how many there are
+    filled: Array  # how many there are
 
     def added(self, start: Array, end: Array, length: Scalar) -> "Path":
-        """With one segment more; beyond the last there is no room, which `count` tells."""
+        """With one segment more; beyond the last there is no room, which `filled` tells."""
         return Path(
-            self.ends.at[self.count].set(jnp.stack([start, end])),
-            self.lengths.at[self.count].set(length),
-            self.count + 1,
+            self.ends.at[self.filled].set(jnp.stack([start, end])),
+            self.lengths.at[self.filled].set(length),
+            self.filled + 1,
         )
 
     def emptied(self) -> "Path":
         """Without segments."""
-        return Path(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.count))
+        return Path(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
 
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
         """How long the error less its mean is beyond limits [s]; NaN where there was no room for all of it."""
@@ -159,7 +159,7 @@ class Path(NamedTuple):
             return length * _share_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
 
         total = jnp.sum(jax.vmap(of_segment)(self.ends, self.lengths), axis=0)
-        return jnp.where(self.count > self.lengths.size, jnp.nan, total)
+        return jnp.where(self.filled > self.lengths.size, jnp.nan, total)
 
 
 class Window(NamedTuple):

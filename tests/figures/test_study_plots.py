@@ -20,7 +20,7 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
     figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", judged)
     for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # whatever the last step of a start was
         (line,) = [line for line in axes.lines if str(line.get_label()).startswith("found")]
-        assert set(line.get_ydata()) == {value}
+        assert set(np.asarray(line.get_ydata()).tolist()) == {value}
     drawn = [np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines[:4]]
     for start in range(2):
         np.testing.assert_array_equal(drawn[2 * start], values[:, start])
@@ -32,7 +32,7 @@ def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap
     over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
     figure = study_plots.profiles({"sign_width": ("-", at, at, over, nearest, 1e-3)}, "goal")
     (axes,) = figure.axes
-    drawn = {line.get_label(): list(line.get_xdata()) for line in axes.lines}
+    drawn = {line.get_label(): np.asarray(line.get_xdata()).tolist() for line in axes.lines}
     assert drawn["limits kept"] == [at[1]]
     assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
     assert drawn["beyond the limit of gain_margin"] == [at[2]]

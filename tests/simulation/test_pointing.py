@@ -267,7 +267,8 @@ def test_a_window_with_more_samples_than_there_is_room_for_has_no_share_of_time(
 
 def test_a_run_that_is_not_sampled_has_room_for_all_its_steps():
     frame = pointing.across((0.0, 0.0, 1.0))
-    asked = pointing.Pointing(frame, 0.0, 1.0, {"rpe_z": 1.0})
+    zero, one = jnp.zeros(()), jnp.ones(())
+    asked = pointing.Pointing(jnp.asarray(frame), zero, one, {"rpe_z": one})
     assert asked.of_run(700).segments("rpe") == 702
     assert asked.of_run(700).segments("rke") == 0
     assert dataclasses.replace(asked, samples=12).of_run(700).segments("rpe") == 14
