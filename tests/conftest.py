@@ -42,11 +42,13 @@ MANY = 25_000  # mappings of memory; Linux allows a process 65 530, and a compil
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
 LONGEST = """
-    cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements test_conformity
-    campaigns/test_campaign_processes search/test_tuning campaigns/test_plans cli/test_campaign_commands
-    search/test_worst batching/test_lanes simulation/test_rollout theory/test_margins paper/test_paper
-    dispersions/test_misfits plants/test_systems devices/test_hardware studies/test_mapping laws/test_chain
-    campaigns/test_montecarlo theory/test_covariance batching/test_kernel test_docs theory/test_theory
+    cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements search/test_tuning
+    search/test_worst theory/test_margins plants/test_systems devices/test_hardware simulation/test_rollout
+    cli/test_campaign_commands dispersions/test_misfits test_conformity onboard/test_library batching/test_lanes
+    campaigns/test_montecarlo campaigns/test_plans studies/test_mapping theory/test_spillover theory/test_covariance
+    laws/test_family batching/test_kernel campaigns/test_campaign_processes search/test_gains laws/test_chain
+    studies/test_tuner observers/test_observers_others campaigns/test_campaign paper/test_paper
+    studies/test_stability theory/test_theory dispersions/test_dispersions
 """.split()
 TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # tune by the same programs, in one worker
 assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
