@@ -3,6 +3,7 @@
 import dataclasses
 import tomllib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import polars as pl
@@ -160,8 +161,11 @@ def test_what_a_row_does_not_give_is_drawn(everything):
     assert_frame_equal(drawn.select(others), plan.head(2).select(others), rel_tol=1e-14, abs_tol=1e-18)
 
 
-@pytest.mark.parametrize("text", [EVERYTHING, CHAIN], ids=["spacecraft", "chain"])
-def test_every_quantity_is_read_as_it_was_set(text):
+FILTER = '[filter]\nkind = "steady_state"\n'
+
+
+@pytest.mark.parametrize("text", [EVERYTHING + FILTER, CHAIN], ids=["spacecraft", "chain"])
+def test_every_quantity_is_read_as_it_was_set_and_flight_software_does_not_know_it(text):
     parts = ready(text).parts
     generator = np.random.default_rng(2)
     there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
@@ -171,7 +175,22 @@ def test_every_quantity_is_read_as_it_was_set(text):
             continue
         quantity = QUANTITIES[name]
         values = generator.uniform(0.1, 1.0, len(columns))
-        np.testing.assert_array_equal(quantity.read(quantity.write(parts, vector(values))), values, err_msg=name)
+        written = quantity.write(parts, vector(values))
+        np.testing.assert_array_equal(quantity.read(written), values, err_msg=name)
+        for one, other in zip(onboard(written), onboard(parts), strict=True):
+            assert one is other, name
+
+
+def onboard(parts):
+    return parts.controller, parts.observer, getattr(parts.sensors, "filter", None)
+
+
+def test_flight_software_does_not_know_what_is_drawn():
+    whole, drawn = ready(EVERYTHING + FILTER), []
+    jax.eval_shape(lambda k: drawn.append(whole.dispersion.apply(whole.parts, 3, k)), jnp.uint32(0))
+    assert onboard(whole.parts)[2] is not None
+    for one, other in zip(onboard(drawn[0]), onboard(whole.parts), strict=True):
+        assert one is other
 
 
 def test_a_chain_flies_a_plan():

@@ -272,6 +272,19 @@ def test_what_is_drawn_where_no_candidate_is_a_body_has_their_law(moments, std):
     assert not np.any(np.all(found == moments, axis=1))
 
 
+def test_the_first_candidate_that_is_a_body_is_drawn():
+    rng, moments, std = np.random.default_rng(2), np.array([10.0, 12.0, 20.0]), 0.2
+    kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
+    c = rng.standard_normal((1 << 15, kind.count))
+    found = np.diagonal(np.asarray(drawn_bodies(kind, vector(c))), axis1=1, axis2=2)
+    shares = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
+    drawn = moments * (1.0 + std * shares)
+    fits = (2.0 * drawn.max(axis=2) <= drawn.sum(axis=2)) & (np.abs(shares).max(axis=2) <= base.FARTHEST)
+    some, first = fits.any(axis=1), fits.argmax(axis=1)
+    assert {0, 1, 2, 3} <= set(first[some])
+    np.testing.assert_allclose(found[some], drawn[some, first[some]], rtol=1e-14)
+
+
 body_slopes = jax.jit(jax.jacfwd(lambda kind, c: kind.at(c), (0, 1)))
 
 

@@ -92,6 +92,16 @@ def test_numbers_follow_the_documented_rule(case):
     np.testing.assert_allclose(draws.normals(key, count, sample), normals, rtol=0, atol=1e-14)
 
 
+def test_several_streams_at_once_are_each_of_them():
+    names, counts = ["rate_noise", "", "attitude_noise"], [1, 5, 4]
+    keys = draws.streams(2**32 - 1, 7, names)
+    assert keys == [draws.stream(2**32 - 1, 7, name) for name in names]
+    for k, law in enumerate(draws.LAWS):
+        found = draws.several(2**32 - 1, 7, law, dict(zip(names, counts, strict=True)))
+        for name, count in zip(names, counts, strict=True):
+            np.testing.assert_allclose(found[name], expected(2**32 - 1, 7, name, 0, count)[k], rtol=0, atol=1e-14)
+
+
 def test_a_derived_seed_is_the_first_word_of_a_stream():
     for seed, name in ((0, "fresh trials"), (2**32 - 1, "x")):
         got = draws.derive(seed, name)
