@@ -20,7 +20,7 @@ from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_sea
 from tests.output.pages import checked
 from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.scenario.bad_scenarios import check_sentence
-from tuning.cli import main, options
+from tuning.cli import main
 from tuning.output import sentences
 from tuning.studies import single, stability
 
@@ -258,17 +258,6 @@ def test_an_empty_file_is_said_to_be_the_papers_case(command, tmp_path):
     (tmp_path / "none.toml").write_text("# to come\n")
     status, _, said = command("simulate", "none.toml", "--quiet", "--no-figures")
     assert (status, said) == (0, "ptsmc: none.toml says nothing: what flies is the paper's Case I\n")
-
-
-@pytest.mark.parametrize(("file", "name"), [
-    (None, "default"), ("mine.toml", "mine"), ("a/mine.toml", "mine"), ("tune-a/tuned.toml", "tune-a"),
-    ("b/../tune-b/tuned.toml", "tune-b"), ("tuned.toml", "here"),
-])  # fmt: skip
-def test_results_are_named_after_the_file_and_what_is_tuned_after_its_folder(tmp_path, monkeypatch, file, name):
-    here = tmp_path / "here"
-    (here / "b").mkdir(parents=True)
-    monkeypatch.chdir(here)
-    assert options.results(None if file is None else Path(file)) == name
 
 
 @pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.4700001'])

@@ -39,7 +39,7 @@ def test_the_guide_is_walked_through(command, tmp_path, monkeypatch):
         for whole, small in SMALLER.items():
             call = call.replace(whole, small)
         if "corners.csv" in call:
-            shutil.copy(tmp_path / "out" / "montecarlo-tune-cubesat" / "worst.csv", tmp_path / "corners.csv")
+            shutil.copy(tmp_path / "out" / "montecarlo-tuned" / "worst.csv", tmp_path / "corners.csv")
         name, *rest = shlex.split(call)
         if name == "make":
             done = subprocess.run([name, *rest], cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -49,12 +49,7 @@ ScenarioFile = Annotated[
 SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
-Out = Annotated[
-    Path | None,
-    Parameter(
-        help="Folder for the results; by default out/COMMAND-NAME, the file's name, of a tuned.toml its folder's name."
-    ),
-]
+Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
 Seed = Annotated[int, whole_number("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
@@ -148,11 +143,5 @@ def prepare(
             print(f"ptsmc: {scenario} says nothing: what flies is the paper's Case I", file=sys.stderr)
         own_parts.allow_scenario(scenario, loaded, trust)
     loaded = reading.complete(loaded)
-    return loaded, out if out is not None else Path("out") / f"{command}-{results(scenario)}"
-
-
-def results(scenario: Path | None) -> str:
-    """What results of a scenario are called; every search leaves a tuned.toml, told apart by its folder."""
-    if scenario is None:
-        return "default"
-    return scenario.resolve().parent.name or "tuned" if scenario.name == "tuned.toml" else scenario.stem
+    name = "default" if scenario is None else scenario.stem
+    return loaded, out if out is not None else Path("out") / f"{command}-{name}"
