@@ -136,7 +136,7 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
     """
     _check_whole_number("seed", seed)
     _check_whole_number("trial", 0 if trial is None else trial)
-    known = what if isinstance(what, Scenario) else scenario.read(what)
+    known = _read(what)
     return Flight(known, runs.fly(scenario.study(known, drawn=trial is not None), seed, trial))
 
 
@@ -172,10 +172,12 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
     return runs.floor(_ready(what), seed)
 
 
+def _read(what: Scenario | str | Path) -> Scenario:
+    return what if isinstance(what, Scenario) else scenario.read(what)
+
+
 def _ready(what: Scenario | Study | str | Path) -> Study:
-    if isinstance(what, Study):
-        return what
-    return scenario.study(what if isinstance(what, Scenario) else scenario.read(what))
+    return what if isinstance(what, Study) else scenario.study(_read(what))
 
 
 def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:

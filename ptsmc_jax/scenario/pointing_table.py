@@ -7,6 +7,7 @@ import numpy as np
 
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.values import NotNegative, Positive, Table, Three
+from ptsmc_jax.simulation import catalogues
 
 LONGEST_STEP = 0.1  # of the continuous loop after the hand-over [s], see `clock`
 
@@ -50,7 +51,8 @@ class Pointing(Table, frozen=True):
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
-        kept = scenario.loop.mode == "sampled" and any(name.startswith(("rpe", "rke")) for name in timed)
+        # where no limit needs it, their number is 0 whatever the period, and one program flies them all
+        kept = scenario.loop.mode == "sampled" and any(name.startswith(catalogues.RELATIVE) for name in timed)
         # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
         samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
         return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

@@ -27,6 +27,7 @@ INDICES = {
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
 TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # of which there are shares of time
+RELATIVE = ("rpe", "rke")  # among them those that need the samples of a window
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
 WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
 # how metrics begin that a run without noise lacks

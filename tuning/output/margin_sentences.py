@@ -29,8 +29,11 @@ def table(summary: Summary) -> Table:
     return Table(("in hold", *COLUMNS.values()), rows)
 
 
-def lines(summary: Summary) -> Iterator[str]:
-    """Whether the loop is stable, and what is least where it is judged."""
+def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
+    """Whether the loop is stable, and what is least where it is judged.
+
+    with_least: False where `left` is said already.
+    """
     if "swing" in summary:
         yield _swings(summary["swing"])
     else:
@@ -48,7 +51,7 @@ def lines(summary: Summary) -> Iterator[str]:
         yield f"before the hand-over the loop with its gains frozen is unstable {when} s to go" + (
             "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
         )
-    if summary["stable"]:
+    if summary["stable"] and with_least:
         yield f"the worst margins in hold, and before the hand-over where judged: {left(summary)}"
     if summary["said"]:
         yield summary["said"]

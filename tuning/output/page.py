@@ -345,11 +345,10 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
 
 def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    left = margin_sentences.left(summary)
-    said = ("calm", f"The loop is stable: {left}") if summary["stable"] else ("bad", "The loop in hold is NOT stable")
-    return Heading(*said, [line for line in margin_sentences.lines(summary) if not line.endswith(f": {left}")]), [
-        Section("Margins", [_table(margin_sentences.table(summary))])
-    ]
+    stable = "calm", f"The loop is stable: {margin_sentences.left(summary)}"
+    said = stable if summary["stable"] else ("bad", "The loop in hold is NOT stable")
+    sections = [Section("Margins", [_table(margin_sentences.table(summary))])]
+    return Heading(*said, list(margin_sentences.lines(summary, with_least=False))), sections
 
 
 def _reproduce(result: Result) -> tuple[Heading, list[Section]]:

@@ -22,25 +22,24 @@ class Front(NamedTuple):
 def against_torque(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
     """The front against the peak torque; raises ScenarioError where there is none to look for."""
     pareto.check(scenario)
-    known_by = pareto.identity(scenario, seed, points)
-    return Front(
-        known_by,
-        lambda tell, journal: pareto.trace(scenario, seed, points, tell, journal),
-        lambda found: pareto.summary(found, scenario),
-        lambda folder, found, figures: pareto.write(folder, scenario, found, figures, known_by),
-    )
+    return _front(pareto, scenario, seed, points)
 
 
 def against_time(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
     """What a faster slew costs; times [s]: the usual ones if there are none. Raises ScenarioError if one cannot fly."""
     times = times or slew_times.usual_times(scenario)
     slew_times.check(scenario, times)
-    known_by = slew_times.identity(scenario, seed, times)
+    return _front(slew_times, scenario, seed, times)
+
+
+def _front(study: Any, scenario: Scenario, seed: int, asked: Any) -> Front:
+    """The front that a module of a study looks for; asked: how many points, or which times."""
+    known_by = study.identity(scenario, seed, asked)
     return Front(
         known_by,
-        lambda tell, journal: slew_times.trace(scenario, seed, times, tell, journal),
-        lambda found: slew_times.summary(found, scenario),
-        lambda folder, found, figures: slew_times.write(folder, scenario, found, figures, known_by),
+        lambda tell, journal: study.trace(scenario, seed, asked, tell, journal),
+        lambda found: study.summary(found, scenario),
+        lambda folder, found, figures: study.write(folder, scenario, found, figures, known_by),
     )
 
 
