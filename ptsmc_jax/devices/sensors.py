@@ -59,7 +59,7 @@ class Sensor(ABC):
 class Reading(NamedTuple):
     """What a sensor says of a state near the true one, to first order, for `error_floor`.
 
-    Of (x, own): the plant's local coordinates (n,), see `Plant.moved`, then states of the sensor's own, a gyro's bias.
+    Of (x, own): local coordinates (n,) of the plant, see `Plant.retract`, then the sensor's own states, a gyro's bias.
     """
 
     rows: np.ndarray  # (m, n + own) what is read of them
@@ -237,7 +237,7 @@ class Sensors(Sensor):
         bias = self.first_bias(seed, trial)
         return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
 
-    def moved(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
+    def retract(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
         """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""
         if memory.estimate is None:
             return memory
@@ -245,8 +245,8 @@ class Sensors(Sensor):
         q = attitude.multiply(memory.estimate.q, attitude.from_rotation_vector(turn))
         return memory._replace(estimate=Estimate(q, memory.estimate.bias + bias), rate=memory.rate + rate)
 
-    def apart(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
-        """What `moved` takes a memory to another one by, to first order."""
+    def local_coordinates(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
+        """What `retract` takes a memory to another one by, to first order."""
         if memory.estimate is None:
             return jnp.zeros(0)
         turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]

@@ -15,7 +15,7 @@ from ptsmc_jax.numerics import draws
 from ptsmc_jax.simulation.rollout import Parts
 
 Numbers = Float[Array, " n"]
-Drawn = draws.Law
+Drawn = draws.Distribution
 Coordinates = dict[str, Array]  # of a trial, by the name of what is drawn
 
 # names of what is drawn, and of the streams that it is drawn from

@@ -118,7 +118,7 @@ def _frequency() -> Quantity:
 def _coupling() -> Quantity:
     def write(parts: Parts, given: Numbers) -> Parts:
         plant: Any = parts.plant
-        return replace(parts, plant=replace(plant, coupling=given.reshape(-1, 3)).settled())
+        return replace(parts, plant=replace(plant, coupling=given.reshape(-1, 3)).with_rest_inverse())
 
     def read(parts: Parts) -> Numbers:
         plant: Any = parts.plant

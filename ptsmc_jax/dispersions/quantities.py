@@ -79,9 +79,9 @@ def _rate() -> Quantity:
 
 def _state() -> Quantity:
     return Quantity(
-        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.seen(parts.initial).size),
-        lambda parts: parts.plant.seen(parts.initial),
-        lambda parts, x: replace(parts, initial=parts.plant.at_rest(x)),
+        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
+        lambda parts: parts.plant.visible(parts.initial),
+        lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
     )
 
 

@@ -82,7 +82,7 @@ class Dispersion:
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
         """Coordinates of a trial; each name has a stream of its own, so one more of them changes no other."""
         kinds, found = self.kinds, {}
-        for law in draws.LAWS:
+        for law in draws.DISTRIBUTIONS:
             counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == law}
             found |= draws.several(seed, trial, law, counts) if counts else {}
         return {name: found[name] for name in kinds}
@@ -96,8 +96,8 @@ class Dispersion:
             turned = self.reference.at(coordinates[REFERENCE], q, q)
             parts = replace(parts, reference=replace(parts.reference, q=turned))
         if self.state is not None:
-            seen = self.state.at(coordinates[INITIAL_STATE], parts.plant.seen(parts.initial))
-            parts = replace(parts, initial=parts.plant.at_rest(seen))
+            seen = self.state.at(coordinates[INITIAL_STATE], parts.plant.visible(parts.initial))
+            parts = replace(parts, initial=parts.plant.with_hidden_at_rest(seen))
         if self.attitude is not None:
             reference = parts.reference(jnp.zeros_like(parts.t_end))
             q = self.attitude.at(coordinates[INITIAL_ATTITUDE], parts.initial.q, reference.q)

@@ -192,7 +192,7 @@ class ErrorOfSystem(ErrorMotion):
         """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
-        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.carried(target, x) - slope @ pushed)
+        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.coasting_acceleration(target, x) - slope @ pushed)
 
 
 class ErrorOfChain(ErrorMotion):

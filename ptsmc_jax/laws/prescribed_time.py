@@ -116,7 +116,7 @@ class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
             return jnp.concatenate([error, x[n : 2 * n] - matrices.solve(self.model.slope(target, x), off)])
 
         x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n : 2 * n]]))
-        w_dot = matrices.solve(self.model.slope(target, x), acceleration - self.model.carried(target, x))
+        w_dot = matrices.solve(self.model.slope(target, x), acceleration - self.model.coasting_acceleration(target, x))
         return Motion(x, w_dot, self.clearance(x, target))
 
     def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:

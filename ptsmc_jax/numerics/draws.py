@@ -20,7 +20,7 @@ from ptsmc_jax.numerics import elementary
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
-WholeNumber = int | np.integer | Array  # a whole number, negative ones wrap to 32 bits
+WholeNumber = int | np.integer | Array  # negative ones wrap to 32 bits
 
 
 class Key(NamedTuple):
@@ -55,13 +55,13 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
 
 def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
     """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
-    return _labelled(seed, trial, jnp.uint32(_label(name)))
+    return _key(seed, trial, jnp.uint32(_label(name)))
 
 
 def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list[Key]:
     """Keys [-] of several streams of a trial, each as `stream` gives it: less code to compile than one by one."""
     labels = jnp.asarray([_label(name) for name in names], dtype=jnp.uint32)
-    keys = jax.lax.map(lambda label: _labelled(seed, trial, label), labels)
+    keys = jax.lax.map(lambda label: _key(seed, trial, label), labels)
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
 
 
@@ -69,7 +69,7 @@ def _label(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
-def _labelled(seed: WholeNumber, trial: WholeNumber, label: Word) -> Key:
+def _key(seed: WholeNumber, trial: WholeNumber, label: Word) -> Key:
     return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
 
 
@@ -79,14 +79,15 @@ def derive(seed: int, name: str) -> int:
 
 
 def _pairs(key: Key, sample: WholeNumber, count: int) -> tuple[Word, Word]:
-    """The words of so many numbers, two a block: (blocks,) each."""
+    """The words of `count` numbers, two a block: (blocks,) each."""
     blocks = jnp.arange((count + 1) // 2, dtype=jnp.uint32)
-    number = _word(sample)
+    sample = _word(sample)
     # a loop over the blocks: the same work, but less code to compile
-    return jax.lax.map(lambda block: threefry(key, (number, block)), blocks)
+    return jax.lax.map(lambda block: threefry(key, (sample, block)), blocks)
 
 
 def _unit(word: Array) -> Array:
+    """The number between 0 and 1 that a word stands for."""
     kind = jnp.result_type(float)
     below_one = np.nextafter(kind.type(1.0), kind.type(0.0))  # float32 would round the largest words up to 1
     return jnp.minimum((word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32), below_one)
@@ -104,11 +105,12 @@ def _normal(a: Word, b: Word) -> tuple[Array, Array]:
     return radius * cosine, radius * sine
 
 
-Law = Literal["uniform", "normal"]
-LAWS: dict[Law, Callable] = {"uniform": _uniform, "normal": _normal}  # of two words
+Distribution = Literal["uniform", "normal"]
+DISTRIBUTIONS: dict[Distribution, Callable] = {"uniform": _uniform, "normal": _normal}  # of two words
 
 
-def _listed(pairs: tuple[Array, Array], count: int) -> Array:
+def _interleaved(pairs: tuple[Array, Array], count: int) -> Array:
+    """The first `count` numbers of pairs (blocks,) each, pair after pair."""
     return jnp.stack(pairs, axis=1).reshape(-1)[:count]
 
 
@@ -119,27 +121,31 @@ def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {c
     >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
     True
     """
-    return _listed(_uniform(*_pairs(key, sample, count)), count)
+    return _interleaved(_uniform(*_pairs(key, sample, count)), count)
 
 
 def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
     """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
-    return _listed(_normal(*_pairs(key, sample, count)), count)
+    return _interleaved(_normal(*_pairs(key, sample, count)), count)
 
 
-def several(seed: WholeNumber, trial: WholeNumber, law: Law, counts: dict[str, int]) -> dict[str, Array]:
-    """So many numbers (count,) [-] of each of these streams of a trial, as `uniforms` or `normals` give them.
+def several(
+    seed: WholeNumber, trial: WholeNumber, distribution: Distribution, counts: dict[str, int]
+) -> dict[str, Array]:
+    """The numbers (count,) [-] of several streams of a trial, as `uniforms` or `normals` give them for each.
 
-    All of them by one loop, over blocks of two numbers: the same work, but a fraction of the code to compile.
+    counts: how many, by the stream's name. All of them by one loop, over blocks of two numbers: the same work, but a
+    fraction of the code to compile.
     """
     blocks = [(_label(name), block) for name, count in counts.items() for block in range((count + 1) // 2)]
 
     def pair(row: Word) -> tuple[Array, Array]:
-        return LAWS[law](*threefry(_labelled(seed, trial, row[0]), (jnp.uint32(0), row[1])))
+        return DISTRIBUTIONS[distribution](*threefry(_key(seed, trial, row[0]), (jnp.uint32(0), row[1])))
 
     first, second = jax.lax.map(pair, jnp.asarray(blocks, dtype=jnp.uint32).reshape(-1, 2))
-    found, start = {}, 0
+    numbers, start = {}, 0
     for name, count in counts.items():
         end = start + (count + 1) // 2
-        found[name], start = _listed((first[start:end], second[start:end]), count), end
-    return found
+        numbers[name] = _interleaved((first[start:end], second[start:end]), count)
+        start = end
+    return numbers

@@ -18,24 +18,30 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> An
 
     rate(t, y) returns dy/dt as a pytree like y; t, dt [s].
     """
-
-    def ahead(slope: Any, step: Scalar) -> Any:
-        return jax.tree.map(lambda y, k: y + step * k, y, slope)
-
     k1 = rate(t, y)
-    k2 = rate(t + dt / 2, ahead(k1, dt / 2))
-    k3 = rate(t + dt / 2, ahead(k2, dt / 2))
-    k4 = rate(t + dt, ahead(k3, dt))
+    k2 = rate(t + dt / 2, _ahead(y, k1, dt / 2))
+    k3 = rate(t + dt / 2, _ahead(y, k2, dt / 2))
+    k4 = rate(t + dt, _ahead(y, k3, dt))
+    return _simpson(y, dt, k1, k2, k3, k4)
+
+
+def _ahead(y: Any, slope: Any, step: Scalar) -> Any:
+    """The pytree y + step slope."""
+    return jax.tree.map(lambda y, k: y + step * k, y, slope)
+
+
+def _simpson(y: Any, dt: Scalar, k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
+    """The pytree y + dt (k1 + 2 k2 + 2 k3 + k4) / 6."""
     return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
 
 
 _TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
-_DOUBLINGS = 40  # norms up to 2^39
-_FEW = 4  # of them
+_DOUBLINGS = 40  # at most: enough for norms up to 2^39
+_USUAL_DOUBLINGS = 4  # enough for norms up to 8, which few matrices exceed
 
 
 def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = None) -> list[Float[Array, "n n"]]:
-    """phi_0(x) = e^x and phi_1 .. phi_order, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x, of a square matrix [-].
+    """[phi_0(x), .., phi_order(x)] of a matrix [-]: phi_0(x) = e^x, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x.
 
     Scaling and doubling, phi_k(2x) = 2^-k (phi_0 phi_k + sum_(j=1..k) phi_j / (k-j)!) (Skaflestad and Wright, Applied
     Numerical Mathematics 59, 2009): nothing cancels for small x, eigenvalues may repeat, and no LAPACK is called, whose
@@ -56,10 +62,13 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     def step(k: Any, phi: list[Array]) -> list[Array]:
         return jax.lax.cond(k < doublings, _double, lambda phi: phi, phi)
 
-    # a loop of fixed length can be run backwards; few matrices need more than the first doublings
-    phi = jax.lax.fori_loop(0, _FEW, step, phi)
+    # loops of fixed length, since those can be differentiated backwards
+    phi = jax.lax.fori_loop(0, _USUAL_DOUBLINGS, step, phi)
     return jax.lax.cond(
-        doublings > _FEW, lambda phi: jax.lax.fori_loop(_FEW, _DOUBLINGS, step, phi), lambda phi: phi, phi
+        doublings > _USUAL_DOUBLINGS,
+        lambda phi: jax.lax.fori_loop(_USUAL_DOUBLINGS, _DOUBLINGS, step, phi),
+        lambda phi: phi,
+        phi,
     )
 
 
@@ -98,18 +107,13 @@ def etdrk4(rate: Callable, linear: Decay, t: Scalar, y: Any, m: Float[Array, " n
     rate(t, y, m) returns (f, g, aux). With A = 0 it is `rk4`; however stiff A is, the step stays stable and exact
     for a constant g. Returned besides: aux of the first and the third stage (start and middle of the step).
     """
-
-    def ahead(slope: Any, step: Scalar) -> Any:
-        return jax.tree.map(lambda y, k: y + step * k, y, slope)
-
     f1, g1, start = rate(t, y, m)
     m2 = linear.half @ m + linear.stage @ g1
-    f2, g2, _ = rate(t + dt / 2, ahead(f1, dt / 2), m2)
+    f2, g2, _ = rate(t + dt / 2, _ahead(y, f1, dt / 2), m2)
     m3 = linear.half @ m + linear.stage @ g2
-    f3, g3, middle = rate(t + dt / 2, ahead(f2, dt / 2), m3)
+    f3, g3, middle = rate(t + dt / 2, _ahead(y, f2, dt / 2), m3)
     m4 = linear.half @ m2 + linear.stage @ (2 * g3 - g1)
-    f4, g4, _ = rate(t + dt, ahead(f3, dt), m4)
+    f4, g4, _ = rate(t + dt, _ahead(y, f3, dt), m4)
     w1, w2, w4 = linear.ends
     m_next = linear.full @ m + w1 @ g1 + w2 @ (g2 + g3) + w4 @ g4
-    y_next = jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, f1, f2, f3, f4)
-    return y_next, m_next, start, middle
+    return _simpson(y, dt, f1, f2, f3, f4), m_next, start, middle

@@ -19,42 +19,42 @@ def solve(a: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n .
 
 def determinant(a: Float[Array, "n n"]) -> Float[Array, ""]:
     """Determinant of a small matrix, written out."""
-    _, found = _eliminated(a, jnp.zeros_like(a[:, 0]))
-    return jnp.where(jnp.isfinite(found), found, 0.0)  # a column without a pivot
+    _, product = _eliminated(a, jnp.zeros_like(a[:, 0]))
+    return jnp.where(jnp.isfinite(product), product, 0.0)  # a column without a pivot
 
 
 def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
     """a^-1 b, and the determinant of a."""
     n = a.shape[0]
-    sizes = [jnp.where(size > 0.0, size, 1.0) for size in (norm(row) for row in a)]
+    sizes = [jnp.where(size > 0.0, size, 1.0) for size in map(norm, a)]
     scales = [1.0 / size for size in sizes]
     rows = [a[i] * scales[i] for i in range(n)]
     right = [b[i] * scales[i] for i in range(n)]
-    found = jnp.prod(jnp.stack(sizes))
+    determinant = jnp.prod(jnp.stack(sizes))
     for k in range(n):
         for i in range(k + 1, n):  # the largest entry of the column rises to row k
             larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             rows[k], rows[i] = jnp.where(larger, rows[i], rows[k]), jnp.where(larger, rows[k], rows[i])
             right[k], right[i] = jnp.where(larger, right[i], right[k]), jnp.where(larger, right[k], right[i])
-            found = jnp.where(larger, -found, found)
-        found = found * rows[k][k]
+            determinant = jnp.where(larger, -determinant, determinant)
+        determinant = determinant * rows[k][k]
         inverse = 1.0 / rows[k][k]
         rows[k], right[k] = rows[k] * inverse, right[k] * inverse
         for i in range(n):
             if i != k:
                 factor = rows[i][k]
                 rows[i], right[i] = rows[i] - factor * rows[k], right[i] - factor * right[k]
-    return jnp.stack(right), found
+    return jnp.stack(right), determinant
 
 
-SWEEPS = 8  # of rotations: they converge quadratically, to all digits in 5 or 6
+SWEEPS = 8  # over all pairs of axes: they converge quadratically, to all digits in 5 or 6
 
 
 def smallest_eigenvalue(a: Float[Array, "n n"]) -> Float[Array, ""]:
     """Smallest eigenvalue of a small symmetric matrix, in its unit, by Jacobi's rotations.
 
-    Golub and Van Loan, Matrix Computations, 2013, 8.5: each makes one pair of entries beside the diagonal zero. Where
-    eigenvalues fall together as well to all digits, which the closed form for three of them is not.
+    Each rotation makes one pair of entries beside the diagonal zero (Golub and Van Loan, Matrix Computations, 2013,
+    8.5). Good to all digits where eigenvalues fall together, too, which the closed form for three of them is not.
     """
 
     def sweep(_: Array, a: Array) -> Array:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy import optimize, stats
 
-MANY = 30  # shares that are not zero, from which on their mean is taken as nearly normal
-SOBOL_BINS = 32  # of an input, by equal shares of the trials
-ALIKE = 0.9999  # rank correlation of two inputs that are one
+NEARLY_NORMAL = 30  # shares above zero, from which on their mean is taken as nearly normal
+SOBOL_BINS = 32  # of an input, with equally many trials each
+SAME_INPUT = 0.9999  # rank correlation above which two inputs count as one
 
 
 def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
@@ -31,9 +31,9 @@ def share_bound(successes: int, trials: int, confidence: float) -> float:
 def mean_bound(shares: np.ndarray, confidence: float) -> float:
     """One-sided upper bound of the mean of shares, (n,) independent numbers from 0 to 1.
 
-    Where at least `MANY` of them are not zero, Student's with Hall's correction for skewness (J. R. Stat. Soc. B 54,
-    1992), whose cover is what it says to a per cent. Where fewer are, Gaffke's (2005), which has never been seen to
-    cover less than it says, and mostly covers more: the quantile of sum D_i x_i + D_(n+1), D uniform on the simplex
+    Where at least `NEARLY_NORMAL` of them are not zero, Student's with Hall's correction for skewness (J. R. Stat. Soc.
+    B 54, 1992), whose cover is what it says to a per cent. Where fewer are, Gaffke's (2005), which has never been seen
+    to cover less than it says, and mostly covers more: the quantile of sum D_i x_i + D_(n+1), D uniform on the simplex
     (Learned-Miller, Thomas, A New Confidence Interval for the Mean of a Bounded Random Variable, arXiv:1905.06208). Of
     zeros and ones that is Clopper and Pearson's.
 
@@ -42,17 +42,18 @@ def mean_bound(shares: np.ndarray, confidence: float) -> float:
     >>> f"{mean_bound(np.append(np.zeros(990), np.full(10, 0.3)), confidence=0.95):.4f}"
     '0.0065'
     """
-    count, some = shares.size, shares[shares > 0.0]
-    if np.all(some == 1.0):
-        return 1.0 - share_bound(count - some.size, count, confidence)
-    if some.size >= MANY:
+    count, positive = shares.size, shares[shares > 0.0]
+    if np.all(positive == 1.0):
+        return 1.0 - share_bound(count - positive.size, count, confidence)
+    if positive.size >= NEARLY_NORMAL:
         return float(_hall(shares, confidence))
 
-    def sure(x: float) -> float:
-        return _below_zero(np.concatenate([some - x, [1.0 - x]]), count - some.size, -x) - confidence
+    def excess_confidence(x: float) -> float:
+        return _below_zero(np.concatenate([positive - x, [1.0 - x]]), count - positive.size, -x) - confidence
 
-    found: Any = optimize.brentq(sure, float(some.sum()) / count * (1.0 + 1e-9), 1.0 - 1e-12)
-    return float(found)
+    mean = float(positive.sum()) / count
+    bound: Any = optimize.brentq(excess_confidence, mean * (1.0 + 1e-9), 1.0 - 1e-12)
+    return float(bound)
 
 
 def _hall(x: np.ndarray, confidence: float) -> float:
@@ -66,21 +67,22 @@ def _hall(x: np.ndarray, confidence: float) -> float:
     return min(1.0, mean - float(x.std(ddof=1)) / np.sqrt(n) * float(t))
 
 
-def _below_zero(weights: np.ndarray, more: int, weight: float) -> float:
-    """Chance that weights times exponential numbers, and so many `more` of one weight, sum up to less than zero.
+def _below_zero(weights: np.ndarray, repeats: int, repeated: float) -> float:
+    """Chance that a weighted sum of exponential numbers is negative: with `weights`, and `repeats` times `repeated`.
 
-    The weights D above are such numbers over their sum. By the saddlepoint formula of Lugannani and Rice (Adv. Appl.
+    The D of `mean_bound` are such numbers over their sum. By the saddlepoint formula of Lugannani and Rice (Adv. Appl.
     Prob. 12, 1980), which puts the bound at most 0.3 % too high.
     """
     s: Any = optimize.brentq(
-        lambda s: np.sum(weights / (1.0 - s * weights)) + more * weight / (1.0 - s * weight),
-        (1.0 - 1e-12) / min(weights.min(), weight),
+        lambda s: np.sum(weights / (1.0 - s * weights)) + repeats * repeated / (1.0 - s * repeated),
+        (1.0 - 1e-12) / min(weights.min(), repeated),
         (1.0 - 1e-12) / weights.max(),
         xtol=1e-14,
     )
-    generating = -np.sum(np.log1p(-s * weights)) - more * np.log1p(-s * weight)
-    bend = np.sum((weights / (1.0 - s * weights)) ** 2) + more * (weight / (1.0 - s * weight)) ** 2
-    w, u = np.sign(s) * np.sqrt(max(-2.0 * generating, 0.0)), s * np.sqrt(bend)
+    generating = -np.sum(np.log1p(-s * weights)) - repeats * np.log1p(-s * repeated)
+    curvature = np.sum((weights / (1.0 - s * weights)) ** 2) + repeats * (repeated / (1.0 - s * repeated)) ** 2
+    w = np.sign(s) * np.sqrt(max(-2.0 * generating, 0.0))
+    u = s * np.sqrt(curvature)
     if abs(u) < 1e-4:  # at the mean, where both terms grow without end
         return 0.5
     return float(stats.norm.cdf(w) + stats.norm.pdf(w) * (1.0 / w - 1.0 / u))
@@ -110,42 +112,48 @@ def value_at(ordered: np.ndarray, quantile: float) -> float:
 
 
 def drivers(
-    inputs: Mapping[str, np.ndarray], metric: np.ndarray, known: dict[str, tuple] | None = None
+    inputs: Mapping[str, np.ndarray], metric: np.ndarray, ranked: dict[str, tuple] | None = None
 ) -> dict[str, dict[str, float]]:
     """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
 
     The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
     Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,
     over its variance, less what bins of unrelated numbers would show. Of ranks, so that a long tail does not decide.
-    (trials,) each; empty where the metric or every input has one value only. known: what the inputs are ranked to is
-    kept there, for other metrics of the same trials. Of inputs that rank the trials alike, such as an angle and the
-    scalar part of its quaternion, the first one speaks for all.
+
+    Args:
+        inputs: (trials,) each, by name. Of inputs that rank the trials alike, such as an angle and the scalar part of
+            its quaternion, the first one speaks for all.
+        metric: (trials,).
+        ranked: what the inputs are ranked to, kept here for other metrics of the same trials.
+
+    Returns:
+        {"rank_correlation", "first_order"} by the input's name; empty where the metric or every input has one value.
     """
-    known = {} if known is None else known
+    ranked = {} if ranked is None else ranked
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
         return {}
-    rank, driving = _ranked(metric), {}
+    metric_ranks, effects = _ranks(metric), {}
     for name, values in inputs.items():
         if np.ptp(values) == 0.0:
             continue
-        if name not in known:
-            ranks = _ranked(values)
-            order = np.argsort(ranks, kind="stable")
-            alike = any(abs(np.mean(ranks * one)) > ALIKE for one, _ in filter(None, known.values()))
-            known[name] = () if alike else (ranks, order)
-        if not known[name]:
+        if name not in ranked:
+            ranks = _ranks(values)
+            duplicate = any(abs(np.mean(ranks * other)) > SAME_INPUT for other, _ in filter(None, ranked.values()))
+            ranked[name] = () if duplicate else (ranks, np.argsort(ranks, kind="stable"))
+        if not ranked[name]:
             continue
-        ranks, order = known[name]
-        correlation = float(np.mean(ranks * rank))
-        bins = np.array_split(rank[order], SOBOL_BINS)
-        between = sum(part.size * part.mean() ** 2 for part in bins) / rank.size
-        within = 1.0 - between
-        by_chance = (SOBOL_BINS - 1) / (rank.size - SOBOL_BINS) * within
-        driving[name] = {"rank_correlation": correlation, "first_order": max(0.0, float(between - by_chance))}
-    return driving
+        ranks, order = ranked[name]
+        bins = np.array_split(metric_ranks[order], SOBOL_BINS)
+        between = sum(part.size * part.mean() ** 2 for part in bins) / metric.size
+        by_chance = (SOBOL_BINS - 1) / (metric.size - SOBOL_BINS) * (1.0 - between)
+        effects[name] = {
+            "rank_correlation": float(np.mean(ranks * metric_ranks)),
+            "first_order": max(0.0, float(between - by_chance)),
+        }
+    return effects
 
 
-def _ranked(values: np.ndarray) -> np.ndarray:
+def _ranks(values: np.ndarray) -> np.ndarray:
     """Ranks of values (trials,), of mean 0 and variance 1: the mean of their products is Spearman's correlation."""
     rank = stats.rankdata(values)
     return (rank - rank.mean()) / rank.std()
@@ -158,16 +166,16 @@ def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
     >>> distinct({"initial_angle": angle, "initial_q4": np.cos(angle / 2), "initial_w1": np.array([2.0, 1.0, 3.0])})
     ['initial_angle', 'initial_w1']
     """
-    kept: dict[str, np.ndarray] = {}
+    distinct_ranks: dict[str, np.ndarray] = {}
     for name, values in inputs.items():
-        rank = _ranked(values)
-        if all(abs(np.mean(rank * other)) <= ALIKE for other in kept.values()):
-            kept[name] = rank
-    return list(kept)
+        ranks = _ranks(values)
+        if all(abs(np.mean(ranks * other)) <= SAME_INPUT for other in distinct_ranks.values()):
+            distinct_ranks[name] = ranks
+    return list(distinct_ranks)
 
 
 def fewest_for(failures: int, quantile: float, confidence: float) -> int:
-    """The fewest trials that show a quantile with this one-sided confidence where so many of them fail.
+    """The fewest trials that show a quantile with this one-sided confidence although `failures` of them fail.
 
     >>> [fewest_for(failures, quantile=0.9973, confidence=0.9) for failures in (0, 1, 2)]
     [852, 1440, 1970]

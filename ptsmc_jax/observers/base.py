@@ -1,6 +1,6 @@
 """Disturbance observers, each in a continuous and a digital form and with the bound K2 on its error (Remark 2).
 
-All estimate d in M w' = known(t, x, u) + d (`base.Plant`). Continuous: m' = -A m + forcing, with the memory m, which
+All estimate d in M w' = f(t, x, u) + d (`base.Plant`). Continuous: m' = -A m + forcing, with the memory m, which
 begins with d_hat, and d_eff = M w' - known the disturbance that the nominal model sees; the rollout steps A exactly.
 Digital: one update a period from the impulse that the model leaves unexplained, the integral of d_eff over it.
 """

@@ -62,7 +62,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     def flown(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
         (now, dt_before, *_), (x, computer, acting, pushed, unit, within) = tick, carry
         dt = now.t_next - now.t
-        there, sensing = parts.plant.seen(x), computer.sensing
+        there, sensing = parts.plant.visible(x), computer.sensing
         measured = there
         if sensors is not None:
             measured, _ = sensors.sample(sensing, there, now, dt_before, *(() if within is None else (within,)))
@@ -93,7 +93,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         computer, acting = computer._replace(applied=brought), actuators.end(acting, drive, queue, dt)
         return (x_next, computer, acting, pushed, unit, after), row
 
-    computer = boot(parts, seed, trial, parts.plant.seen(x0), started)
+    computer = boot(parts, seed, trial, parts.plant.visible(x0), started)
     if actuators.holds:
         computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)

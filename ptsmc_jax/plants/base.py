@@ -12,11 +12,12 @@ Scalar = Float[Array, ""]
 
 
 class Plant(ABC):
-    """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = known(t, x, u) + d.
+    """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = f(t, x, u) + d.
 
     u, d and w are (m,), of a spacecraft in N m and rad/s, of others in the states' own units. M is (m, m) and, unless
-    `mass` says otherwise, the constant `inertia`, against which observers read their gains. The rollout, the observers
-    and the metrics need no more.
+    `mass` says otherwise, the constant `inertia`, against which observers read their gains. A time t is in s; a state x
+    is a pytree of the plant's own kind, and so is its derivative. The rollout, the observers and the metrics need no
+    more.
     """
 
     inertia: Any  # (m, m)
@@ -38,8 +39,8 @@ class Plant(ABC):
         return self.inertia
 
     @abstractmethod
-    def known(self, t: Scalar, x: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """What drives w besides the disturbance."""
+    def generalised_force(self, t: Scalar, x: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The force f(t, x, u) that drives w besides the disturbance."""
 
     @abstractmethod
     def rate(self, t: Scalar, x: Any, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> Any:
@@ -50,67 +51,67 @@ class Plant(ABC):
         """The input with which w' is this under a disturbance d."""
 
     def unexplained(self, t: Scalar, x: Any, x_dot: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The disturbance that explains the motion, M w' - known(t, x, u)."""
-        return self.mass(t, x) @ self.velocity(x_dot) - self.known(t, x, u)
+        """The disturbance that explains the motion, M w' - f(t, x, u)."""
+        return self.mass(t, x) @ self.velocity(x_dot) - self.generalised_force(t, x, u)
 
     def unexplained_impulse(
         self, t: Scalar, x: Any, x_next: Any, u: Float[Array, " m"], dt: Scalar
     ) -> Float[Array, " m"]:
         """Its integral over a period dt [s] that ends at t, by the trapezium rule from the states at both ends."""
         before = t - dt
-        known = 0.5 * (self.known(before, x, u) + self.known(t, x_next, u))
+        force = 0.5 * (self.generalised_force(before, x, u) + self.generalised_force(t, x_next, u))
         mass = 0.5 * (self.mass(before, x) + self.mass(t, x_next))
-        return mass @ (self.velocity(x_next) - self.velocity(x)) - dt * known
+        return mass @ (self.velocity(x_next) - self.velocity(x)) - dt * force
 
     def normalise(self, x: Any) -> Any:
-        """The state with its constraints met again, which integration meets but for its error."""
+        """The state with its constraints met exactly, such as |q| = 1, which integration meets to its error."""
         return x
 
-    def seen(self, x: Any) -> Any:
-        """What sensors see of a state: that of the model which law and observer know. Of most plants all of it."""
+    def visible(self, x: Any) -> Any:
+        """What sensors can see of a state, that of the model that law and observer know; of most plants all."""
         return x
 
-    def at_rest(self, seen: Any) -> Any:
-        """The state of which sensors see this, with what they do not see at rest."""
-        return seen
+    def with_hidden_at_rest(self, visible: Any) -> Any:
+        """The state of which sensors see `visible`, with what they do not see at rest."""
+        return visible
 
-    def moved(self, x: Any, by: Float[Array, " n"]) -> Any:
-        """A state near another one: local coordinates (n,), as many as it has degrees of freedom.
+    def retract(self, x: Any, by: Float[Array, " n"]) -> Any:
+        """The state near x at local coordinates (n,), as many as x has degrees of freedom.
 
         Those of what sensors see come first.
         """
         return x + by
 
-    def apart(self, x: Any, other: Any) -> Float[Array, " n"]:
-        """Local coordinates (n,) of a state near x, to first order."""
+    def local_coordinates(self, x: Any, other: Any) -> Float[Array, " n"]:
+        """Local coordinates (n,) of a state near x, to first order: the inverse of `retract`."""
         return other - x
 
     @abstractmethod
     def speed(self, x: Any) -> Scalar:
-        """What the metric peak_rate is the largest of."""
+        """The scalar speed, whose largest value is the metric peak_rate."""
 
     def momentum(self, x: Any) -> Float[Array, " m"]:
-        """Whose 2-norm the metric peak_momentum is the largest of; NaN where a plant has none."""
+        """The momentum, whose largest 2-norm is the metric peak_momentum; NaN where a plant has none."""
         return jnp.full_like(self.velocity(x), jnp.nan)
 
     def too_fast(self, x: Any, dt: Scalar) -> Array:
-        """Whether more happens in an integration step of dt [s] than it can follow."""
+        """Whether the state changes more in an integration step of dt [s] than the step can follow."""
         return jnp.zeros_like(dt, dtype=bool)
 
-    def ringing(self, x: Any) -> Scalar | None:
-        """What the metrics peak_modal and residual_modal are the largest of; None where nothing rings."""
+    def modal_amplitude(self, x: Any) -> Scalar | None:
+        """Size of the modes' motion, for the metrics peak_modal and residual_modal; None without modes."""
         return None
 
     @abstractmethod
     def columns(self, x: Any) -> dict[str, Any]:
-        """A history of states by the names of its columns: name -> (time, components)."""
+        """A history of states (time, ..) as columns of a table: name -> (time, components)."""
 
     def hidden_columns(self, x: Any) -> dict[str, Any]:
         """The columns of what sensors do not see, such as flexible modes."""
         return {}
 
 
-def called(function: Callable | None) -> Any:
-    """A function as a pytree that can be called."""
-    plain = function is not None and jax.tree.leaves(function) == [function]  # no pytree itself
+def as_pytree(function: Callable | None) -> Any:
+    """A callable that may be a field of a plant: a plain function is wrapped, a pytree and None are that already."""
+    plain = function is not None and jax.tree.leaves(function) == [function]
     return jax.tree_util.Partial(function) if plain else function

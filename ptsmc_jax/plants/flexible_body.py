@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, pytree, vector
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 
 Scalar = Float[Array, ""]
@@ -45,37 +45,44 @@ class FlexibleSpacecraft(Spacecraft):
         """What springs and dampers do to the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""
         return self.frequency * (2.0 * self.damping * modes.rate + self.frequency * modes.e)
 
-    def mass(self, t: Scalar, x: AttitudeState) -> Float[Array, "3 3"]:
+    @property
+    def rest_inertia(self) -> Float[Array, "3 3"]:
         """J - D'D [kg m^2]."""
         return self.inertia - self.coupling.T @ self.coupling
 
-    def known(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
+    def mass(self, t: Scalar, x: AttitudeState) -> Float[Array, "3 3"]:
+        """J - D'D [kg m^2]."""
+        return self.rest_inertia
+
+    def generalised_force(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
         """(J - D'D) w' without the disturbance [N m]."""
         return u - jnp.cross(x.w, self.momentum(x)) + self.coupling.T @ self.force(x.modes)
 
     def rate(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
         """Time derivative of the state under torque and disturbance [N m]."""
-        w_dot = self.rest_inverse @ (self.known(t, x, u) + disturbance)
+        w_dot = self.rest_inverse @ (self.generalised_force(t, x, u) + disturbance)
         e_ddot = -self.force(x.modes) - self.coupling @ w_dot
         return AttitudeState(attitude.derivative(x.q, x.w), w_dot, Modes(x.modes.rate, e_ddot))
 
-    def seen(self, x: AttitudeState) -> AttitudeState:
+    def visible(self, x: AttitudeState) -> AttitudeState:
         """Attitude and rate."""
         return x._replace(modes=None)
 
-    def at_rest(self, seen: AttitudeState) -> AttitudeState:
+    def with_hidden_at_rest(self, visible: AttitudeState) -> AttitudeState:
         """With the modes at rest: e = e' = 0, the body turning as a rigid one."""
-        return seen._replace(modes=Modes(jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency)))
+        return visible._replace(modes=Modes(jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency)))
 
-    def moved(self, x: AttitudeState, by: Float[Array, " n"]) -> AttitudeState:
+    def retract(self, x: AttitudeState, by: Float[Array, " n"]) -> AttitudeState:
         """Moved as a rigid body is, then by e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
         n = self.frequency.shape[-1]
-        near = super().moved(x, by[:6])
+        near = super().retract(x, by[:6])
         return near._replace(modes=Modes(x.modes.e + by[6 : 6 + n], x.modes.rate + by[6 + n :]))
 
-    def apart(self, x: AttitudeState, other: AttitudeState) -> Float[Array, " n"]:
-        """What `moved` takes x to the other by, to first order."""
-        return jnp.concatenate([super().apart(x, other), other.modes.e - x.modes.e, other.modes.rate - x.modes.rate])
+    def local_coordinates(self, x: AttitudeState, other: AttitudeState) -> Float[Array, " n"]:
+        """What `retract` takes x to the other by, to first order."""
+        return jnp.concatenate(
+            [super().local_coordinates(x, other), other.modes.e - x.modes.e, other.modes.rate - x.modes.rate]
+        )
 
     def momentum(self, x: AttitudeState) -> Float[Array, "3"]:
         """Angular momentum in body axes, J w + D' e' [N m s]."""
@@ -84,24 +91,24 @@ class FlexibleSpacecraft(Spacecraft):
     def energy(self, x: AttitudeState) -> Scalar:
         """Kinetic and elastic energy, (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2 [J]; with u = d = 0 it cannot grow."""
         e, rate = x.modes
-        moving = x.w @ self.inertia @ x.w + 2.0 * x.w @ (self.coupling.T @ rate) + rate @ rate
-        return (moving + jnp.sum((self.frequency * e) ** 2)) / 2.0
+        kinetic = x.w @ self.inertia @ x.w + 2.0 * x.w @ (self.coupling.T @ rate) + rate @ rate
+        return (kinetic + jnp.sum((self.frequency * e) ** 2)) / 2.0
 
-    def ringing(self, x: AttitudeState) -> Scalar:
+    def modal_amplitude(self, x: AttitudeState) -> Scalar:
         """Size of the modes' motion, the square root of the sum of e^2 + (e'/W)^2 [sqrt(kg) m]."""
         e, rate = x.modes
         return guards.norm(jnp.concatenate([e, rate / self.frequency]))
 
     def with_inertia(self, inertia: Float[Array, "3 3"], inverse: Float[Array, "3 3"]) -> "FlexibleSpacecraft":
-        """The body with another J; a run whose J leaves no J - D'D > 0 is marked."""
-        return replace(self, inertia=inertia, inertia_inverse=inverse).settled()
+        """The body with another J [kg m^2], (3, 3); a run whose J leaves no J - D'D > 0 is marked."""
+        return replace(self, inertia=inertia, inertia_inverse=inverse).with_rest_inverse()
 
-    def settled(self) -> "FlexibleSpacecraft":
+    def with_rest_inverse(self) -> "FlexibleSpacecraft":
         """The body with (J - D'D)^-1 made of its J and D; not finite where J - D'D is not positive definite."""
-        rest = self.inertia - self.coupling.T @ self.coupling
+        rest = self.rest_inertia
         minors = (rest[0, 0], rest[0, 0] * rest[1, 1] - rest[0, 1] * rest[1, 0], matrices.determinant(rest))
-        there = jnp.all(jnp.stack(minors) > 0.0)
-        return replace(self, rest_inverse=jnp.where(there, matrices.solve(rest, jnp.eye(3)), jnp.nan))
+        definite = jnp.all(jnp.stack(minors) > 0.0)
+        return replace(self, rest_inverse=jnp.where(definite, matrices.solve(rest, jnp.eye(3)), jnp.nan))
 
     def hidden_columns(self, x: AttitudeState) -> dict[str, Any]:
         """Modal coordinates e1.. [sqrt(kg) m] and their rates e_dot1.. [sqrt(kg) m/s]."""
@@ -109,14 +116,21 @@ class FlexibleSpacecraft(Spacecraft):
 
 
 def flexible(inertia: object, frequency: object, damping: object, coupling: object) -> FlexibleSpacecraft:
-    """Flexible spacecraft: inertia of the whole body as `rigid_body.spacecraft` takes it [kg m^2], and its modes.
+    """Flexible spacecraft from its inertia and its modes. Raises ValueError where no body can have them.
 
-    frequency: (n,) [rad/s]; damping: (n,) [-]; coupling: (n, 3) [sqrt(kg) m]. Raises ValueError where no body can have
-    them.
+    Args:
+        inertia: of the whole body with its modes at rest, as `rigid_body.spacecraft` takes it [kg m^2].
+        frequency: (n,) of each mode with the body held [rad/s].
+        damping: (n,) [-].
+        coupling: (n, 3) [sqrt(kg) m].
     """
     tensor = formulas.check_inertia(inertia)
     rest = formulas.rest_inertia(tensor, coupling)
-    modes = (jnp.asarray(np.asarray(v, dtype=float)) for v in (frequency, damping, coupling))
-    inverses = (jnp.asarray(np.linalg.inv(v)) for v in (tensor, rest))
-    whole, rigid = inverses
-    return FlexibleSpacecraft(jnp.asarray(tensor), whole, *modes, rest_inverse=rigid)
+    return FlexibleSpacecraft(
+        inertia=vector(tensor),
+        inertia_inverse=vector(np.linalg.inv(tensor)),
+        frequency=vector(frequency),
+        damping=vector(damping),
+        coupling=vector(coupling),
+        rest_inverse=vector(np.linalg.inv(rest)),
+    )

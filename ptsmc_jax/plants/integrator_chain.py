@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.pytrees import pytree
-from ptsmc_jax.plants.base import Plant, called
+from ptsmc_jax.plants.base import Plant, as_pytree
 
 Scalar = Float[Array, ""]
 
@@ -45,7 +45,7 @@ class Chain(Plant):
         """x_n, (1,)."""
         return x[-1:]
 
-    def known(self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"]) -> Float[Array, "1"]:
+    def generalised_force(self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"]) -> Float[Array, "1"]:
         """f(x) + g(x) u, (1,)."""
         return self.drift(x) + self.input_gain(x) * u
 
@@ -53,7 +53,7 @@ class Chain(Plant):
         self, t: Scalar, x: Float[Array, " n"], u: Float[Array, "1"], disturbance: Float[Array, "1"]
     ) -> Float[Array, " n"]:
         """Time derivative of the state, (35)."""
-        return jnp.concatenate([x[1:], self.known(t, x, u) + disturbance])
+        return jnp.concatenate([x[1:], self.generalised_force(t, x, u) + disturbance])
 
     def input_for(
         self, t: Scalar, x: Float[Array, " n"], w_dot: Float[Array, "1"], d: Float[Array, "1"]
@@ -71,7 +71,7 @@ class Chain(Plant):
 
 
 def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> Chain:
-    """Integrator chain; f, g: see `Chain`, plain functions are wrapped. Raises ValueError where order is below 2."""
+    """Integrator chain of an order n; f, g: functions of the state (n,), see `Chain`. Raises ValueError for n < 2."""
     if order < 2:
         raise ValueError(f"order is {order}, but must be at least 2")
-    return Chain(order, called(f), called(g))
+    return Chain(order, as_pytree(f), as_pytree(g))

@@ -41,7 +41,7 @@ class Spacecraft(Plant):
         """The rate w [rad/s]; of a derivative, w' [rad/s^2]."""
         return x.w
 
-    def known(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
+    def generalised_force(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
         """J w' without the disturbance, u - w x J w [N m]."""
         return u - self.gyroscopic(x.w)
 
@@ -60,11 +60,11 @@ class Spacecraft(Plant):
         """The state with |q| = 1 again."""
         return x._replace(q=attitude.normalise(x.q))
 
-    def moved(self, x: AttitudeState, by: Float[Array, "6"]) -> AttitudeState:
+    def retract(self, x: AttitudeState, by: Float[Array, "6"]) -> AttitudeState:
         """The state turned by a small rotation in body axes [rad], its rate changed [rad/s]."""
         return AttitudeState(attitude.multiply(x.q, attitude.from_rotation_vector(by[:3])), x.w + by[3:])
 
-    def apart(self, x: AttitudeState, other: AttitudeState) -> Float[Array, "6"]:
+    def local_coordinates(self, x: AttitudeState, other: AttitudeState) -> Float[Array, "6"]:
         """Small rotation in body axes [rad] and change of the rate [rad/s]."""
         return jnp.concatenate([2.0 * attitude.multiply(attitude.conjugate(x.q), other.q)[:3], other.w - x.w])
 

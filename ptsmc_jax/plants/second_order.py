@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
-from ptsmc_jax.plants.base import Plant, called
+from ptsmc_jax.plants.base import Plant, as_pytree
 
 Scalar = Float[Array, ""]
 
@@ -33,9 +33,10 @@ class System(Plant):
     inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
     inertia_inverse: Leaf  # (n, n)
 
-    def _at(self, function: Any, t: Scalar, x: Float[Array, " twice"]) -> Array:
+    def split(self, x: Float[Array, " twice"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """x_1 and x_2."""
         n = self.inputs
-        return function(t, x[:n], x[n : 2 * n])
+        return x[:n], x[n : 2 * n]
 
     def position(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """x_1."""
@@ -47,55 +48,61 @@ class System(Plant):
 
     def position_rate(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """x_1' = F."""
-        return self._at(self.F, t, x)
+        return self.F(t, *self.split(x))
 
     def slope(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
         """dF/dx2."""
-        n = self.inputs
-        return jax.jacfwd(self.F, argnums=2)(t, x[:n], x[n : 2 * n])
+        return jax.jacfwd(self.F, argnums=2)(t, *self.split(x))
 
-    def carried(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """What of x_1'' no acceleration makes: dF/dt + dF/dx1 F."""
-        n = self.inputs
-        x_1, x_2 = x[:n], x[n : 2 * n]
-        moved = (jnp.ones_like(t), self.F(t, x_1, x_2))
-        return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), moved)[1]
+    def coasting_acceleration(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
+        """The x_1'' where x_2' = 0: dF/dt + dF/dx1 F."""
+        x_1, x_2 = self.split(x)
+        rates = (jnp.ones_like(t), self.F(t, x_1, x_2))
+        return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), rates)[1]
 
     def drift(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
         """H."""
-        return self._at(self.H, t, x)
+        return self.H(t, *self.split(x))
 
     def input_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
         """G."""
-        return self._at(self.G, t, x)
+        return self.G(t, *self.split(x))
 
     def disturbance_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
         """D."""
-        return jnp.eye(self.inputs) if self.D is None else self._at(self.D, t, x)
+        return jnp.eye(self.inputs) if self.D is None else self.D(t, *self.split(x))
 
     def mass(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
         """D^-1."""
         one = jnp.eye(self.inputs)
         return one if self.D is None else matrices.solve(self.disturbance_gain(t, x), one)
 
-    def known(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
+    def driven(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
+        """H + G u, the x_2' without a disturbance."""
+        return self.drift(t, x) + self.input_gain(t, x) @ u
+
+    def generalised_force(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
         """D^-1 (H + G u)."""
-        driven = self.drift(t, x) + self.input_gain(t, x) @ u
+        driven = self.driven(t, x, u)
         return driven if self.D is None else matrices.solve(self.disturbance_gain(t, x), driven)
 
     def rate(
         self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
     ) -> Float[Array, " twice"]:
         """Time derivative of the state, (25)."""
-        driven = self.drift(t, x) + self.input_gain(t, x) @ u + self.disturbance_gain(t, x) @ disturbance
-        return jnp.concatenate([self.position_rate(t, x), driven])
+        x_2_dot = self.driven(t, x, u) + self.disturbance_gain(t, x) @ disturbance
+        return jnp.concatenate([self.position_rate(t, x), x_2_dot, *self.hidden_rates(t, x, u)])
+
+    def hidden_rates(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> tuple[Array, ...]:
+        """Derivatives of the states that follow x_2: there are none."""
+        return ()
 
     def input_for(
         self, t: Scalar, x: Float[Array, " twice"], w_dot: Float[Array, " n"], d: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """G^-1 (x_2' - H - D d)."""
-        driven = w_dot - self.drift(t, x) - self.disturbance_gain(t, x) @ d
-        return matrices.solve(self.input_gain(t, x), driven)
+        from_input = w_dot - self.drift(t, x) - self.disturbance_gain(t, x) @ d
+        return matrices.solve(self.input_gain(t, x), from_input)
 
     def speed(self, x: Float[Array, " twice"]) -> Scalar:
         """|x_2|."""
@@ -107,7 +114,7 @@ class System(Plant):
 
     def columns(self, x: Any) -> dict[str, Any]:
         """The states x_1 and x_2, one after the other."""
-        return {"x": x}
+        return {"x": x[..., : 2 * self.inputs]}
 
 
 @pytree
@@ -124,29 +131,19 @@ class HiddenSystem(System):
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
         """H."""
-        n = self.inputs
-        return self.H(t, x[:n], x[n : 2 * n], x[2 * n :])
+        return self.H(t, *self.split(x), x[2 * self.inputs :])
 
-    def rate(
-        self, t: Scalar, x: Float[Array, " whole"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
-    ) -> Float[Array, " whole"]:
-        """Time derivative of the state."""
-        n = self.inputs
-        driven = self.drift(t, x) + self.input_gain(t, x) @ u + self.disturbance_gain(t, x) @ disturbance
-        hidden = self.Z(t, x[:n], x[n : 2 * n], x[2 * n :], u)
-        return jnp.concatenate([self.position_rate(t, x), driven, hidden])
+    def hidden_rates(self, t: Scalar, x: Float[Array, " whole"], u: Float[Array, " n"]) -> tuple[Array, ...]:
+        """The derivative Z of z."""
+        return (self.Z(t, *self.split(x), x[2 * self.inputs :], u),)
 
-    def seen(self, x: Float[Array, " whole"]) -> Float[Array, " twice"]:
+    def visible(self, x: Float[Array, " whole"]) -> Float[Array, " twice"]:
         """x_1 and x_2."""
         return x[: 2 * self.inputs]
 
-    def at_rest(self, seen: Float[Array, " twice"]) -> Float[Array, " whole"]:
+    def with_hidden_at_rest(self, visible: Float[Array, " twice"]) -> Float[Array, " whole"]:
         """The state of these x_1 and x_2, with z at z0."""
-        return jnp.append(seen, self.z0)
-
-    def columns(self, x: Any) -> dict[str, Any]:
-        """The states x_1 and x_2, one after the other."""
-        return {"x": x[..., : 2 * self.inputs]}
+        return jnp.append(visible, self.z0)
 
     def hidden_columns(self, x: Any) -> dict[str, Any]:
         """The states z."""
@@ -164,23 +161,32 @@ def system(
     Z: Callable | None = None,
     z0: object = (),
 ) -> System:
-    """Second-order system (25) with n inputs from JAX functions of (t, x_1, x_2); see `System`.
+    """Second-order system (25) from JAX functions of (t, x_1, x_2), t [s] and x_1, x_2 (n,); see `System`.
 
-    F and H return (n,), G and D (n, n); D, the disturbance's input matrix, is the identity if None, and must be
-    invertible for any observer. inertia: (n, n), symmetric and positive definite, that observers read their gains
-    against (A = l inertia^-1), the identity if None: gains are then in 1/s. With Z, of (t, x_1, x_2, z, u), it has
-    states z (k,) besides, z0 at first, which H takes as a fourth argument: see `HiddenSystem`; it may fly as a truth.
-    Raises ValueError where a function does not take such arguments or returns another shape.
+    Args:
+        n: number of inputs.
+        F: x_1', (n,).
+        H: x_2' without input and disturbance, (n,); with Z it takes the hidden states z as a fourth argument.
+        G: input matrix, (n, n).
+        D: the disturbance's input matrix, (n, n), which must be invertible for any observer; None: the identity.
+        inertia: (n, n), symmetric and positive definite, that observers read their gains against, A = l inertia^-1;
+            None: the identity, gains are then in 1/s.
+        Z: derivative of hidden states z (k,), of (t, x_1, x_2, z, u): a truth to fly, see `HiddenSystem`.
+        z0: z at t = 0, (k,).
+
+    Raises:
+        ValueError: a function does not take such arguments, or returns another shape; or the numbers do not fit.
     """
     if not isinstance(n, int) or n < 1:
         raise ValueError(f"n is {n}, but must be a whole number of at least 1")
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), number.dtype)
     z = _hidden(z0, Z)
-    whole = (vector, vector) if Z is None else (vector, vector, z)
     signatures: list[tuple[str, Any, tuple, tuple]] = [
         ("F(t, x_1, x_2)", F, (vector, vector), (n,)),
-        ("H(t, x_1, x_2)" if Z is None else "H(t, x_1, x_2, z)", H, whole, (n,)),
+        ("H(t, x_1, x_2)", H, (vector, vector), (n,))
+        if Z is None
+        else ("H(t, x_1, x_2, z)", H, (vector, vector, z), (n,)),
         ("G(t, x_1, x_2)", G, (vector, vector), (n, n)),
         ("D(t, x_1, x_2)", D, (vector, vector), (n, n)),
         ("Z(t, x_1, x_2, z, u)", Z, (vector, vector, z, vector), z.shape),
@@ -191,21 +197,23 @@ def system(
         try:
             returned = jax.eval_shape(function, number, *arguments)
         except Exception as error:
-            failure = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            first_line = (str(error).splitlines() or [""])[0]
+            failure = f"{type(error).__name__}: {first_line}"
             raise ValueError(f"{name} fails for x_1 and x_2 of shape ({n},): {failure}") from error
-        got = getattr(returned, "shape", type(returned).__name__)
-        if got != shape:
-            raise ValueError(f"{name} returns {got}, but for n = {n} must return an array {shape}")
+        returned_shape = getattr(returned, "shape", type(returned).__name__)
+        if returned_shape != shape:
+            raise ValueError(f"{name} returns {returned_shape}, but for n = {n} must return an array {shape}")
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
     definite = scale.shape == (n, n) and np.allclose(scale, scale.T, rtol=1e-9) and np.linalg.eigvalsh(scale)[0] > 0
     if not definite:
         raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
-    arrays = called(F), called(H), called(G), called(D), jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
-    return System(*arrays) if Z is None else HiddenSystem(*arrays, called(Z), z)
+    functions = as_pytree(F), as_pytree(H), as_pytree(G), as_pytree(D)
+    fields = *functions, jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
+    return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
 
 
 def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:
-    """The initial hidden states. Raises ValueError where they are no list of numbers, or Z is missing."""
+    """The initial hidden states (k,). Raises ValueError where they are no list of numbers, or Z is missing."""
     try:
         z = np.atleast_1d(np.asarray(z0, dtype=float))
     except (TypeError, ValueError):

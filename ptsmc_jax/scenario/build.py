@@ -32,7 +32,7 @@ def setup(scenario: Scenario) -> Setup:
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
         sensors=scenario.devices.sensors(scenario) if scenario.sensors is None else scenario.sensors.build(model),
-        initial=plant.at_rest(scenario.start()),
+        initial=plant.with_hidden_at_rest(scenario.start()),
         t_end=vector(scenario.end),
         window=vector(scenario.window),
         settling_angle=vector(scenario.loop.settling_angle),

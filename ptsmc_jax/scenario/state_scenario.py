@@ -218,9 +218,9 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
 
     def target(self) -> Any:
         """Time: the reference is in x_1, an error already."""
-        from ptsmc_jax.signals.references import Now
+        from ptsmc_jax.signals.references import CurrentTime
 
-        return Now()
+        return CurrentTime()
 
     def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
         """What the law, or the observer, must invert where it starts."""

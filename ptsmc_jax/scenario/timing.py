@@ -171,7 +171,7 @@ def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
 
     def jacobian(t: Any, x: Any) -> Any:
         u = law.invert(x, t, none, none)
-        return plant.jacobian(t, plant.at_rest(x), u)
+        return plant.jacobian(t, plant.with_hidden_at_rest(x), u)
 
     def along(t: Any) -> Any:
         return law.motion(t, setup.initial, none, none, none).w_dot

@@ -22,10 +22,10 @@ class Disturbance:
         """Disturbance at t [s] in the state x, (m,) [N m]."""
         raise NotImplementedError
 
-    drawn: ClassVar[Mapping[str, str]] = {}  # the fields whose numbers can be drawn, by "phase" and "amplitude"
+    drawn: ClassVar[Mapping[str, str]] = {}  # "phase", "amplitude" -> the field that holds what a dispersion draws
 
     def fastest(self) -> float:
-        """How fast it changes at most [rad/s], which the integration steps follow; 0: slowly."""
+        """Its largest angular frequency [rad/s], which the integration steps follow; 0: slower than all else."""
         return 0.0
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
@@ -49,7 +49,7 @@ class Constant(Disturbance):
 @pytree
 @dataclass(frozen=True)
 class Bias(Constant):
-    """A constant that is added to the disturbance of a scenario, see `with_bias`; its amplitude is none of theirs."""
+    """A constant that is added to the disturbance of a scenario, see `with_bias`; it is not among the amplitudes."""
 
     drawn: ClassVar[Mapping[str, str]] = {}
 
@@ -115,43 +115,44 @@ class Sum(Disturbance):
         return Sum(tuple(on_body(term, inertia) for term in self.terms))
 
 
-def together(disturbance: Any) -> tuple[Any, ...]:
-    """The disturbances that act at once."""
+def terms(disturbance: Any) -> tuple[Any, ...]:
+    """The terms of a sum of disturbances; of another disturbance itself alone."""
     return getattr(disturbance, "terms", (disturbance,))
 
 
-def _drawn(term: Any, what: str) -> str | None:
+def _drawn_field(term: Any, what: str) -> str | None:
+    """The field of a term that holds its phase or amplitude; None where it has none, or is a plain function."""
     return getattr(term, "drawn", {}).get(what)
 
 
 def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
     """Every phase [rad] or amplitude [N m] of a disturbance, (count,): term after term, input after input."""
-    fields = [(term, _drawn(term, what)) for term in together(disturbance)]
+    fields = [(term, _drawn_field(term, what)) for term in terms(disturbance)]
     return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(getattr(term, field)) for term, field in fields if field)])
 
 
 def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
     """The disturbance with these phases [rad] or amplitudes [N m], as `values` gives them; what has none stays."""
-    terms, used = [], 0
-    for term in together(disturbance):
-        field = _drawn(term, what)
+    changed, used = [], 0
+    for term in terms(disturbance):
+        field = _drawn_field(term, what)
         if field is not None:
             old = jnp.asarray(getattr(term, field))
             term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
             used += old.size
-        terms.append(term)
-    return Sum(tuple(terms)) if hasattr(disturbance, "terms") else terms[0]
+        changed.append(term)
+    return Sum(tuple(changed)) if hasattr(disturbance, "terms") else changed[0]
 
 
 def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
-    """What is added to a disturbance, (m,) [N m]; zero: nothing is."""
-    last = together(disturbance)[-1]
+    """The `Bias` of a disturbance, (m,) [N m]; zero where it has none."""
+    last = terms(disturbance)[-1]
     return last.value if isinstance(last, Bias) else jnp.zeros(inputs)
 
 
 def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:
-    """The disturbance with this added to it, (m,) [N m], in place of what was added before."""
-    return Sum((*(term for term in together(disturbance) if not isinstance(term, Bias)), Bias(value)))
+    """The disturbance with this `Bias` added, (m,) [N m], in place of the one before."""
+    return Sum((*(term for term in terms(disturbance) if not isinstance(term, Bias)), Bias(value)))
 
 
 def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:

@@ -52,8 +52,8 @@ class Spin:
         return Target(turned, self.rate, jnp.zeros(3))
 
 
-def moving(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
-    """Target at t [s] of a reference attitude given as a function of time; its derivatives are exact (autodiff).
+def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
+    """Target at t [s] of an attitude path, a unit quaternion as a function of time; its derivatives are exact.
 
     w = 2 vec(q* q') and w' = 2 vec(q* q''), since q*' q' = |q'|^2 has no vector part.
     """
@@ -70,19 +70,19 @@ class TurningFunction(Function):
 
     def __call__(self, t: Time) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Target at t [s]; a quaternion's rates are its derivatives. Raises TypeError where it is neither."""
-        found = self.function(t)
-        if isinstance(found, Target):
-            return found
-        if jnp.shape(found) != (4,):
+        value = self.function(t)
+        if isinstance(value, Target):
+            return value
+        if jnp.shape(value) != (4,):
             raise TypeError(
-                f"the reference function returns {found!r}, but must return a quaternion (4,), scalar last, or a Target"
+                f"the reference function returns {value!r}, but must return a quaternion (4,), scalar last, or a Target"
             )
-        return moving(lambda t: attitude.normalise(jnp.asarray(self.function(t))), t)
+        return target_of(lambda t: attitude.normalise(jnp.asarray(self.function(t))), t)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a reference attitude of one's own is derived from: q_f(t) = q attitude(t)."""
+    """A reference given by an attitude as a function of time, q_f(t) = q attitude(t); the base of one's own, too."""
 
     q: Leaf  # (4,) the attitude that it turns from
 
@@ -96,68 +96,57 @@ class Reference:
 
     def __call__(self, t: Time) -> Target:
         """Target at t [s]."""
-        return moving(lambda t: attitude.multiply(self.q, self.attitude(t)), t)
+        return target_of(lambda t: attitude.multiply(self.q, self.attitude(t)), t)
 
 
 @pytree
 @dataclass(frozen=True)
-class Swing:
+class Swing(Reference):
     """A reference that swings about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
 
-    q: Leaf  # (4,) the attitude it swings about
-    amplitude: Leaf  # (3,) of the rotation vector, per axis [rad]
+    amplitude: Leaf  # (3,) of the rotation vector r, per axis [rad]
     frequency: Leaf  # (3,) [rad/s]
     phase: Leaf  # (3,) [rad]
 
-    def __call__(self, t: Time) -> Target:
-        """Target at t [s]."""
-
-        def path(t: Time) -> Float[Array, "4"]:
-            turn = self.amplitude * jnp.sin(self.frequency * t + self.phase)
-            return attitude.multiply(self.q, attitude.from_rotation_vector(turn))
-
-        return moving(path, t)
+    def attitude(self, t: Time) -> Float[Array, "4"]:
+        """The unit quaternion exp(r(t)) at t [s]."""
+        return attitude.from_rotation_vector(self.amplitude * jnp.sin(self.frequency * t + self.phase))
 
 
 @pytree
 @dataclass(frozen=True)
-class Slew:
+class Slew(Reference):
     """A reference that turns about a fixed axis from rest to rest: q_f(t) = q exp(share(t / duration) turn).
 
     share(x) = 10 x^3 - 15 x^4 + 6 x^5, 0 before and 1 after: its first two derivatives vanish at both ends.
     """
 
-    q: Leaf  # (4,) attitude until t = 0
-    turn: Leaf  # (3,) rotation vector to the attitude from t = duration on [rad]
+    turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to that from t = duration on [rad]
     duration: Leaf  # [s]
 
-    def __call__(self, t: Time) -> Target:
-        """Target at t [s]."""
-
-        def path(t: Time) -> Float[Array, "4"]:
-            x = jnp.clip(t / self.duration, 0.0, 1.0)
-            share = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-            return attitude.multiply(self.q, attitude.from_rotation_vector(share * self.turn))
-
-        return moving(path, t)
+    def attitude(self, t: Time) -> Float[Array, "4"]:
+        """The unit quaternion exp(share turn) at t [s]."""
+        x = jnp.clip(t / self.duration, 0.0, 1.0)
+        share = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+        return attitude.from_rotation_vector(share * self.turn)
 
 
 @pytree
 @dataclass(frozen=True)
 class Origin:
-    """The reference of an integrator chain: the origin, which needs no numbers."""
+    """The reference of an integrator chain: the origin."""
 
     def __call__(self, t: Time) -> None:
-        """None: a chain's target needs no numbers."""
+        """None: the origin needs no numbers."""
 
 
 @pytree
 @dataclass(frozen=True)
-class Now:
+class CurrentTime:
     """The reference of a system of one's own: the time itself, since F says how far from its target the system is."""
 
     def __call__(self, t: Time) -> Time:
-        """T [s]."""
+        """The time t itself [s]."""
         return t
 
 

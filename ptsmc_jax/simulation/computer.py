@@ -106,7 +106,7 @@ def seen_within(parts: Parts, now: Ticks, until: Callable[[Scalar], Any]) -> Any
     """
     if getattr(parts.sensors, "own_times", None) is None:
         return None
-    return parts.plant.seen(until(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
+    return parts.plant.visible(until(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
 
 
 def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:
@@ -144,7 +144,7 @@ def filtered(parts: Parts, period: Period, computer: Computer, u: Array) -> tupl
 def decide(parts: Parts, k2: Any, period: Period, computer: Computer, x: Any) -> tuple[Decision, Computer]:
     """The flight software in a control period: sensors, observer, law, filter of its command; k2: its K2(t) [s].
 
-    x: what sensors without noise see of the true state, `Plant.seen`.
+    x: what sensors without noise see of the true state, `Plant.visible`.
     `applied` of the computer that comes back is the old one: what the period's command brings about is not known yet.
     """
     target = parts.reference(period.now.t)

@@ -25,7 +25,7 @@ class Snapshot(NamedTuple):
     angle: Array  # to the reference [rad]; for other plants |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
     momentum: Array  # |J w| [N m s]
-    ringing: Array | None = None  # `Plant.ringing`, of a flexible body [sqrt(kg) m]
+    modal_amplitude: Array | None = None  # `Plant.modal_amplitude`, of a flexible body [sqrt(kg) m]
 
 
 class Start(NamedTuple):

@@ -119,11 +119,12 @@ def _hold_angle(largest: Array, interval: Interval, errors: Errors, criteria: Cr
 
 def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     """The largest at ends of intervals from t_f on; before, what it was."""
-    ringing = interval.end.ringing
-    if ringing is None:
+    amplitude = interval.end.modal_amplitude
+    if amplitude is None:
         return largest
     early = interval.t < criteria.t_f  # an interval that t_f lies in begins anew
-    return jnp.where(interval.t_next >= criteria.t_f, jnp.where(early, ringing, jnp.maximum(largest, ringing)), largest)
+    reached = interval.t_next >= criteria.t_f
+    return jnp.where(reached, jnp.where(early, amplitude, jnp.maximum(largest, amplitude)), largest)
 
 
 # absolute, mean and relative index: of the attitude's error, and of what the law is told of it
@@ -221,7 +222,7 @@ def _pointing_rows() -> dict[str, Metric]:
     return found
 
 
-_RINGING = _peak(lambda interval: interval.end.ringing, lambda start: start.snapshot.ringing)
+_RINGING = _peak(lambda interval: interval.end.modal_amplitude, lambda start: start.snapshot.modal_amplitude)
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),

@@ -163,7 +163,12 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
         dt = now.t_next - now.t
         computer = world.computer._replace(applied=(state.u, None)) if actuators.holds else world.computer
         (target, d_hat, u, s, w, channels), computer = software.decide(
-            parts, k2, period_of(tick)._replace(within=world.within), computer, parts.plant.seen(state.x), world.acting
+            parts,
+            k2,
+            period_of(tick)._replace(within=world.within),
+            computer,
+            parts.plant.visible(state.x),
+            world.acting,
         )
         drive, queue = actuators.command(world.acting, u, w, now.t, dt, now.noise_weight)
         drive = drive if channels is None else drive._replace(c=channels)
@@ -190,7 +195,7 @@ def _sampled(parts: Parts, ticks: Ticks, course: _Course, seed, trial, record, s
     state = _begin(parts, course, acting.h)
     first = state.snapshot
     pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    computer = software.boot(parts, seed, trial, parts.plant.seen(course.x0), started)
+    computer = software.boot(parts, seed, trial, parts.plant.visible(course.x0), started)
     if actuators.holds:  # the state has it
         computer = computer._replace(applied=None)
     first_late = None if parts.jitter is None else late(ticks.t[0], ticks.sample[0])
@@ -370,7 +375,7 @@ def _start(parts: Parts, snapshot: Snapshot, wheels: Array | None) -> Start:
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     angle = parts.controller.angle(x, target)
     plant = parts.plant
-    return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.ringing(x))
+    return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
 
 
 def _watch(

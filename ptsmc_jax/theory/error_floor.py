@@ -222,13 +222,13 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
         pushed = disturbance - parts.disturbance(tick.t, x)
 
         def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array]:
-            near = plant.moved(x, z)
+            near = plant.retract(x, z)
             near_next = rollout.over_period(parts, tick.t, near, drive, pushed + push, dt)
             (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
             middle = (start + end) / 2 + dt / 8 * (rate - rate_next)
-            return plant.apart(x_next, near_next), jnp.concatenate([start, middle, end])
+            return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end])
 
-        still = jnp.zeros_like(plant.apart(x, x))
+        still = jnp.zeros_like(plant.local_coordinates(x, x))
         (move, push), (seen, seen_push) = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
         return _Linear(move, push, seen, seen_push)
 

@@ -98,11 +98,11 @@ def nominal(parts: Parts) -> Nominal:
     k2, actuators = parts.observer.error_bound(), _actuators(parts)
     x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     model = actuators.begin(parts.plant.inputs)
-    computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.seen(x0), started)
+    computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.visible(x0), started)
 
     def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
         period = period_of(tick)
-        decision, computer, model = _computed(parts, k2, period, carry, parts.plant.seen(carry.x))
+        decision, computer, model = _computed(parts, k2, period, carry, parts.plant.visible(carry.x))
         wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
         x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
         after = Carry(x, acting, computer, model)
@@ -156,10 +156,11 @@ class _Local:
     def __init__(self, parts: Parts, base: Carry):
         self._plant, self._model, self._sensors = parts.plant, parts.observer.model, parts.sensors
         self._base = base
-        self._turned = hasattr(parts.sensors, "moved")
-        start = parts.plant.apart(base.x, base.x)
-        known = self._model.apart(base.computer.seen, base.computer.seen)
-        inside = parts.sensors.apart(base.computer.sensing, base.computer.sensing) if self._turned else jnp.zeros(0)
+        self._turned = hasattr(parts.sensors, "retract")
+        start = parts.plant.local_coordinates(base.x, base.x)
+        known = self._model.local_coordinates(base.computer.seen, base.computer.seen)
+        sensing = base.computer.sensing
+        inside = parts.sensors.local_coordinates(sensing, sensing) if self._turned else jnp.zeros(0)
         rest, self._unravel = ravel_pytree(self._rest(base))
         self.sizes = [start.size, known.size, inside.size, rest.size]
 
@@ -169,25 +170,25 @@ class _Local:
         own = _numbers(computer.law), computer.filtered
         return carry.acting, computer.memory, computer.applied, carry.model, kept, *own
 
-    def moved(self, z: Array) -> Carry:
+    def retract(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
         near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
         acting, memory, applied, model, kept, law, filtered = near
         inside = base.computer.sensing
-        inside = self._sensors.moved(inside, sensing) if self._turned else _with_numbers(inside, kept)
+        inside = self._sensors.retract(inside, sensing) if self._turned else _with_numbers(inside, kept)
         law = _with_numbers(base.computer.law, law)
-        computer = Computer(inside, self._model.moved(base.computer.seen, seen), memory, law, applied, filtered)
-        return Carry(plant.moved(base.x, x), acting, computer, model)
+        computer = Computer(inside, self._model.retract(base.computer.seen, seen), memory, law, applied, filtered)
+        return Carry(plant.retract(base.x, x), acting, computer, model)
 
-    def apart(self, other: Carry) -> Array:
+    def local_coordinates(self, other: Carry) -> Array:
         base, plant = self._base, self._plant
-        seen = self._model.apart(base.computer.seen, other.computer.seen)
+        seen = self._model.local_coordinates(base.computer.seen, other.computer.seen)
         inside = jnp.zeros(0)
         if self._turned:
-            inside = self._sensors.apart(base.computer.sensing, other.computer.sensing)
+            inside = self._sensors.local_coordinates(base.computer.sensing, other.computer.sensing)
         rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
-        return jnp.concatenate([plant.apart(base.x, other.x), seen, inside, rest])
+        return jnp.concatenate([plant.local_coordinates(base.x, other.x), seen, inside, rest])
 
 
 def _numbers(memory: Any) -> list[Array]:
@@ -221,24 +222,24 @@ def opened(parts: Parts, during: Nominal) -> Opened:
     target = parts.reference(now.t)
 
     def flown(z: Array, seen: Array) -> tuple[Array, Array, Array]:
-        carry = here.moved(z)
-        seen = parts.observer.model.moved(plant.seen(before.x), seen)
+        carry = here.retract(z)
+        seen = parts.observer.model.retract(plant.visible(before.x), seen)
         decision, computer, model = _computed(parts, k2, period, carry, seen)
         x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
-        return there.apart(Carry(x, acting, computer, model)), decision.u, decision.s
+        return there.local_coordinates(Carry(x, acting, computer, model)), decision.u, decision.s
 
     def pushed(part: Scalar) -> tuple[Array, Array, Array]:
         def ended(old: Array, new: Array, d: Array) -> Array:
             commands = [(arriving + old, now.t, part * dt), (arriving + new, now.t + part * dt, (1.0 - part) * dt)]
             x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
-            return there.apart(after._replace(x=x, acting=acting))
+            return there.local_coordinates(after._replace(x=x, acting=acting))
 
         return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
 
     (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
     old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=_actuators(parts).delay)
-    error = jax.jacfwd(lambda by: law.errors(plant.moved(before.x, by), target)[0])(x0)
+    error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
     return Opened(loop, error, s_command, s_direct)
 
 

@@ -111,12 +111,12 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
         d_hat, _ = computer.estimate(parts, period, before, seen)
 
         def error(by: Array) -> Array:
-            return law.derivatives(model.moved(seen, by), target).reshape(-1)
+            return law.derivatives(model.retract(seen, by), target).reshape(-1)
 
         def commanded(by: Array) -> Array:
-            return computer.command(parts, k2, period, before, model.moved(seen, by), target, d_hat)[0]
+            return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]
 
-        zero = jnp.zeros(model.apart(seen, seen).size)
+        zero = jnp.zeros(model.local_coordinates(seen, seen).size)
         way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
         here, sloped = jax.jvp(commanded, (zero,), (way,))
         whole = commanded(way) - here

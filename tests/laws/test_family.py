@@ -139,7 +139,7 @@ PLANTS: dict[str, Any] = {
     ),
     "chain": (ErrorOfChain, integrator_chain.chain(2, lambda x: -0.8 * jnp.sin(x[0]), lambda x: 2.0 + x[0] ** 2),
               references.Origin(), vector([0.7, -0.4]), vector([0.1]), np.array([1.1]), np.array([-0.3])),
-    "arm": (ErrorOfSystem, ARM, references.Now(), vector([0.4, -0.3, 0.5, -0.2]), vector([0.2, -0.1]),
+    "arm": (ErrorOfSystem, ARM, references.CurrentTime(), vector([0.4, -0.3, 0.5, -0.2]), vector([0.2, -0.1]),
             np.array([0.8, -0.5]), np.array([0.3, 0.1])),
 }  # fmt: skip
 

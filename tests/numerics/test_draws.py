@@ -96,7 +96,7 @@ def test_several_streams_at_once_are_each_of_them():
     names, counts = ["rate_noise", "", "attitude_noise"], [1, 5, 4]
     keys = draws.streams(2**32 - 1, 7, names)
     assert keys == [draws.stream(2**32 - 1, 7, name) for name in names]
-    for k, law in enumerate(draws.LAWS):
+    for k, law in enumerate(draws.DISTRIBUTIONS):
         found = draws.several(2**32 - 1, 7, law, dict(zip(names, counts, strict=True)))
         for name, count in zip(names, counts, strict=True):
             np.testing.assert_allclose(found[name], expected(2**32 - 1, 7, name, 0, count)[k], rtol=0, atol=1e-14)

@@ -100,7 +100,7 @@ def test_the_bound_of_a_mean_is_clopper_and_pearsons_of_zeros_and_ones():
         np.testing.assert_allclose(statistics.mean_bound(shares, confidence), 1.0 - exact, rtol=1e-9)
         # nearly ones, by the saddlepoint formula and, where there are many, by Hall's
         near = statistics.mean_bound(shares * (1.0 - 1e-9), confidence)
-        assert near == pytest.approx(1.0 - exact, rel=4e-3 if ones < statistics.MANY else 0.03)
+        assert near == pytest.approx(1.0 - exact, rel=4e-3 if ones < statistics.NEARLY_NORMAL else 0.03)
 
 
 def test_the_bound_of_a_mean_is_the_quantile_that_it_says():

@@ -61,7 +61,7 @@ def as_system(run, reference):
             model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width, law.surface_rate
         ),
         observer=replace(run.observer, model=model),
-        reference=references.Now(),
+        reference=references.CurrentTime(),
         initial=jnp.concatenate([error, run.initial.w]),
     )
 
@@ -85,9 +85,11 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     model: Any = own.plant
     np.testing.assert_allclose(model.slope(t, state), 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
     by_hand = -0.25 * jnp.dot(x.w, x.w) * x.q[:3] - SPIN(t).vector_rates()[1]
-    np.testing.assert_allclose(model.carried(t, state), by_hand, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(model.coasting_acceleration(t, state), by_hand, rtol=0, atol=1e-15)
     np.testing.assert_allclose(model.mass(t, state), FULL_INERTIA, rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(model.known(t, state, u), run.plant.known(t, x, u), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        model.generalised_force(t, state, u), run.plant.generalised_force(t, x, u), rtol=0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("period", short([None, 0.05], [0.05]))
@@ -171,7 +173,7 @@ def test_jacobians_of_the_arm_are_those_derived_by_hand():
     np.testing.assert_array_equal(arm.slope(t, x), np.eye(2))
     # F = q' - q_d': dF/dt = -q_d''
     second = [0.6 * 0.64 * np.sin(0.8 * 0.7), 0.5 * np.cos(0.7)]
-    np.testing.assert_allclose(arm.carried(t, x), second, rtol=1e-14)
+    np.testing.assert_allclose(arm.coasting_acceleration(t, x), second, rtol=1e-14)
 
 
 def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time():

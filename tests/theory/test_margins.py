@@ -128,8 +128,8 @@ def _flown(parts, run, index, gain, late):
     actuators = parts.actuators
     delay = 0 if actuators is None else actuators.delay
     axes, now, dt = jnp.arange(base.size), period.now, period.length
-    still = jnp.zeros_like(parts.plant.apart(carry_0.x, carry_0.x))
-    begun = carry_0._replace(x=parts.plant.moved(carry_0.x, still.at[: base.size].set(1e-5)))
+    still = jnp.zeros_like(parts.plant.local_coordinates(carry_0.x, carry_0.x))
+    begun = carry_0._replace(x=parts.plant.retract(carry_0.x, still.at[: base.size].set(1e-5)))
 
     def step(state, _):
         carry, sent = state
@@ -141,7 +141,7 @@ def _flown(parts, run, index, gain, late):
         old = jnp.where(late > 0.0, sent[whole + delay + 1, axes], new)
         spans = [(old, now.t, part * dt), (new, now.t + part * dt, (1.0 - part) * dt)]
         x, acting = linear._acted(parts, period, carry, decision.w, spans)
-        size = jnp.linalg.norm(parts.plant.apart(carry_0.x, x))
+        size = jnp.linalg.norm(parts.plant.local_coordinates(carry_0.x, x))
         return (linear.Carry(x, acting, computer, model), sent), jnp.log(size)
 
     sent = jnp.broadcast_to(base, (260, base.size))
@@ -186,7 +186,7 @@ def test_the_nominal_run_is_the_one_that_flies(kind):
     parts = linear.quiet(scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts)
     log = rollout.simulate_jit(parts, record=True).log
     run = linear.nominal_jit(parts)
-    sizes = jax.jit(jax.vmap(parts.plant.apart))(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
+    sizes = jax.jit(jax.vmap(parts.plant.local_coordinates))(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
     np.testing.assert_allclose(sizes, 0.0, atol=1e-11)  # rounding, in rad and rad/s of order 1
 
 
