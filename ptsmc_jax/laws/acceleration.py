@@ -1,7 +1,7 @@
-"""Laws that say which acceleration of the error they want; what input brings it about, the error's motion knows.
+"""Laws written for the error's acceleration, eps'' = a + d: the error's motion turns a into the plant's input.
 
-Each is written once, for eps'' = a + d, whatever the plant: `on` makes it the law of a spacecraft's error quaternion,
-of a chain or of a system of one's own. They fly in the sampled loop.
+Each is written once, whatever the plant: `law_on_error` makes it the law of a spacecraft's error quaternion, of a chain
+or of a system of one's own. They fly in the sampled loop.
 """
 
 import functools
@@ -21,9 +21,10 @@ Vector = Float[Array, " m"]
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """A law of the error's motion eps'' = a + d, all (m,), where what is left of d is at most `bound` in 2-norm.
+    """A law for the error's motion eps'' = a + d, all (m,), which chooses a.
 
-    bound is N K2 / 2 of `base.SecondOrder`: what the disturbance observer leaves, or the whole disturbance.
+    `bound` limits the 2-norm of what is not estimated of d. It is N K2 / 2 of `base.SecondOrderLaw`: what the
+    disturbance observer leaves, or the whole disturbance where there is none.
     """
 
     model: Any  # the nominal plant
@@ -31,15 +32,22 @@ class AccelerationLaw(Law):
     delta: Leaf  # a sample of the anchored clock falls on t_f - delta [s]
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """The acceleration a that it wants and its sliding variable, (m,) each; of a law without a memory."""
+        """The acceleration a and the sliding variable, (m,) each, of a law that remembers nothing.
+
+        Args:
+            now: when; `now.t` [s], `now.hold`, `now.dt` [s].
+            error: eps, (m,).
+            error_rate: eps' [1/s], (m,).
+            bound: on the disturbance that is not estimated, in the units of a.
+        """
         raise NotImplementedError
 
     def step(
         self, memory: Any, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
     ) -> tuple[Vector, Vector, Any]:
-        """The same, (m,) each, with what the law remembers: from `begin`, or from the sample before; and from then on.
+        """The same for a law that remembers something, with its memory for the next sample.
 
-        The memory keeps its shapes and types.
+        memory: from `begin`, or from the sample before; it keeps its shapes and types.
         """
         a, s = self.acceleration(now, error, error_rate, bound)
         return a, s, memory
@@ -47,7 +55,7 @@ class AccelerationLaw(Law):
     def command(
         self, memory: Any, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector, Any]:
-        """Input (m,) for the acceleration that the law wants, its sliding variable and its memory."""
+        """Input (m,) that brings the law's acceleration about, its sliding variable and its memory."""
         error, error_rate = self.errors(x, target)
         a, s, memory = self.step(memory, now, error, error_rate, 0.5 * self.influence(x, target) * k2)
         return self.invert(x, target, 2.0 * a, d_hat), s, memory
@@ -55,25 +63,22 @@ class AccelerationLaw(Law):
 
 @dataclass(frozen=True)
 class SlidingLaw(AccelerationLaw):
-    """One that switches against what is left of the disturbance: a = equivalent - bound sign(s)."""
+    """A law that switches against the disturbance that is not estimated: a = equivalent - bound sign(s)."""
 
     def surface(self, error: Vector, error_rate: Vector) -> tuple[Vector, Vector]:
-        """Sliding variable s, and what the law wants of eps'' but for what switches, (m,) each."""
+        """Sliding variable s, and the equivalent acceleration, a without its switching term, (m,) each."""
         raise NotImplementedError
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """As the class says."""
         s, equivalent = self.surface(error, error_rate)
-        return equivalent - bound * self.sign(s), s
-
-    def sign(self, s: Vector) -> Vector:
-        """Smooth sign tanh(s / sign_width) [-]; the exact one for a width of 0."""
-        return guards.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
+        sign = guards.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
+        return equivalent - bound * sign, s
 
 
 @functools.cache
-def on(motion: type[ErrorMotion], law: type[Law]) -> type[Law]:
-    """The law on this error: a class with the law's fields."""
-    made = type(f"{law.__name__}On{motion.__name__}", (law, motion), {"__module__": law.__module__})
-    made.__doc__ = law.__doc__
-    return pytree(dataclass(frozen=True)(made))
+def law_on_error(motion: type[ErrorMotion], law: type[Law]) -> type[Law]:
+    """The law on an error: a class with the law's fields and the error's motion."""
+    combined = type(f"{law.__name__}On{motion.__name__}", (law, motion), {"__module__": law.__module__})
+    combined.__doc__ = law.__doc__
+    return pytree(dataclass(frozen=True)(combined))

@@ -18,7 +18,7 @@ Vector = Float[Array, " m"]
 
 
 class SurfaceGains(NamedTuple):
-    """What both phases of the law share: s = c eps' + e eps, desired 2 eps'' = -a eps' - b s - switching."""
+    """Gains that both phases of the law have: s = c eps' + e eps, desired 2 eps'' = -a eps' - b s - switching."""
 
     c: Array  # [s] before the hand-over, [-] after
     e: Array  # [-] before the hand-over, [1/s] after
@@ -27,7 +27,7 @@ class SurfaceGains(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What a plant does where its error moves in a given way."""
+    """The motion of a plant whose error moves as prescribed."""
 
     x: Any  # state
     w_dot: Array  # (m,) derivative of its velocity
@@ -58,7 +58,16 @@ class Law(ErrorMotion):
     def torque(
         self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector]:
-        """Commanded input (m,) and sliding variable; d_hat: estimated disturbance, k2: K2, bound on its error."""
+        """Commanded input (m,) and sliding variable (m,).
+
+        Args:
+            t: time [s].
+            hold: whether it is after the hand-over.
+            x: state, as it is measured.
+            target: of the reference at t.
+            d_hat: estimated disturbance, (m,).
+            k2: K2, bound on the 2-norm of its error.
+        """
         raise NotImplementedError
 
     def begin(self) -> Any:
@@ -70,7 +79,7 @@ class Law(ErrorMotion):
     ) -> tuple[Vector, Vector, Any]:
         """The same as `torque` in the sampled loop, for laws that remember something, or look at the period ahead.
 
-        Commanded input (m,), sliding variable, and the memory that the next sample finds.
+        Commanded input (m,), sliding variable, and the memory for the next sample.
         """
         u, s = self.torque(now.t, now.hold, x, target, d_hat, k2)
         return u, s, memory
@@ -86,14 +95,14 @@ class Law(ErrorMotion):
 
 
 @dataclass(frozen=True)
-class Prescribed(Law):
-    """What the paper's laws share: gains, and a hand-over at t_f - delta (Remark 1).
+class PrescribedTimeLaw(Law):
+    """Base of the paper's laws: their gains, and the hand-over at t_f - delta (Remark 1).
 
     The paper's proofs call on LaSalle after t_f, but the system is not autonomous; V' <= -2 K1 V with V(t_f) = 0 is
     enough, and with delta > 0 V(t_f) is only small.
     """
 
-    model: Any
+    model: Any  # the nominal plant
     t_f: Leaf
     eta: Leaf  # eta > 2, and greater than the order of a chain [-]
     delta: Leaf
@@ -105,8 +114,10 @@ class Prescribed(Law):
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
     prescribed: ClassVar[bool] = True
 
-    def landing(self, now: Sample, s: Vector, handed: Vector, power: Scalar, rate: Scalar, switching: Scalar) -> Vector:
-        """Where s is to be at the end of the period that begins, implicit (backward Euler) sampling; (m,).
+    def landing(
+        self, now: Sample, s: Vector, at_hand_over: Vector, power: Scalar, rate: Scalar, switching: Scalar
+    ) -> Vector:
+        """The s (m,) at which implicit (backward Euler) sampling aims for the end of the period that begins.
 
         Where the law in continuous time would bring it, r^power s before the hand-over and e^(-rate h) s after it, and
         from there toward zero by what the switching term can do in the period, k = `switching`: s+ = target - k
@@ -114,9 +125,11 @@ class Prescribed(Law):
         sliding-mode control with state observer and disturbance rejection, IEEE Trans. Automatic Control 57(5), 2012.
         There is no boundary layer to choose, and no border for delta.
 
-        The s is that of the period's end. In a period that the hand-over ends it is the hold's, and lands at `handed`.
+        The surface is that of the period's end. In a period that the hand-over ends it is the hold's, where s is to be
+        `at_hand_over`.
         """
-        before = jnp.where(self.in_hold(now.t, now.t + now.dt, now.hold), handed, self.share(now) ** power * s)
+        ends_in_hold = self.in_hold(now.t, now.t + now.dt, now.hold)
+        before = jnp.where(ends_in_hold, at_hand_over, self.remaining_share(now) ** power * s)
         target = jnp.where(now.hold, jnp.exp(-rate * now.dt) * s, before)
         # slope 1 where there is nothing to switch against, at rest too
         return jnp.where(jnp.abs(target) < switching, 0.0, target - switching * jnp.sign(target))
@@ -127,8 +140,11 @@ class Prescribed(Law):
             return hold
         return hold | (t_next > self.hand_over - 1e-6 * (t_next - t))  # rounding must not cost a period
 
-    def share(self, now: Sample) -> Scalar:
-        """What of the time to t_f is left at the end of the period that begins [-]; 1 in hold. Never quite nothing."""
+    def remaining_share(self, now: Sample) -> Scalar:
+        """Share r of the time to t_f that is left at the end of the period that begins [-]; 1 in hold.
+
+        At least 1e-9 of a period is left: powers of r, and what is divided by them, stay finite.
+        """
         left = jnp.where(now.hold, 1.0, self.t_f - now.t)
         return jnp.where(now.hold, 1.0, jnp.maximum(left - now.dt, 1e-9 * now.dt) / left)
 
@@ -140,17 +156,17 @@ class Prescribed(Law):
         raise NotImplementedError
 
     def exact_motion(self, t: Scalar, target: Any, start: Any, errors: Float[Array, "m n"]) -> Motion:
-        """What the plant does then; target: at t, start: the initial state, errors: its `derivatives`."""
+        """The plant's motion at t in `exact`; target: at t, start: the initial state, errors: its `derivatives`."""
         raise NotImplementedError
 
-    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
         """Factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
 
-        visited: targets (points,) and states (points, ..) of a run, where it depends on them.
+        visited: targets (points,) and states (points, ..) of a run, for a law whose factor depends on them.
         """
         raise NotImplementedError
 
-    def boundary_layer(self, k2: Scalar, visited: Any = None) -> tuple[Scalar, Scalar]:
+    def boundary_layer(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> tuple[Scalar, Scalar]:
         """Fastest rate of the smooth sign's boundary layer before and after the hand-over [1/s], for K2 up to k2."""
         after = self.switching_rate(k2, visited) / self.sign_width
         return self.t_f ** (self.order - 1) * after, after
@@ -165,12 +181,12 @@ class Prescribed(Law):
 
     def hold_rates(self) -> dict[str, float]:
         """Fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
-        on = float(np.max(np.abs(formulas.surface_roots(self.surface()))))
-        return {"k1": float(self.reaching_rate()), "surface_rate": on}
+        fastest_root = float(np.max(np.abs(formulas.surface_roots(self.surface()))))
+        return {"k1": float(self.reaching_rate()), "surface_rate": fastest_root}
 
 
 @dataclass(frozen=True)
-class SecondOrder(Prescribed):
+class SecondOrderLaw(PrescribedTimeLaw):
     """The law of an error vector eps whose second derivative the input sets: (29), of which (57) and (60) are a case.
 
     s = tau eps' + eta eps and 2 eps'' = -2 (eta-1) eps'/tau - 2 eta s/tau^2 - N K2 sign(s) before the hand-over (26),
@@ -197,13 +213,13 @@ class SecondOrder(Prescribed):
 
     def exact(self, t: Scalar, start: Float[Array, "m 2"]) -> tuple[Vector, Vector]:
         """The error [-] and s, (m,) each."""
-        found = exact_error(t, self.t_f, self.eta, start[:, 0], start[:, 1])
-        return found.error, found.s
+        exact = exact_error(t, self.t_f, self.eta, start[:, 0], start[:, 1])
+        return exact.error, exact.s
 
     def exact_motion(self, t: Scalar, target: Any, start: Any, errors: Float[Array, "m 2"]) -> Motion:
         """State and w' by `motion`, for the error and derivatives of the closed form."""
-        wanted = exact_error(t, self.t_f, self.eta, errors[:, 0], errors[:, 1])
-        return self.motion(target, start, wanted.error, wanted.error_rate, wanted.acceleration)
+        exact = exact_error(t, self.t_f, self.eta, errors[:, 0], errors[:, 1])
+        return self.motion(target, start, exact.error, exact.error_rate, exact.acceleration)
 
     def motion(self, target: Any, start: Any, error: Vector, error_rate: Vector, acceleration: Vector) -> Motion:
         """State and w' for which the error and its derivatives are these; start: the initial state, for branches."""
@@ -222,33 +238,31 @@ class SecondOrder(Prescribed):
     def torque(
         self, t: Scalar, hold: Bool[Array, ""], x: Any, target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector]:
-        """Commanded input by the law above before and after the hand-over, and the sliding variable.
-
-        d_hat: estimated disturbance; k2: K2, bound on the 2-norm of its error.
-        """
+        """Commanded input by the law above before and after the hand-over, and the sliding variable."""
         gains = self.gains(t, hold)
         error, error_rate = self.errors(x, target)
         s = gains.c * error_rate + gains.e * error
         switching = self.influence(x, target) * k2 * guards.smooth_sign(s, self.sign_width)
-        wanted = -switching - gains.a * error_rate - gains.b * s
-        return self.invert(x, target, wanted, d_hat), s
+        twice_acceleration = -switching - gains.a * error_rate - gains.b * s
+        return self.invert(x, target, twice_acceleration, d_hat), s
 
     def command(
         self, memory: Any, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector, Any]:
-        """`torque`, or with implicit sampling the input that lands s where `landing` says: s+ = s_0 + g eps''."""
+        """`torque`, or with implicit sampling the input that brings s to `landing`: s+ = s_0 + g eps''."""
         if not self.implicit:
             return super().command(memory, now, x, target, d_hat, k2)
-        h, share, here = now.dt, self.share(now), self.gains(now.t, now.hold)
-        over = self.in_hold(now.t, now.t + h, now.hold)
-        end = self.gains(now.t + h, over)
+        h, r = now.dt, self.remaining_share(now)
+        start = self.gains(now.t, now.hold)
+        ends_in_hold = self.in_hold(now.t, now.t + h, now.hold)
+        end = self.gains(now.t + h, ends_in_hold)
         error, error_rate = self.errors(x, target)
-        s = here.c * error_rate + here.e * error
-        s_0 = end.c * error_rate + end.e * (error + h * error_rate)
+        s = start.c * error_rate + start.e * error
+        s_0 = end.c * error_rate + end.e * (error + h * error_rate)  # at the end, without acceleration
         g = h * end.c + end.e * h**2 / 2.0
-        # s = 0 before the hand-over: eps falls like r^eta. What the hold is given hangs on a rate that is measured, not
-        # on eta / delta times the noise of an attitude
-        handed = share ** (self.eta - 1.0) * (error_rate + self.surface_rate * share * error)
+        # Before the hand-over s = 0 lets eps fall like r^eta. The s handed over is made of the measured rate, not of
+        # eta / delta times an attitude, whose noise that would multiply
+        at_hand_over = r ** (self.eta - 1.0) * (error_rate + self.surface_rate * r * error)
         switching = g * 0.5 * self.influence(x, target) * k2
-        landed = self.landing(now, s, handed, self.eta, 0.5 * self.reaching_gain(), switching)
-        return self.invert(x, target, 2.0 * (landed - s_0) / g, d_hat), s, memory
+        s_end = self.landing(now, s, at_hand_over, self.eta, 0.5 * self.reaching_gain(), switching)
+        return self.invert(x, target, 2.0 * (s_end - s_0) / g, d_hat), s, memory

@@ -64,9 +64,7 @@ def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
 def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
     """y, y', .. y^(n) of y = x_1 / r^eta at t [s]: what the initial state (n,) gives, and what s(0) = 1 adds."""
     n, tau = x0.shape[0], t_f - t
-    rising = [jnp.ones_like(eta)]
-    for k in range(n):
-        rising.append(rising[-1] * (eta + k))
+    rising = _rising_factorials(eta, n)
     start = [
         sum((math.comb(k, j) * x0[j] * rising[k - j] * t_f ** (j - k) for j in range(k + 1)), jnp.zeros_like(t))
         for k in range(n - 1)
@@ -106,7 +104,13 @@ def expansion(eta: Scalar, order: int) -> list[Scalar]:
 
     The paper only calls them expansion parameters (and says "expand (35)" for (36)). Order 2: (eta, 1), which is (7).
     """
-    rising = [jnp.ones_like(eta)]
-    for k in range(order - 1):
-        rising.append(rising[-1] * (eta + k))
+    rising = _rising_factorials(eta, order - 1)
     return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
+
+
+def _rising_factorials(eta: Scalar, largest: int) -> list[Scalar]:
+    """1, eta, eta (eta+1), .. eta (eta+1) .. (eta+largest-1)."""
+    rising = [jnp.ones_like(eta)]
+    for k in range(largest):
+        rising.append(rising[-1] * (eta + k))
+    return rising

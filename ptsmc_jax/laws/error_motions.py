@@ -1,9 +1,9 @@
 """The errors that laws drive to zero, each with how inputs and disturbances move it: eps'' = .. + (gain) u + .. d.
 
-A law knows one of these; what it wants of eps'' is turned into the plant's input.
+A law has one of them as a base, which turns the eps'' that it asks for into the plant's input.
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,7 +30,7 @@ class ErrorMotion:
     additive: ClassVar[bool] = False  # the paper's q_1 - q_1f, singular where the body is, wherever the reference is
 
     def align(self, x: Any, target: Any) -> Any:
-        """The initial state in the form that the law can bring to the target."""
+        """The initial state in the form that the law can bring to the target, such as the sign of a quaternion."""
         return x
 
     def clearance(self, x: Any, target: Any) -> Scalar:
@@ -38,11 +38,11 @@ class ErrorMotion:
         return jnp.ones(())
 
     def clearance_unit(self, first: Scalar) -> Scalar:
-        """What a run divides clearances by, from that of its initial state: its sign, so that it begins above 0."""
+        """The unit of a run's clearances, from that of its initial state: its sign, so that they begin above 0."""
         return jnp.where(first < 0.0, -1.0, 1.0)
 
     def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
-        """What is driven to zero, (m,), and its derivative."""
+        """The error that is driven to zero, (m,), and its derivative [1/s]."""
         raise NotImplementedError
 
     def derivatives(self, x: Any, target: Any) -> Float[Array, "m n"]:
@@ -50,22 +50,22 @@ class ErrorMotion:
         return jnp.stack(self.errors(x, target), axis=1)
 
     def angle(self, x: Any, target: Any) -> Scalar:
-        """What settles: the angle to the reference [rad], for other plants |x_1|."""
+        """The scalar that settles: the angle to the reference [rad], for other plants |x_1|."""
         raise NotImplementedError
 
     def influence(self, x: Any, target: Any) -> Scalar:
-        """The factor N, what a unit of disturbance does to 2 eps'' at most."""
+        """The factor N: how much a unit of disturbance changes 2 eps'' at most."""
         raise NotImplementedError
 
-    def invert(self, x: Any, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
-        """Input (m,) for which 2 eps'' is `wanted` if the disturbance is d_hat."""
+    def invert(self, x: Any, target: Any, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+        """Input (m,) for which 2 eps'' is `twice_acceleration`, (m,), if the disturbance is d_hat, (m,)."""
         raise NotImplementedError
 
-    def straight(self, error: Vector) -> Vector:
-        """The error (m,) in coordinates in which the plain way to zero is a straight line; they vanish with it."""
+    def straight_coordinates(self, error: Vector) -> Vector:
+        """The error (m,) in coordinates in which the shortest path to zero is a straight line; they vanish with it."""
         return error
 
-    def error_at(self, straight: Vector) -> Vector:
+    def from_straight_coordinates(self, straight: Vector) -> Vector:
         """The error (m,) where those coordinates are these."""
         return straight
 
@@ -99,12 +99,20 @@ class ErrorVector(ErrorMotion):
         """|T J^-1| of (57) [1/(kg m^2)]."""
         return guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
 
-    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 eps_1'' = wanted [1/s^2]: w x J w - d_hat + J T^-1 (wanted + 2 q_1f'' - T' w)."""
+    def invert(self, x: AttitudeState, target: Target, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 eps_1'' = `twice_acceleration`: w x J w - d_hat + J T^-1 (2 eps_1'' + 2 q_1f'' - T' w)."""
         _, reference_acceleration = target.vector_rates()
         t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
-        turned = attitude.t_inverse_times(x.q, wanted + 2.0 * reference_acceleration - t_dot_w)
+        turned = attitude.t_inverse_times(x.q, twice_acceleration + 2.0 * reference_acceleration - t_dot_w)
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
+
+
+class RelativeMotion(NamedTuple):
+    """Motion of the body relative to its reference; R rotates from the reference's axes to the body's."""
+
+    q_e: Array  # (4,) error quaternion q_f* q [-]
+    w_e: Array  # (3,) w - R w_f [rad/s]
+    feedforward: Array  # (3,) (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]
 
 
 class ErrorQuaternion(ErrorMotion):
@@ -128,17 +136,17 @@ class ErrorQuaternion(ErrorMotion):
         """Angle between the attitude and its reference [rad]."""
         return attitude.angle(x.q, target.q)
 
-    def relative(self, x: AttitudeState, target: Target) -> tuple[Array, Vector, Vector, Vector]:
-        """The relative motion: q_e [-], w_e and R w_f [rad/s], (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]."""
+    def relative(self, x: AttitudeState, target: Target) -> RelativeMotion:
+        """The motion of the body relative to its reference."""
         q_e = attitude.multiply(attitude.conjugate(target.q), x.q)
-        back = attitude.conjugate(q_e)
-        carried = attitude.rotate(back, target.w)
-        w_e = x.w - carried
-        return q_e, w_e, carried, attitude.rotate(back, target.w_dot) - jnp.cross(w_e, carried)
+        to_body = attitude.conjugate(q_e)
+        w_f = attitude.rotate(to_body, target.w)
+        w_e = x.w - w_f
+        return RelativeMotion(q_e, w_e, attitude.rotate(to_body, target.w_dot) - jnp.cross(w_e, w_f))
 
     def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
         """The vector part v [-] and its derivative [1/s]."""
-        q_e, w_e, _, _ = self.relative(x, target)
+        q_e, w_e, _ = self.relative(x, target)
         v_dot, _ = attitude.vector_rates(q_e, w_e, jnp.zeros(3))
         return q_e[:3], v_dot
 
@@ -147,17 +155,17 @@ class ErrorQuaternion(ErrorMotion):
         q_e, *_ = self.relative(x, target)
         return guards.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
 
-    def invert(self, x: AttitudeState, target: Target, wanted: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 v'' = wanted [1/s^2]."""
-        q_e, w_e, _, feedforward = self.relative(x, target)
-        turned = attitude.t_inverse_times(q_e, wanted + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+    def invert(self, x: AttitudeState, target: Target, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for 2 v'' = `twice_acceleration` [1/s^2]; see `PrescribedTimeMultiplicative`."""
+        q_e, w_e, feedforward = self.relative(x, target)
+        turned = attitude.t_inverse_times(q_e, twice_acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
 
-    def straight(self, error: Vector) -> Vector:
+    def straight_coordinates(self, error: Vector) -> Vector:
         """The rotation vector of q_e [rad]: a straight line is a rotation about the eigenaxis."""
         return attitude.rotation_vector(error)
 
-    def error_at(self, straight: Vector) -> Vector:
+    def from_straight_coordinates(self, straight: Vector) -> Vector:
         """The vector part of the rotation's quaternion [-]."""
         return attitude.from_rotation_vector(straight)[:3]
 
@@ -188,11 +196,14 @@ class ErrorOfSystem(ErrorMotion):
         """2 |dF/dx2 D|."""
         return 2.0 * guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
 
-    def invert(self, x: State, target: Scalar, wanted: Vector, d_hat: Vector) -> Vector:
-        """Input (n,) for 2 x_1'' = wanted: (dF/dx2 G)^-1 (wanted/2 - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
+    def invert(self, x: State, target: Scalar, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+        """Input (n,) for this x_1'': (dF/dx2 G)^-1 (x_1'' - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
-        pushed = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
-        return matrices.solve(slope @ gain, 0.5 * wanted - self.model.coasting_acceleration(target, x) - slope @ pushed)
+        without_input = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
+        return matrices.solve(
+            slope @ gain,
+            0.5 * twice_acceleration - self.model.coasting_acceleration(target, x) - slope @ without_input,
+        )
 
 
 class ErrorOfChain(ErrorMotion):
@@ -216,6 +227,6 @@ class ErrorOfChain(ErrorMotion):
         """2."""
         return 2.0 * jnp.ones(())
 
-    def invert(self, x: State, target: Any, wanted: Vector, d_hat: Vector) -> Vector:
-        """Input (1,) for 2 x_1'' = wanted: (wanted/2 - f(x) - d_hat) / g(x)."""
-        return (0.5 * wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+    def invert(self, x: State, target: Any, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+        """Input (1,) for this x_1'': (x_1'' - f(x) - d_hat) / g(x)."""
+        return (0.5 * twice_acceleration - self.model.drift(x) - d_hat) / self.model.input_gain(x)

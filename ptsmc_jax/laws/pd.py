@@ -42,7 +42,7 @@ class QuaternionPD(ErrorQuaternion, Law):
         self, t: Scalar, hold: Bool[Array, ""], x: AttitudeState, target: Target, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector]:
         """Torque [N m], and v + (k_d/k_p) w_e, which it drives to zero, (3,) each."""
-        q_e, w_e, _, feedforward = self.relative(x, target)
+        q_e, w_e, feedforward = self.relative(x, target)
         known = feedforward - self.k_p * q_e[:3] - self.k_d * w_e
         u = self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ known
         return u, q_e[:3] + self.k_d / self.k_p * w_e

@@ -46,10 +46,10 @@ class PredefinedTime(AccelerationLaw):
         s = error_rate + guards.signed_root(squares, jnp.zeros_like(bound))
         size = jnp.abs(error)
         # Phi_1 Phi_1' as a product without a negative power, which at zero would have no value; |x|^0 of q1 = 1/2 is 1
-        grown = guards.signed_power(size, 2.0 * self.q1)
-        none = (size == 0.0) & (self.q1 >= 0.5)
-        rest = size + jnp.where(none, 1.0, guards.signed_power(size, 1.0 - 2.0 * self.q1))
+        power = guards.signed_power(size, 2.0 * self.q1)
+        at_zero = (size == 0.0) & (self.q1 >= 0.5)
+        quotient = size + jnp.where(at_zero, 1.0, guards.signed_power(size, 1.0 - 2.0 * self.q1))
         factor = (jnp.pi / (2.0 * self.q1 * first)) ** 2
-        turning = factor * ((1.0 + self.q1) * grown + 1.0 - self.q1) * rest
-        switching = (bound + 2.0 * turning) * guards.smooth_sign(s, self.sign_width)
+        phi_slope = factor * ((1.0 + self.q1) * power + 1.0 - self.q1) * quotient
+        switching = (bound + 2.0 * phi_slope) * guards.smooth_sign(s, self.sign_width)
         return -phi(s, self.q2, second) - switching, s

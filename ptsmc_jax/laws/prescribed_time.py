@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax.laws.base import Motion, Prescribed, Sample, SecondOrder
+from ptsmc_jax.laws.base import Motion, PrescribedTimeLaw, Sample, SecondOrderLaw
 from ptsmc_jax.laws.closed_forms import exact_chain, expansion
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
 from ptsmc_jax.numerics import attitude, guards, matrices
@@ -27,7 +27,7 @@ State = Float[Array, " twice"]
 
 
 @dataclass(frozen=True)
-class _Attitude(SecondOrder):
+class _Attitude(SecondOrderLaw):
     """What both laws for a spacecraft share: K1 acts with an effective gain of K1/2 in (60)."""
 
     model: Spacecraft  # the nominal plant
@@ -36,7 +36,7 @@ class _Attitude(SecondOrder):
         """K1 of (60) [1/s]: half of what (29)'s K1 does."""
         return self.k1
 
-    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
         """|T J^-1| K2 / 2 at most: |T|_2 = 1 for a unit quaternion."""
         return 0.5 * guards.norm(self.model.inertia_inverse) * k2
 
@@ -46,13 +46,13 @@ class _Attitude(SecondOrder):
 class PrescribedTime(ErrorVector, _Attitude):
     """Disturbance-observer based law on the additive error eps_1 = q_1 - q_1f (4), handed over at t_f - delta.
 
-    (56), (57) before and (59), (60) after the hand-over. Besides what `SecondOrder` says: `T` of (1) is both torque and
-    matrix and q both quaternion and its scalar, here the torque is u and the scalar q4. The law is singular at q4 = 0,
-    180 degrees from the inertial frame's identity wherever the reference is, and cannot cross it: `align` chooses the
-    sign of q, `clearance` says how far away the singularity is. So "bounded control" is not global: the bound grows
-    like 1/q4. Between attitudes on either side of the identity the path leads past it, which may be the long way round:
-    from 150 to -150 degrees about an axis the body turns by 300 degrees. After the hand-over nothing stays "at the
-    origin": the rates are c (`surface_rate`, 1 1/s in the paper) and K1/2.
+    (56), (57) before and (59), (60) after the hand-over. Differences from the paper, besides those of `SecondOrderLaw`:
+    `T` of (1) is both torque and matrix and q both quaternion and its scalar, here the torque is u and the scalar q4.
+    The law is singular at q4 = 0, 180 degrees from the inertial frame's identity wherever the reference is, and cannot
+    cross it: `align` chooses the sign of q, `clearance` says how far away the singularity is. So "bounded control" is
+    not global: the bound grows like 1/q4. Between attitudes on either side of the identity the path leads past it,
+    which may be the long way round: from 150 to -150 degrees about an axis the body turns by 300 degrees. After the
+    hand-over nothing stays "at the origin": the rates are c (`surface_rate`, 1 1/s in the paper) and K1/2.
     """
 
     def motion(
@@ -87,16 +87,15 @@ class PrescribedTimeMultiplicative(ErrorQuaternion, _Attitude):
         q_e, square = attitude.from_vector_part(error, jnp.ones_like(self.t_f))
         w_e = 2.0 * attitude.t_inverse_times(q_e, error_rate)
         q = attitude.multiply(target.q, q_e)
-        carried = attitude.rotate(attitude.conjugate(q_e), target.w)
-        x = AttitudeState(q, w_e + carried)
-        _, _, _, feedforward = self.relative(x, target)
+        w_f = attitude.rotate(attitude.conjugate(q_e), target.w)
+        x = AttitudeState(q, w_e + w_f)
         turning = attitude.t_inverse_times(q_e, 2.0 * acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
-        return Motion(x, feedforward + turning, square)
+        return Motion(x, self.relative(x, target).feedforward + turning, square)
 
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
+class PrescribedTimeSystem(ErrorOfSystem, SecondOrderLaw):
     """Law (29) for a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation.
 
     x_1 is the error, so F may know the time: a moving reference is part of it. dF/dx2 G must be invertible along the
@@ -119,15 +118,16 @@ class PrescribedTimeSystem(ErrorOfSystem, SecondOrder):
         w_dot = matrices.solve(self.model.slope(target, x), acceleration - self.model.coasting_acceleration(target, x))
         return Motion(x, w_dot, self.clearance(x, target))
 
-    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
         """|dF/dx2 D| K2, the largest over the states that are visited."""
+        assert visited is not None
         times, states = visited
         return 0.5 * jnp.max(jax.vmap(self.influence)(states, times)) * k2
 
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeChain(ErrorOfChain, Prescribed):
+class PrescribedTimeChain(ErrorOfChain, PrescribedTimeLaw):
     """Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
 
     For order 2 it is (24) on (6). Differences from the paper: its sums of (38), (40) and (52) run to n-1, but x_(n+1)
@@ -150,44 +150,39 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
     ) -> tuple[Vector, Vector]:
         """Input (1,) by the first branch of (52) before and the second after the hand-over, and s (37), (39), (1,).
 
-        d_hat: estimated disturbance; k2: bound on its error, K where nothing is estimated.
+        k2: bound on the error of d_hat, K where nothing is estimated.
         """
         n = self.order
         tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
         c = expansion(self.eta, n)
         a = self.surface()
-        weights = [jnp.where(hold, held, c[i] * tau**i) for i, held in enumerate([*a, 1.0])]
-        s = jnp.dot(jnp.stack(weights), x)
+        s = jnp.dot(_surface_weights(c, [*a, 1.0], tau, hold), x)
         rates = [jnp.where(hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
         reaching = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
-        known = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
-        wanted = -known - k2 * guards.smooth_sign(s, self.sign_width)
-        u = (wanted - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+        equivalent = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
+        x_n_dot = -equivalent - k2 * guards.smooth_sign(s, self.sign_width)
+        u = (x_n_dot - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, jnp.reshape(s, 1)
 
     def command(
         self, memory: Any, now: Sample, x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar
     ) -> tuple[Vector, Vector, Any]:
-        """`torque`, or with implicit sampling the input (1,) that lands s where `landing` says: s+ = s_0 + g x_n'."""
+        """`torque`, or with implicit sampling the input (1,) that brings s to `landing`: s+ = s_0 + g x_n'."""
         if not self.implicit:
             return super().command(memory, now, x, target, d_hat, k2)
-        n, h, c, share = self.order, now.dt, expansion(self.eta, self.order), self.share(now)
-        ends = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
+        n, h, c, r = self.order, now.dt, expansion(self.eta, self.order), self.remaining_share(now)
+        # the states at the end of the period are drifted + x_n' pushed: Taylor's series of a chain
+        drifted = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
         pushed = jnp.stack([h ** (n - i) / math.factorial(n - i) for i in range(n)])
-        held, left = [*self.surface(), 1.0], jnp.where(now.hold, 1.0, self.t_f - now.t)
-
-        def weights(tau: Scalar, hold: Bool[Array, ""]) -> Float[Array, " n"]:
-            return jnp.stack([jnp.where(hold, held[i], c[i] * tau**i) for i in range(n)])
-
-        after = weights(share * left, self.in_hold(now.t, now.t + h, now.hold))
-        falls = [held[i] * share ** (self.eta - i) * x[i] for i in range(n)]  # on s = 0, x_1 like r^eta
-        s, s_0, handed = (
-            jnp.reshape(v, 1)
-            for v in (jnp.dot(weights(left, now.hold), x), jnp.dot(after, jnp.stack(ends)), sum(falls))
-        )
-        g = jnp.dot(after, pushed)
-        landed = self.landing(now, s, handed, self.eta + n - 2, self.k1, g * k2)
-        u = ((landed - s_0) / g - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+        a, left = [*self.surface(), 1.0], jnp.where(now.hold, 1.0, self.t_f - now.t)
+        weights_end = _surface_weights(c, a, r * left, self.in_hold(now.t, now.t + h, now.hold))
+        # before the hand-over s = 0 lets x_1 fall like r^eta
+        at_hand_over = jnp.reshape(sum(a[i] * r ** (self.eta - i) * x[i] for i in range(n)), 1)
+        s = jnp.reshape(jnp.dot(_surface_weights(c, a, left, now.hold), x), 1)
+        s_0 = jnp.reshape(jnp.dot(weights_end, jnp.stack(drifted)), 1)
+        g = jnp.dot(weights_end, pushed)
+        s_end = self.landing(now, s, at_hand_over, self.eta + n - 2, self.k1, g * k2)
+        u = ((s_end - s_0) / g - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, s, memory
 
     def exact(self, t: Scalar, start: Float[Array, "1 n"]) -> tuple[Vector, Vector]:
@@ -200,7 +195,7 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         motion = exact_chain(t, self.t_f, self.eta, errors[0])
         return Motion(motion.x, jnp.reshape(motion.acceleration, 1), jnp.ones_like(t))
 
-    def switching_rate(self, k2: Scalar, visited: Any = None) -> Scalar:
+    def switching_rate(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
         """K2."""
         return k2
 
@@ -208,3 +203,8 @@ class PrescribedTimeChain(ErrorOfChain, Prescribed):
         """a_i c^(n-i) [1/s^(n-i)]: time runs c times as fast on the surface."""
         n = self.order
         return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])
+
+
+def _surface_weights(c: list[Scalar], a: list, tau: Scalar, hold: Bool[Array, ""]) -> Float[Array, " n"]:
+    """Weights of a chain's states in s: a where `hold` (39), else c_i tau^i (37), tau = t_f - t [s]."""
+    return jnp.stack([jnp.where(hold, a[i], c[i] * tau**i) for i in range(len(c))])

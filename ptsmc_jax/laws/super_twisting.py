@@ -37,8 +37,8 @@ class SuperTwisting(AccelerationLaw):
     def step(
         self, memory: Vector, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
     ) -> tuple[Vector, Vector, Vector]:
-        """As the class says, (m,) each; what is left of the disturbance is v's to find, whatever its bound."""
+        """As the class says, (m,) each; `bound` is not used: v finds the disturbance."""
         s = error_rate + self.surface_rate * error
-        pulled = 1.5 * jnp.sqrt(self.lipschitz) * guards.signed_root(s, self.sign_width)
-        a = memory - self.surface_rate * error_rate - pulled
+        root = 1.5 * jnp.sqrt(self.lipschitz) * guards.signed_root(s, self.sign_width)
+        a = memory - self.surface_rate * error_rate - root
         return a, s, memory - now.dt * 1.1 * self.lipschitz * guards.smooth_sign(s, self.sign_width)

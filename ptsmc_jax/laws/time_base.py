@@ -19,13 +19,13 @@ Vector = Float[Array, " m"]
 class Start(NamedTuple):
     """Where a profile begins."""
 
-    known: Scalar  # 1.0 from the first sample on, before it 0.0
-    straight: Vector  # the first error in the coordinates of `ErrorMotion.straight`
+    measured: Scalar  # 1.0 from the first sample on, before it 0.0
+    error: Vector  # the first error, in its `ErrorMotion.straight_coordinates`
     rate: Vector  # and its derivative [1/s]
 
 
 class Profile(NamedTuple):
-    """What an error is to follow, with its derivatives, (m,) each."""
+    """The error that is to be followed, with its derivatives, (m,) each."""
 
     error: Vector
     rate: Vector
@@ -45,17 +45,17 @@ class TimeBase(AccelerationLaw):
 
     def begin(self) -> Start:
         """Before the first sample the profile is not known."""
-        none = jnp.zeros(self.model.inputs)
-        return Start(jnp.zeros(()), none, none)
+        zero = jnp.zeros(self.model.inputs)
+        return Start(jnp.zeros(()), zero, zero)
 
     def profile(self, start: Start, t: Scalar) -> Profile:
         """The profile at t [s]."""
 
         def error(t: Scalar) -> Vector:
             x = jnp.minimum(t / self.t_f, 1.0)
-            place = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
-            moved = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
-            return self.error_at(place * start.straight + self.t_f * moved * start.rate)
+            of_error = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
+            of_rate = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
+            return self.from_straight_coordinates(of_error * start.error + self.t_f * of_rate * start.rate)
 
         def rates(t: Scalar) -> tuple[Vector, Vector]:
             return jax.jvp(error, (t,), (jnp.ones_like(t),))
@@ -63,19 +63,22 @@ class TimeBase(AccelerationLaw):
         (r, rate), (_, acceleration) = jax.jvp(rates, (t,), (jnp.ones_like(t),))
         return Profile(r, rate, acceleration)
 
-    def following(self, apart: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """Acceleration that brings what is apart from the profile to zero, and the sliding variable, (m,) each."""
+    def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Acceleration that brings the deviation E from the profile to zero, and the sliding variable, (m,) each.
+
+        rate: E' [1/s], (m,); bound: as in `AccelerationLaw`.
+        """
         raise NotImplementedError
 
     def step(
         self, memory: Start, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
     ) -> tuple[Vector, Vector, Start]:
-        """Acceleration of the profile and what follows it, (m,) each; remembers where the profile began."""
-        straight, rate = jax.jvp(self.straight, (error,), (error_rate,))
-        start = guards.select(memory.known > 0.5, memory, Start(jnp.ones_like(now.t), straight, rate))
-        wanted = self.profile(start, now.t)
-        a, s = self.following(error - wanted.error, error_rate - wanted.rate, bound)
-        return wanted.acceleration + a, s, start
+        """Acceleration of the profile with the feedback, and s, (m,) each; remembers where the profile began."""
+        straight, rate = jax.jvp(self.straight_coordinates, (error,), (error_rate,))
+        start = guards.select(memory.measured > 0.5, memory, Start(jnp.ones_like(now.t), straight, rate))
+        profile = self.profile(start, now.t)
+        a, s = self.feedback(error - profile.error, error_rate - profile.rate, bound)
+        return profile.acceleration + a, s, start
 
 
 @dataclass(frozen=True)
@@ -86,9 +89,9 @@ class TimeBasePD(TimeBase):
     k_d: Leaf  # [1/s]
     tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
 
-    def following(self, apart: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+    def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """As the class says, (m,) each."""
-        return -self.k_d * rate - self.k_p * apart, rate + self.k_p / self.k_d * apart
+        return -self.k_d * rate - self.k_p * deviation, rate + self.k_p / self.k_d * deviation
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ class TimeBaseSliding(TimeBase):
     sign_width: Leaf  # in the units of s
     tunable: ClassVar[tuple[str, ...]] = ("surface_rate", "k", "sign_width", "t_f")
 
-    def following(self, apart: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+    def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """As the class says, (m,) each."""
-        s = rate + self.surface_rate * apart
+        s = rate + self.surface_rate * deviation
         return -self.surface_rate * rate - self.k * s - bound * guards.smooth_sign(s, self.sign_width), s

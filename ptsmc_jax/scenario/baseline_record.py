@@ -40,9 +40,9 @@ class BaselineTable(LawTable, frozen=True):
 
     def physics(self, motion: str) -> Any:
         """The law on the error of this kind of plant."""
-        from ptsmc_jax.laws.acceleration import on
+        from ptsmc_jax.laws.acceleration import law_on_error
 
-        return on(self.error_motion(motion), self.law())
+        return law_on_error(self.error_motion(motion), self.law())
 
     def check(self, scenario: Any) -> None:
         """These laws are of second order, and so must the plant be."""

@@ -11,7 +11,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.laws import fixed_time, pd, terminal
-from ptsmc_jax.laws.acceleration import on
+from ptsmc_jax.laws.acceleration import law_on_error
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.error_motions import ErrorQuaternion
 from ptsmc_jax.numerics import attitude, guards
@@ -26,7 +26,7 @@ COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
 
 
 def of_attitudes(law) -> Any:
-    return on(ErrorQuaternion, law)
+    return law_on_error(ErrorQuaternion, law)
 
 
 LAWS: dict[str, Any] = {

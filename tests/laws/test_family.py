@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.laws import pd, predefined_time, scaling, super_twisting, time_base
-from ptsmc_jax.laws.acceleration import on
+from ptsmc_jax.laws.acceleration import law_on_error
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion
 from ptsmc_jax.numerics import attitude
@@ -49,7 +49,7 @@ NEVER = jnp.asarray(False)
 def made(name, error: Any = ErrorOfChain, model: Any = CHAIN, t_f=T_F, delta=DELTA, **changes) -> Any:
     """The law by its name in scenario files, with the gains above."""
     gains = {key: vector(value) for key, value in {**GAINS[name], **changes}.items()}
-    law: Any = on(error, CLASSES[name])
+    law: Any = law_on_error(error, CLASSES[name])
     return law(model=model, t_f=vector(t_f), delta=vector(delta), **gains)
 
 
