@@ -8,14 +8,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax.devices.reaction_wheels import Wheels
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 def quantise(u: Array, step: Scalar) -> Array:

@@ -9,9 +9,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 
 class Estimate(NamedTuple):

@@ -10,12 +10,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 class Kept(NamedTuple):

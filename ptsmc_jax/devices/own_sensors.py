@@ -14,9 +14,7 @@ from ptsmc_jax.devices.sensors import Sensor
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 OWN_NOISE = "own_noise"
 

@@ -19,10 +19,8 @@ from ptsmc_jax.devices.star_times import StarTimes, filter_between
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
-
-Scalar = Float[Array, ""]
 
 ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"

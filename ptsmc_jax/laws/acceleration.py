@@ -8,15 +8,10 @@ import functools
 from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Array, Float
-
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.laws.closed_forms import exact_error
 from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
 
 class SurfaceGains(NamedTuple):

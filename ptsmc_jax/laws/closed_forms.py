@@ -6,7 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Scalar
+
 Vector = Float[Array, " n"]
 
 

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude, guards, matrices
+from ptsmc_jax.numerics.pytrees import Scalar, Vector
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.signals.references import Target
 
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
 State = Float[Array, " states"]
 
 

@@ -4,13 +4,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ptsmc_jax.laws.acceleration import SlidingLaw
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf
-
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Vector
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.laws.error_motions import ErrorQuaternion
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.signals.references import Target
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
 
 
 @pytree

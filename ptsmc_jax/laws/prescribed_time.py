@@ -15,14 +15,12 @@ from ptsmc_jax.laws.base import Motion, PrescribedTimeLaw, Sample, SecondOrderLa
 from ptsmc_jax.laws.closed_forms import exact_chain, expansion
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.signals.references import Target
 
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
 State = Float[Array, " twice"]
 
 

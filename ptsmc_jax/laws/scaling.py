@@ -4,14 +4,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.numerics.pytrees import Leaf
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
 
 @dataclass(frozen=True)

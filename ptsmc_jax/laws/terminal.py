@@ -3,13 +3,9 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from jaxtyping import Array, Float
-
 from ptsmc_jax.laws.acceleration import SlidingLaw
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf
-
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Vector
 
 
 @dataclass(frozen=True)

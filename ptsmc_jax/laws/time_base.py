@@ -5,15 +5,11 @@ from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
 
 class Start(NamedTuple):

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.matrices import row_norm
-
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Scalar
 
 
 def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> Any:

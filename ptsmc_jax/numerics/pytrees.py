@@ -1,4 +1,4 @@
-"""Parts as pytrees: what a part's class is decorated with, the type of its numbers, and gains among them."""
+"""Parts as pytrees: the decorator of a part's class, the types of its numbers, and gains among them."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 # Type of a part's numbers: an array, alone or with batch axes; at run time anything, since JAX rebuilds pytrees
 # around placeholders and a check of the type would refuse them.
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 else:
     Leaf = Any
 
+Scalar = Float[Array, ""]
+Vector = Float[Array, " m"]  # a number for each input of the plant
 
 _Class = TypeVar("_Class", bound=type)
 

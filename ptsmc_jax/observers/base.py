@@ -13,11 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import integrators, matrices
-from ptsmc_jax.numerics.pytrees import Leaf
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 from ptsmc_jax.plants.base import Plant
 
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
 Memory = Float[Array, " memory"]
 Matrix = Float[Array, "k k"]
 
@@ -54,13 +52,19 @@ class ErrorBound(NamedTuple):
         return self.floor + remaining * (self.start - self.floor)
 
 
+def constant_bound(component_bound: Scalar, components: int) -> ErrorBound:
+    """K2 at all times where each component of the error is bounded [N m]: the 2-norm by sqrt(m) times as much."""
+    bound = jnp.sqrt(float(components)) * component_bound
+    return ErrorBound(jnp.zeros_like(bound), bound, bound)
+
+
 @dataclass(frozen=True)
 class Observer(ABC):
     """What the rollout asks of an observer."""
 
     model: Plant  # the nominal plant
     tunable: ClassVar[tuple[str, ...]] = ()  # fields that tuning may move, besides `gain`
-    estimates: ClassVar[bool] = True  # the disturbance
+    estimates: ClassVar[bool] = True  # False: d_hat is always 0
     linear: ClassVar[bool] = False  # the estimate is linear in what is measured, and its bound inverse to the gain
 
     def begin(self) -> Memory:
@@ -77,19 +81,27 @@ class Observer(ABC):
 
     @abstractmethod
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """A [1/s] for the memory, its mean over a step from t to t_next [s]."""
+        """The mean of A [1/s] over a step from t to t_next [s]."""
 
     @abstractmethod
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
-        """The forcing m' + A m at t in the step `span`, with A the `decay_matrix` of that step; seen: d_eff [N m]."""
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
+        """The forcing m' + A m at t in the step `span` [s], with A the `decay_matrix` of that step; d_eff [N m]."""
 
     @abstractmethod
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """What `update` needs of a period dt [s], computed outside the loop."""
+        """The matrix that `update` takes for a period dt [s], computed once, outside the loop."""
 
     @abstractmethod
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
-        """Memory at the end t of a period dt [s]; impulse: what `Plant.unexplained_impulse` measures of it [N m s]."""
+        """Memory at the end of a period.
+
+        Args:
+            matrix: `update_matrix(dt)`.
+            memory: at its start.
+            impulse: `Plant.unexplained_impulse` of the period, (m,) [N m s].
+            t: end of the period [s].
+            dt: its length [s], which may be 0.
+        """
 
     def fastest(self) -> float:
         """Rate that explicit steps of the continuous loop must resolve [1/s]: that of a smooth sign of its own."""
@@ -118,8 +130,7 @@ class SampledObserver(Observer):
 
     def error_bound(self) -> ErrorBound:
         """K2, which the law switches against; if nothing else is said sqrt(m) K, as without an observer."""
-        bound = jnp.sqrt(float(self.model.inputs)) * self.disturbance_bound
-        return ErrorBound(jnp.zeros_like(bound), bound, bound)
+        return constant_bound(self.disturbance_bound, self.model.inputs)
 
     def update(self, matrix: Matrix, memory: Any, impulse: Vector, t: Scalar, dt: Scalar) -> Any:
         """`step` over periods that have a length, of the mean impulse / dt [N m]."""
@@ -134,22 +145,22 @@ class SampledObserver(Observer):
         """Not used: of the continuous loop."""
         raise NotImplementedError
 
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Any, seen: Vector) -> Any:
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Any, d_eff: Vector) -> Any:
         """Not used: of the continuous loop."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Linear(Observer):
-    """What observers with a constant part l = diag(gain) of their gain share."""
+    """Base of observers whose gain has a constant part l = diag(gain)."""
 
     gain: Leaf  # (m,) diagonal of l [N m s, so that l J^-1 is in 1/s]
     disturbance_rate_bound: Leaf  # c of Assumption 1, bound on each component of d' [N m/s]
     initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
     linear: ClassVar[bool] = True
 
-    def _slope(self) -> Matrix:
-        """The matrix l J^-1 [1/s]."""
+    def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
+        """The constant part of A, l J^-1 [1/s]."""
         return self.gain[:, None] * self.model.inertia_inverse
 
     def _bound(self) -> ErrorBound:
@@ -167,6 +178,6 @@ class Linear(Observer):
 
     def update_matrix(self, dt: Scalar) -> Matrix:
         """(I - e^(-A dt)) / dt = A phi_1(-A dt) [1/s]: smooth in dt down to 0, where it is A."""
-        a = self._slope()
+        a = Linear.decay_matrix(self, dt, dt)
         _, phi = integrators.phi_functions(-a * dt, 1)
         return a @ phi

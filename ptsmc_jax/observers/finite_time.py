@@ -4,19 +4,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
+from ptsmc_jax.observers.base import Matrix, Memory, Observer
 
-Matrix = Float[Array, "k k"]
-Memory = Float[Array, " memory"]
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
-
-# Largest |e| at the next zero of e0 over that at the last one, for |d'| <= 0, 0.1 .. 1 times c and the worst d': it
-# slows e down while |e0| grows and speeds it up while it falls (found by integration, checked in the tests).
+# Largest |e| at a zero of e0 over that at the zero before, for |d'| <= 0, 0.1 .. 1 times c and the worst d': it slows e
+# down while |e0| grows and speeds it up while |e0| falls (by integration, checked in tests/observers).
 _OVERSHOOT = (0.159, 0.185, 0.212, 0.240, 0.270, 0.301, 0.336, 0.374, 0.417, 0.470, 0.538)
 
 
@@ -68,20 +63,20 @@ class FiniteTimeObserver(Observer):
         q = jnp.interp(k, jnp.linspace(0.0, 1.0, len(_OVERSHOOT)), jnp.asarray(_OVERSHOOT))  # convex: from above
         settled = (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c
         shares = jnp.clip(self.disturbance_rate_bound / self.gain, 0.0, 1.0)
-        off = self.sign_width * jnp.arctanh(shares / 1.1)
-        left = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(off, self.sign_width)
-        return FiniteTimeBound(self.initial_error, settled, guards.norm(left))
+        e0 = self.sign_width * jnp.arctanh(shares / 1.1)
+        e = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(e0, self.sign_width)
+        return FiniteTimeBound(self.initial_error, settled, guards.norm(e))
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """Zero: nothing is linear."""
         size = 2 * self.model.inputs
         return jnp.zeros((size, size))
 
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """The equations above."""
-        d_hat, off = jnp.split(memory, 2)
-        drop = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(off, self.sign_width)
-        return jnp.concatenate([-1.1 * self.gain * guards.smooth_sign(off, self.sign_width), d_hat - seen - drop])
+        d_hat, e0 = jnp.split(memory, 2)
+        root = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(e0, self.sign_width)
+        return jnp.concatenate([-1.1 * self.gain * guards.smooth_sign(e0, self.sign_width), d_hat - d_eff - root])
 
     def update_matrix(self, dt: Scalar) -> Matrix:
         """Empty: `update` needs no matrix."""
@@ -90,17 +85,17 @@ class FiniteTimeObserver(Observer):
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
         """Implicit Euler with the exact sign, in closed form: it cannot blow up, and it rests where e0 = 0.
 
-        e0+ + dt 1.5 sqrt(c) |e0+|^1/2 sign(e0+) + dt^2 1.1 c xi = e0 + dt d_hat - impulse, xi in sign(e0+).
+        e0+ + dt 1.5 sqrt(c) |e0+|^1/2 sign(e0+) + dt^2 1.1 c xi = b, b = e0 + dt d_hat - impulse, xi in sign(e0+): a
+        quadratic equation for |e0+|^1/2.
         """
-        d_hat, off = jnp.split(memory, 2)
-        pulled = off + dt * d_hat - impulse
-        switched, half = 1.1 * self.gain * dt * dt, 0.75 * jnp.sqrt(self.gain) * dt
-        xi = jnp.clip(pulled / jnp.where(switched > 0.0, switched, 1.0), -1.0, 1.0)
-        root = (
-            jnp.sqrt(half * half + jnp.maximum(jnp.abs(pulled) - switched, 0.0) + jnp.where(dt > 0.0, 0.0, 1.0)) - half
-        )
-        off = jnp.where(jnp.abs(xi) < 1.0, 0.0, root * root * xi)
-        return jnp.concatenate([d_hat - 1.1 * self.gain * dt * xi, off])
+        d_hat, e0 = jnp.split(memory, 2)
+        b = e0 + dt * d_hat - impulse
+        switching, half = 1.1 * self.gain * dt * dt, 0.75 * jnp.sqrt(self.gain) * dt
+        xi = jnp.clip(b / jnp.where(switching > 0.0, switching, 1.0), -1.0, 1.0)
+        no_length = jnp.where(dt > 0.0, 0.0, 1.0)  # keeps the square root's slope finite where dt is 0
+        root = jnp.sqrt(half * half + jnp.maximum(jnp.abs(b) - switching, 0.0) + no_length) - half
+        e0 = jnp.where(jnp.abs(xi) < 1.0, 0.0, root * root * xi)
+        return jnp.concatenate([d_hat - 1.1 * self.gain * dt * xi, e0])
 
     def fastest(self) -> float:
         """1.5 sqrt(c / width) at e0 = 0 [1/s], with 1.1 c / width the square of the frequency."""

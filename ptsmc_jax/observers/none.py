@@ -4,15 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-from ptsmc_jax.observers.base import ErrorBound, Observer
-
-Matrix = Float[Array, "k k"]
-Memory = Float[Array, " memory"]
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
+from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory, Observer, constant_bound
 
 
 @pytree
@@ -29,14 +23,13 @@ class NoObserver(Observer):
 
     def error_bound(self) -> ErrorBound:
         """sqrt(m) K at all times."""
-        bound = jnp.sqrt(float(self.model.inputs)) * self.disturbance_bound
-        return ErrorBound(jnp.zeros_like(bound), bound, bound)
+        return constant_bound(self.disturbance_bound, self.model.inputs)
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """Zero."""
         return jnp.zeros((self.model.inputs, self.model.inputs))
 
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """Zero."""
         return jnp.zeros_like(memory)
 

@@ -2,15 +2,8 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Array, Float
-
-from ptsmc_jax.numerics.pytrees import pytree
-from ptsmc_jax.observers.base import ErrorBound, Linear
-
-Matrix = Float[Array, "k k"]
-Memory = Float[Array, " memory"]
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Scalar, Vector, pytree
+from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
 
 
 @pytree
@@ -21,21 +14,14 @@ class NonlinearObserver(Linear):
     The paper's z is d_hat - l w. Its error obeys (54): e' = -l M^-1 e - d', with M the inertia J of a spacecraft.
     """
 
-    def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """A = l J^-1 [1/s], constant."""
-        return self._slope()
-
     def error_bound(self) -> ErrorBound:
         """(55) corrected."""
         return self._bound()
 
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """A d_eff [N m/s]."""
-        return self.gain * (self.model.inertia_inverse @ seen)
+        return self.gain * (self.model.inertia_inverse @ d_eff)
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
-        """d_hat+ = E d_hat + (I - E) impulse / dt, E = e^(-A dt): unbiased, a contraction for any gain and period.
-
-        `matrix` is `update_matrix(dt)`.
-        """
+        """d_hat+ = E d_hat + (I - E) impulse / dt, E = e^(-A dt): unbiased, a contraction for any gain and period."""
         return memory + matrix @ (impulse - dt * memory)

@@ -4,15 +4,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-from ptsmc_jax.observers.base import ErrorBound, Linear
-
-Matrix = Float[Array, "k k"]
-Memory = Float[Array, " memory"]
-Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
+from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
 
 
 class PrescribedTimeBound(NamedTuple):
@@ -55,18 +50,19 @@ class PrescribedTimeObserver(Linear):
     with d_hat continuous (the paper's z reset).
     """
 
-    mu: Leaf  # > 1 [-]
-    t_o: Leaf  # T_o [s]
-    delta_o: Leaf  # [s]
+    mu: Leaf  # power with which the error falls, > 1 [-]
+    t_o: Leaf  # T_o, by when the error is gone [s]
+    delta_o: Leaf  # so long before T_o it becomes the nonlinear observer [s]
 
     def _left(self, t: Scalar) -> Scalar:
+        """The time to T_o, and from T_o - delta_o on delta_o [s]."""
         return jnp.maximum(self.t_o - t, self.delta_o)
 
     def _mean(self, t: Scalar, t_next: Scalar) -> Scalar:
         """Mean of mu/(T_o - t) over an interval, 0 from T_o - delta_o on [1/s]."""
         dt = t_next - t
-        fallen = jnp.log(self._left(t) / self._left(t_next)) / jnp.where(dt > 0.0, dt, 1.0)
-        return self.mu * jnp.where(dt > 0.0, fallen, 0.0)
+        mean = jnp.log(self._left(t) / self._left(t_next)) / jnp.where(dt > 0.0, dt, 1.0)
+        return self.mu * jnp.where(dt > 0.0, mean, 0.0)
 
     def error_bound(self) -> PrescribedTimeBound:
         """K2(t)."""
@@ -74,23 +70,23 @@ class PrescribedTimeObserver(Linear):
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """A = l J^-1 + mu/(T_o - t), its mean over the step [1/s]."""
-        return self._slope() + self._mean(t, t_next) * jnp.eye(self.model.inputs)
+        return super().decay_matrix(t, t_next) + self._mean(t, t_next) * jnp.eye(self.model.inputs)
 
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, seen: Vector) -> Memory:
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """A(t) d_eff - (A(t) - A) d_hat [N m/s]; a step lies on one side of T_o - delta_o."""
         early = 0.5 * (span[0] + span[1]) < self.t_o - self.delta_o
-        extra = jnp.where(early, self.mu / self._left(t), 0.0)
-        off = extra - self._mean(*span)
-        return self.gain * (self.model.inertia_inverse @ seen) + extra * seen - off * memory
+        rate = jnp.where(early, self.mu / self._left(t), 0.0)
+        deviation = rate - self._mean(*span)
+        return self.gain * (self.model.inertia_inverse @ d_eff) + rate * d_eff - deviation * memory
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
         """As the nonlinear one's, with E = e^(-l J^-1 dt) ((T_o - t)/(T_o - t + dt))^mu."""
-        kept = jnp.exp(-self._mean(t - dt, t) * dt)
-        gone = (1.0 - kept) / jnp.where(dt > 0.0, dt, 1.0)
-        return memory + kept * (matrix @ (impulse - dt * memory)) + gone * (impulse - dt * memory)
+        factor = jnp.exp(-self._mean(t - dt, t) * dt)
+        rate = (1.0 - factor) / jnp.where(dt > 0.0, dt, 1.0)
+        return memory + factor * (matrix @ (impulse - dt * memory)) + rate * (impulse - dt * memory)
 
     def nodes(self) -> tuple[float, ...]:
-        """Nodes that close in on T_o, each a tenth nearer, and T_o - delta_o."""
+        """T_o - delta_o, and times [s] that close in on T_o, each a tenth nearer."""
         t_o, delta_o = float(self.t_o), float(self.delta_o)
         left, times = t_o, [t_o - delta_o]
         while left > max(delta_o, 1e-9 * t_o):

@@ -9,10 +9,8 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree, vector
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
-
-Scalar = Float[Array, ""]
 
 
 class Modes(NamedTuple):

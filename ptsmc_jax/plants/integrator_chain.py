@@ -7,10 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics.pytrees import pytree
+from ptsmc_jax.numerics.pytrees import Scalar, pytree
 from ptsmc_jax.plants.base import Plant, as_pytree
-
-Scalar = Float[Array, ""]
 
 
 @pytree

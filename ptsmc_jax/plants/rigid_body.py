@@ -10,10 +10,8 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.formulas import check_inertia
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.base import Plant
-
-Scalar = Float[Array, ""]
 
 
 class AttitudeState(NamedTuple):

@@ -10,10 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.base import Plant, as_pytree
-
-Scalar = Float[Array, ""]
 
 
 @pytree

@@ -15,9 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
-
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 
 def _not_below(t: Array, limit: Scalar | float) -> Array:

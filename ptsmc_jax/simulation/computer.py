@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Parts
-
-Scalar = Float[Array, ""]
 
 
 class Computer(NamedTuple):

@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude, elementary, guards
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-Scalar = Float[Array, ""]
 Vector = Float[Array, "3"]
 
 AXES = ("x", "y", "z", "boresight")  # of the indices: body axes, and the half-cone

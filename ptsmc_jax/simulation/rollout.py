@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import Actuators, Drive
@@ -16,14 +16,13 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import draws, guards, integrators, matrices
 from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, Computer, Software, brought_about, schedule, seen_within
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 from ptsmc_jax.simulation.metric_rows import Running
-
-Scalar = Float[Array, ""]
 
 OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
 # code: (status, reason)
