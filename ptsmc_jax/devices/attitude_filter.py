@@ -39,8 +39,13 @@ class AttitudeFilter:
     ) -> Estimate:
         """An estimate [-, rad/s] whose errors are those of the steady state: the filter has run before the slew.
 
-        sample: number of the first sample, before which this is; where its share is below 1, it is partly before the
-        next one.
+        Args:
+            q: true attitude.
+            bias: true bias of the gyro [rad/s].
+            normals: standard normal numbers that the errors are made of.
+            sample: number of the first sample; the estimate is that just before it.
+            share: below 1 in a partial first period, where the errors are between those before this sample and before
+                the next one.
         """
         every = self.spread.shape[0]
         root = guards.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
@@ -49,14 +54,14 @@ class AttitudeFilter:
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
-        a, b = w - old.bias, w_next - old.bias
+        a, b = w - old.bias, w_next - old.bias  # rates of the body
         turn = dt / 2 * (a + b) + dt * dt / 12 * jnp.cross(a, b)
         return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
 
     def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:
         """The estimate after a star tracker sample [-] that counts with this weight (0: none)."""
-        off = attitude.multiply(attitude.conjugate(old.q), measured)
-        residual = jnp.where(off[3] < 0.0, -2.0, 2.0) * off[:3]
+        error = attitude.multiply(attitude.conjugate(old.q), measured)
+        residual = jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
         turn = self.attitude_gain * weight * residual
         q = attitude.normalise(attitude.multiply(old.q, attitude.from_rotation_vector(turn)))
         return Estimate(q, old.bias - self.bias_gain * weight * residual)
@@ -76,9 +81,9 @@ class AttitudeFilter:
         w, w_next: rates measured at both ends [rad/s], linear in time between; measured [-] counts with this weight.
         """
         share = 1.0 - age / jnp.where(dt > 0.0, dt, 1.0)
-        there = w + share * (w_next - w)
-        corrected = self.correct(self.propagate(old, w, there, dt - age), measured, weight)
-        return self.propagate(corrected, there, w_next, age)
+        w_at_sample = w + share * (w_next - w)
+        corrected = self.correct(self.propagate(old, w, w_at_sample, dt - age), measured, weight)
+        return self.propagate(corrected, w_at_sample, w_next, age)
 
 
 def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
@@ -90,18 +95,24 @@ def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
     return 1.0 - pole**2, (1.0 - pole) ** 2 / interval
 
 
-@programs.jit(static_argnames="every")  # one program, where each of its operations would be one
+@programs.jit(static_argnames="every")  # one program; else each of its operations would be compiled by itself
 def attitude_filter(
     bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, every: int
 ) -> AttitudeFilter:
-    """Filter of this bandwidth [rad/s], its errors at t = 0 those of its steady state under these noises.
+    """Filter of a bandwidth whose errors at t = 0 are those of its steady state under these noises.
 
-    attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk [rad/s/sqrt(s)];
-    every: control periods between star tracker samples.
+    Args:
+        bandwidth: [rad/s].
+        attitude_noise: 1 sigma of a star tracker sample about each axis [rad].
+        rate_noise: 1 sigma of a gyro sample, one in each control period [rad/s].
+        bias_walk: random walk of the gyro's bias [rad/s/sqrt(s)].
+        period: of control [s].
+        every: control periods between star tracker samples.
     """
     k1, k2 = filter_gains(bandwidth, period * every)
-    # e: errors of attitude, less what the gyro's noise at the sample adds to it, and of bias, just before a sample.
-    # One period later it is step e, after a star tracker sample step keep e, and noises times the vectors named so
+    # The error e just before a sample is (attitude, without what this sample of the gyro adds to it; bias). It obeys
+    # e+ = after(period) e, or `corrected` e where the star tracker has a sample, plus noises times the vectors `gyro`,
+    # `walk` and `star`
     zero, one, half = jnp.zeros_like(k1), jnp.ones_like(k1), period / 2
 
     def after(t: Any) -> Array:
@@ -115,8 +126,8 @@ def attitude_filter(
     star = after(period) @ jnp.stack([k1, -k2])
     drive = square(2.0 * gyro, rate_noise) + square(walk, bias_walk)
     steps = jax.vmap(after)(period * jnp.arange(every))
-    each = jax.vmap(lambda step: step @ drive @ step.T)(steps)
-    added = jnp.cumsum(each, axis=0) - each
+    increments = jax.vmap(lambda step: step @ drive @ step.T)(steps)
+    added = jnp.cumsum(increments, axis=0) - increments  # covariance since the star tracker's sample
     move = corrected @ steps[-1]
     drive = corrected @ added[-1] @ corrected.T + square(star, attitude_noise)
     drive = drive + square(corrected @ gyro + gyro, rate_noise) + square(walk, bias_walk)

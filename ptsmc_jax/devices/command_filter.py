@@ -3,7 +3,7 @@
 Each is that of continuous time by the bilinear rule, its corner W met exactly: g = tan(W h / 2) for a period h (Tustin
 with prewarping; Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998). It integrates from one sample to
 the next, whatever the period's length is, and begins at rest: a roll-off has no output at the first sample. The flight
-computer knows its filter: observers are told the filtered command. Vectors (m,) in N m.
+computer knows its filter: observers use the filtered command. Vectors (m,) in N m.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from jaxtyping import Array
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
-class Kept(NamedTuple):
-    """What a filter carries from sample to sample: its integrators, with what they take up in half the next period."""
+class FilterState(NamedTuple):
+    """A filter's integrators between samples, advanced by half of the next period."""
 
     first: Array  # (m,) [N m]
     second: Array  # (m,) [N m]; of a first-order filter not used
@@ -24,20 +24,20 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True)
 class CommandFilter:
-    """What the flight computer asks of a filter of its command."""
+    """A filter of the flight computer's command."""
 
     corner: Leaf  # W [rad/s]
 
-    def begin(self, inputs: int) -> Kept:
+    def begin(self, inputs: int) -> FilterState:
         """At rest."""
-        return Kept(jnp.zeros(inputs), jnp.zeros(inputs))
+        return FilterState(jnp.zeros(inputs), jnp.zeros(inputs))
 
-    def half(self, dt: Scalar) -> Scalar:
+    def prewarped(self, dt: Scalar) -> Scalar:
         """The g = tan(W dt / 2) [-] for a period dt [s]; W dt below pi."""
         return jnp.tan(0.5 * self.corner * dt)
 
-    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
-        """Filtered command (m,) [N m] of a sample, and what the next one finds.
+    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+        """Filtered command (m,) [N m] of a sample, and the state for the next one.
 
         before, dt: lengths of the periods that end and begin at the sample [s].
         """
@@ -49,11 +49,11 @@ class CommandFilter:
 class FirstOrder(CommandFilter):
     """Roll-off W / (s + W): 3 dB and 45 degrees at the corner, then 20 dB a decade."""
 
-    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """The low pass y, y' = W (u - y)."""
-        g = self.half(before)
-        y = (kept.first + g * u) / (1.0 + g)
-        return y, Kept(y + self.half(dt) * (u - y), kept.second)
+        g = self.prewarped(before)
+        y = (state.first + g * u) / (1.0 + g)
+        return y, FilterState(y + self.prewarped(dt) * (u - y), state.second)
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,15 @@ class _Second(CommandFilter):
 
     damping: Leaf  # z [-]
 
-    def _integrated(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Vector, Kept]:
+    def _integrated(
+        self, state: FilterState, u: Vector, before: Scalar, dt: Scalar
+    ) -> tuple[Vector, Vector, FilterState]:
         """Band b and low pass l of this sample."""
-        g, next_g = self.half(before), self.half(dt)
-        band = (kept.first + g * (u - kept.second)) / (1.0 + g * (g + 2.0 * self.damping))
-        low = kept.second + g * band
+        g, next_g = self.prewarped(before), self.prewarped(dt)
+        band = (state.first + g * (u - state.second)) / (1.0 + g * (g + 2.0 * self.damping))
+        low = state.second + g * band
         high = u - 2.0 * self.damping * band - low
-        return band, low, Kept(band + next_g * high, low + next_g * band)
+        return band, low, FilterState(band + next_g * high, low + next_g * band)
 
 
 @pytree
@@ -76,10 +78,10 @@ class _Second(CommandFilter):
 class SecondOrder(_Second):
     """Roll-off W^2 / (s^2 + 2 z W s + W^2): 90 degrees at the corner, then 40 dB a decade."""
 
-    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
+    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """The low pass."""
-        _, low, kept = self._integrated(kept, u, before, dt)
-        return low, kept
+        _, low, state = self._integrated(state, u, before, dt)
+        return low, state
 
 
 @pytree
@@ -87,7 +89,7 @@ class SecondOrder(_Second):
 class Notch(_Second):
     """Notch (s^2 + W^2) / (s^2 + 2 z W s + W^2): nothing passes at its corner, z says how wide it is."""
 
-    def step(self, kept: Kept, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Kept]:
-        """What is left without the band, u - 2 z b."""
-        band, _, kept = self._integrated(kept, u, before, dt)
-        return u - 2.0 * self.damping * band, kept
+    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+        """The command without the band, u - 2 z b."""
+        band, _, state = self._integrated(state, u, before, dt)
+        return u - 2.0 * self.damping * band, state

@@ -1,12 +1,11 @@
-"""Sensors of one's own: what the law sees of the true state at a sample, and what they remember of it.
+"""Sensors of one's own: at a sample they turn the true state x into the measured one, and may remember something.
 
-seen, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
+measured, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
 """
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -50,11 +49,11 @@ class OwnSensors(Sensor):
     """Sensors of one's own as the rollout asks for them: with noise that belongs to (seed, trial, sample)."""
 
     own: Any  # `SampledSensor`
-    loud: Leaf  # 1, or 0 [-]: without noise
+    noise_scale: Leaf  # 1, or 0 without noise [-]
 
     def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " draws"]:
         """Noise of one sample, (draws,) [-]."""
-        return self.loud * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
+        return self.noise_scale * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> tuple:
         """Memory before the first sample of positive length [s], which is now."""
@@ -62,14 +61,12 @@ class OwnSensors(Sensor):
         return key, self.noise(key, now.sample), self.own.begin(x0)
 
     def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, tuple]:
-        """The state as seen, and the memory; a period without a length [s] changes none of what is remembered."""
-        key, noise, kept = memory
-        following = self.noise(key, now.sample + 1)
-        seen, new = self.own.see(kept, x, guards.lerp(now.noise_weight, noise, following), now.t, dt)
-        there = now.t_next > now.t
-        kept = jax.tree.map(lambda one, other: jnp.where(there, one, other), new, kept)
-        return seen, (key, following, kept)
+        """The measured state, and the memory; a period without a length [s] does not change the memory."""
+        key, noise, own_memory = memory
+        noise_next = self.noise(key, now.sample + 1)
+        measured, new = self.own.see(own_memory, x, guards.lerp(now.noise_weight, noise, noise_next), now.t, dt)
+        return measured, (key, noise_next, guards.select(now.t_next > now.t, new, own_memory))
 
     def quiet(self) -> "OwnSensors":
-        """Its standard normal numbers all zero."""
-        return replace(self, loud=0.0 * self.loud)
+        """The sensors with all their standard normal numbers zero."""
+        return replace(self, noise_scale=0.0 * self.noise_scale)

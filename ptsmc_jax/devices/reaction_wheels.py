@@ -38,7 +38,7 @@ def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_li
     return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)
 
 
-def spares(device: Wheels) -> Float[Array, "n n 3"]:
-    """Allocation (n, n, 3) without each of the wheels: pseudo-inverses of A = axes [-], one of whose columns is 0."""
-    axes, each = np.asarray(device.axes), np.arange(device.axes.shape[1])
-    return jnp.stack([jnp.asarray(np.linalg.pinv(axes * (each != k), rcond=1e-6)) for k in each])
+def spare_allocations(device: Wheels) -> Float[Array, "n n 3"]:
+    """Allocations (n, n, 3) without each of the wheels: pseudo-inverses of A = axes [-], one of whose columns is 0."""
+    axes, numbers = np.asarray(device.axes), np.arange(device.axes.shape[1])
+    return jnp.stack([jnp.asarray(np.linalg.pinv(axes * (numbers != k), rcond=1e-6)) for k in numbers])

@@ -1,7 +1,7 @@
 """Times of a star tracker that samples by a clock of its own, which need not be those of the control samples.
 
-It samples once in `interval`, which is at least a control period: at the first control sample of the clock's count
-(t = 0, or the hand-over) and every interval from there. What it says is used at the next control sample.
+It samples once in `interval`, which is at least a control period: at control sample 0 of the clock (t = 0, or the
+hand-over) and every interval from there. Its measurement is used at the next control sample.
 """
 
 import math
@@ -19,27 +19,27 @@ from ptsmc_jax.devices.attitude_filter import AttitudeFilter, cholesky, filter_g
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
-ROUNDING = 1e-9  # of a period: a sample so much late is on time
-LONGEST = 1000  # control periods of a pattern
+ROUNDING = 1e-9  # share of a period by which times may differ and still count as equal
+LONGEST = 1000  # control periods of a pattern at most
 
 
 @pytree
 @dataclass(frozen=True)
 class StarTimes:
-    """When a star tracker has sampled that goes by its own clock."""
+    """When a star tracker samples that goes by its own clock."""
 
     interval: Leaf  # between its samples [s]
     period: Leaf  # of control [s]
-    pattern: tuple[int, int] = field(metadata={"static": True})  # control periods, and its samples in them, see below
+    pattern: tuple[int, int] = field(metadata={"static": True})  # see the function `pattern`
 
     def age(self, sample: Any) -> Any:
-        """How long before a control sample, by its number, its last one was [s]."""
+        """How long before a control sample, given by its number, the star tracker's last sample was [s]."""
         t = sample * self.period
         last = jnp.floor((t + ROUNDING * self.period) / self.interval) * self.interval
         return jnp.maximum(t - last, 0.0)
 
     def due(self, sample: Any) -> Any:
-        """Whether it has sampled since the control sample before this one, by its number."""
+        """Whether it has sampled since the control sample before this one, given by its number."""
         return self.age(sample) < (1.0 - ROUNDING) * self.period
 
 
@@ -49,9 +49,10 @@ def star_times(interval: float, period: float) -> StarTimes:
 
 
 def pattern(ratio: float) -> tuple[int, int]:
-    """(periods, samples) after which the times repeat, or nearly so where that takes more than `LONGEST` periods.
+    """(control periods, star tracker samples in them) after which the times repeat, at most `LONGEST` periods.
 
-    ratio: of the interval to the control period [-]. Only the errors of a filter at t = 0 are those of the pattern.
+    ratio: of the interval to the control period [-]. Where the times repeat later, or never, these are nearly so; only
+    the errors of a filter at t = 0 are made of them.
 
     >>> pattern(2.5), pattern(4.0)
     ((5, 2), (4, 1))
@@ -68,7 +69,7 @@ def filter_between(
     """The `attitude_filter` of a star tracker that samples by its own clock.
 
     bandwidth [rad/s]; attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk
-    [rad/s/sqrt(s)]; interval between star tracker samples [s]; repeating: see `pattern`.
+    [rad/s/sqrt(s)]; interval between star tracker samples [s]; repeating: the `pattern` of its times.
     """
     k1, k2 = filter_gains(bandwidth, interval)
     periods, samples = repeating
@@ -76,35 +77,36 @@ def filter_between(
     ages = count - (count * samples // periods) * (periods / samples)  # in periods
     sizes = jnp.stack([rate_noise, bias_walk * jnp.sqrt(period), attitude_noise])
 
-    def moved(errors: Float[Array, "3"], noise: Float[Array, "3"], age: Any, weight: Any) -> Float[Array, "3"]:
+    def after(errors: Float[Array, "3"], noise: Float[Array, "3"], age: Any, weight: Any) -> Float[Array, "3"]:
         """Errors (attitude, bias, gyro) at the next control sample; between samples the gyro's is linear in time."""
-        (turn, bias, gyro), (fresh, drift, star) = errors, sizes * noise
+        (turn, bias, gyro), (gyro_next, drift, star) = errors, sizes * noise
         before = period - age
-        turn_rate = (fresh + drift - gyro) / period
-        there = turn + before * (gyro - bias) + turn_rate * before**2 / 2
-        residual = weight * (star - there)
-        there, corrected = there + k1 * residual, bias - k2 * residual
-        turn = there + age * (gyro - corrected) + turn_rate * (period**2 - before**2) / 2
-        return jnp.stack([turn, corrected - drift, fresh])
+        turn_rate = (gyro_next + drift - gyro) / period
+        at_star = turn + before * (gyro - bias) + turn_rate * before**2 / 2
+        residual = weight * (star - at_star)
+        at_star, corrected = at_star + k1 * residual, bias - k2 * residual
+        turn = at_star + age * (gyro - corrected) + turn_rate * (period**2 - before**2) / 2
+        return jnp.stack([turn, corrected - drift, gyro_next])
 
     def linear(age: Any, weight: Any) -> tuple[Array, Array]:
-        return jax.jacfwd(moved, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3), age, weight)
+        """Matrices of the errors and of the noise in `after`."""
+        return jax.jacfwd(after, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3), age, weight)
 
-    def step(covariance: Array, by: tuple[Array, Array]) -> tuple[Array, Array]:
-        move, enter = by
-        after = move @ covariance @ move.T + enter @ enter.T
-        return after, after
+    def step(covariance: Array, linear_step: tuple[Array, Array]) -> tuple[Array, Array]:
+        a, b = linear_step
+        covariance = a @ covariance @ a.T + b @ b.T
+        return covariance, covariance
 
     at = jnp.asarray(np.minimum(ages, 1.0)) * period
-    moves, enters = jax.vmap(linear)(at, jnp.asarray((ages < 1.0 - ROUNDING) * 1.0))
-    whole = jax.lax.scan(lambda m, move: (move @ m, None), jnp.eye(3), moves)[0]
+    steps = jax.vmap(linear)(at, jnp.asarray((ages < 1.0 - ROUNDING) * 1.0))
+    whole = jax.lax.scan(lambda m, a: (a @ m, None), jnp.eye(3), steps[0])[0]
     # of the gyro's error, which is new at every sample, the covariance is known at once; the other block solves for it
-    known = jax.lax.scan(step, jnp.zeros((3, 3)), (moves, enters))[0].at[:2, :2].set(0.0)
-    once = jax.lax.scan(step, known, (moves, enters))[0][:2, :2]
+    gyro_only = jax.lax.scan(step, jnp.zeros((3, 3)), steps)[0].at[:2, :2].set(0.0)
+    once = jax.lax.scan(step, gyro_only, steps)[0][:2, :2]
     block = matrices.solve(jnp.eye(4) - jnp.kron(whole[:2, :2], whole[:2, :2]), once.reshape(4)).reshape(2, 2)
-    first = known.at[:2, :2].set(block)
-    after = jax.lax.scan(step, first, (moves, enters))[1]
-    before = jnp.concatenate([first[None], after[:-1]])  # at the control samples of the pattern, the first one first
-    move, enter = linear(jnp.zeros_like(period), 0.0)
-    spread = jax.vmap(lambda known: cholesky((move @ known @ move.T + enter @ enter.T)[:2, :2]))(before)
+    first = gyro_only.at[:2, :2].set(block)
+    ends = jax.lax.scan(step, first, steps)[1]
+    starts = jnp.concatenate([first[None], ends[:-1]])  # at the control samples of the pattern, the first one first
+    a, b = linear(jnp.zeros_like(period), 0.0)
+    spread = jax.vmap(lambda covariance: cholesky((a @ covariance @ a.T + b @ b.T)[:2, :2]))(starts)
     return AttitudeFilter(k1, k2, spread)

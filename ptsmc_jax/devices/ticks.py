@@ -1,4 +1,4 @@
-"""The intervals of a run as clocks make them and devices are told them."""
+"""The intervals of a run, as clocks make them and devices use them."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,12 @@ from jaxtyping import Array
 
 
 class Ticks(NamedTuple):
-    """Intervals, (N,) arrays."""
+    """Control periods, or steps of integration: (N,) arrays; in the loop those of one, scalars."""
 
     t: Array  # start [s]
     t_next: Array  # end [s]
     hold: Array  # bool: after the hand-over
     sample: Array  # int32: number of the sample, from the hand-over (anchored) or from t = 0 (others)
-    noise_weight: Array  # share of this sample's own noise, the rest is the next one's; below 1 in a partial first one
+    noise_weight: (
+        Array  # share of this sample's own noise, the rest is the next one's; below 1 in a partial first period
+    )

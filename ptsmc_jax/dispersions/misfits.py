@@ -63,7 +63,7 @@ def _unit_vectors(given: np.ndarray) -> np.ndarray:
 
 def _failure() -> Quantity:
     def read(parts: Parts) -> Numbers:
-        fails = _actuators(parts).fails
+        fails = _actuators(parts).failure_times
         if fails is None:
             return jnp.array([jnp.inf, 0.0])
         return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
@@ -71,7 +71,7 @@ def _failure() -> Quantity:
     def write(parts: Parts, given: Numbers) -> Parts:
         wheel = jnp.arange(channels(parts).shape[1]) + 1.0
         return replace(
-            parts, actuators=replace(_actuators(parts), fails=jnp.where(wheel == given[1], given[0], jnp.inf))
+            parts, actuators=replace(_actuators(parts), failure_times=jnp.where(wheel == given[1], given[0], jnp.inf))
         )
 
     def with_whole_wheel(given: np.ndarray) -> np.ndarray:

@@ -67,8 +67,11 @@ class SlidingLaw(AccelerationLaw):
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """As the class says."""
         s, equivalent = self.surface(error, error_rate)
-        sign = guards.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
-        return equivalent - bound * sign, s
+        return equivalent - bound * self.sign(s), s
+
+    def sign(self, s: Vector) -> Vector:
+        """Smooth sign tanh(s / sign_width) [-]; the exact one for a width of 0."""
+        return guards.smooth_sign(s, self.sign_width)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @functools.cache

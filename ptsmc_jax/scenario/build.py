@@ -23,7 +23,7 @@ def setup(scenario: Scenario) -> Setup:
     wheels = scenario.reaction_wheels
     devices = scenario.devices.actuators(None if wheels is None else wheels.build())
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
-        devices = dataclasses.replace(devices, spares=reaction_wheels.spares(devices.wheels))
+        devices = dataclasses.replace(devices, spare_allocations=reaction_wheels.spare_allocations(devices.wheels))
     filtering = scenario.devices.command_filter
     return Setup(
         plant=plant,

@@ -86,7 +86,7 @@ def test_the_body_gets_what_scaled_and_turned_actuators_give_and_flight_software
     turned = np.asarray(device.directions)
     np.testing.assert_allclose(np.linalg.norm(turned, axis=0), 1.0, rtol=1e-14)
     assert 1e-3 < np.abs(turned - np.eye(3)).max() < 0.1
-    assert device.known == actuators.Actuators()
+    assert device.nominal == actuators.Actuators()
 
 
 def test_a_misfit_of_nothing_changes_no_digit():

@@ -331,7 +331,7 @@ def test_the_profile_is_the_quintic_that_begins_as_measured_and_ends_at_rest():
     profile = jax.jit(law.profile)
     for t in (0.0, 0.4, 2.5, 4.9, T_F, T_F + 1.0):
         for found, known in zip(
-            profile(start, vector(t)), quintic(np.array(start.straight), np.array(start.rate), t), strict=True
+            profile(start, vector(t)), quintic(np.array(start.error), np.array(start.rate), t), strict=True
         ):
             np.testing.assert_allclose(found, known, rtol=1e-11, atol=1e-14)  # rounding in powers up to x^5
     first, last = profile(start, vector(0.0)), profile(start, vector(T_F))

@@ -108,7 +108,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     np.testing.assert_allclose(u[2:-1, 0], wanted, rtol=0.0, atol=1e-13)
     other = rollout.simulate_jit(parts, 3, 8)
     assert float(other.metrics.window_error) != float(rollout.simulate_jit(parts, 3, 7).metrics.window_error)
-    assert linear.quiet(parts).sensors.loud == 0.0
+    assert linear.quiet(parts).sensors.noise_scale == 0.0
     assert t.size > 60
 
 
