@@ -221,6 +221,7 @@ class Actuators:
 
     def wheels_at(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
         """Momentum [N m s] and torque [N m] of each wheel s [s] into the period, (wheels,) each."""
+        assert drive.h is not None
         v, impulse, _ = self.channels(drive, s)
         return drive.h - self.delivered(drive, impulse), self.delivered(drive, v)
 
