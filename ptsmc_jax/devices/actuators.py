@@ -1,6 +1,7 @@
 """Actuators, between the commanded torque and the body: delay, quantisation, limits, lag, reaction wheels.
 
-Each device is off where it is None. A channel is what makes torque: a body axis, or a wheel.
+Each device is off where it is None. A channel is what makes torque: a body axis, or a wheel. Quantisation has the
+derivative of its command.
 """
 
 from dataclasses import dataclass, field, replace
