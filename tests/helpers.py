@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import polars as pl
@@ -18,7 +19,7 @@ from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.observers import none, nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.signals import disturbances, references
-from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.rollout import Parts
 from tests.tree import QUICKLY as QUICKLY
 from tests.tree import ROOT as ROOT
@@ -60,8 +61,15 @@ steps = 4
 def roomy(timing: Any) -> Any:
     """The clock with more steps, or periods of length zero, so that runs of other times are the same program."""
     counts = {name: getattr(timing, name) for name in ("before", "after")}
-    more = {name: count if count > 1000 else 2 ** math.ceil(math.log2(count)) for name, count in counts.items()}
+    more = {name: count if count > 1024 else 512 if count <= 512 else 1024 for name, count in counts.items()}
     return dataclasses.replace(timing, **more)
+
+
+def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
+    """A run with its history, all of it NumPy's, so that one program flies all parts of a structure."""
+    numbers = jax.tree.map(np.asarray, run)  # whose types are never weak, as Python's numbers are
+    flown = rollout.simulate_jit(numbers, np.uint32(seed), np.uint32(trial), record=True)
+    return jax.tree.map(np.asarray, flown)
 
 
 def vector(*values: Any) -> Any:
