@@ -10,9 +10,8 @@ from scipy import optimize, signal
 
 from ptsmc_jax import scenario
 from ptsmc_jax.plants import second_order
-from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import borders, crossings, linear, margins
-from tests.helpers import short
+from tests.helpers import fly, short
 from tuning.search.gains import with_gains
 
 CHAIN = {
@@ -86,7 +85,7 @@ def test_margins_are_those_of_an_independent_transfer_function(k1, period, rate,
 
 def test_gain_margin_of_a_sampled_double_integrator():
     """A pole comes to -1 at k kd h = 2."""
-    _, loop, (_, kd) = chain()
+    _, loop, (_, kd) = chain(hardware={"delay": 0, "state_noise": [1e-6, 1e-6]})
     np.testing.assert_allclose(10 ** (of(loop).gain_up / 20), 2.0 / (kd * 0.05), rtol=1e-10)
 
 
@@ -95,20 +94,22 @@ def test_slopes_of_margins_are_those_of_central_differences():
     run = linear.nominal_jit(parts)
     index = jnp.asarray(linear.full_periods(parts, run, hold=True)[-1])
 
-    @jax.jit
-    def values(at):
+    def margins_at(at):
         changed = with_gains(parts, {"k1": at[0], "sign_width": at[1], "surface_rate": at[2]})
         during = jax.tree.map(lambda v: v[index], linear.nominal(changed))
         found = margins.of(linear.opened(changed, during).loop)
         return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.modulus[0]])
 
-    at = jnp.asarray([3.0, 2e-2, 1.5])
-    exact = jax.jit(jax.jacfwd(values))(at)
-    for k in range(3):
-        step = 1e-4 * float(at[k]) * jnp.eye(3)[k]
-        numeric = (8 * (values(at + step) - values(at - step)) - values(at + 2 * step) + values(at - 2 * step)) / (
-            12 * step[k]
-        )
+    @jax.jit
+    def sloped(at, along):
+        return jax.jvp(margins_at, (at,), (along,))
+
+    at, axes = np.array([3.0, 2e-2, 1.5]), np.eye(3)
+    exact = np.stack([sloped(at, along)[1] for along in axes], axis=1)
+    for k, along in enumerate(axes):
+        step = 1e-4 * at[k]
+        far_down, down, up, far_up = (np.asarray(sloped(at + n * step * along, along)[0]) for n in (-2, -1, 1, 2))
+        numeric = (8 * (up - down) - far_up + far_down) / (12 * step)
         np.testing.assert_allclose(exact[:, k], numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
 
@@ -183,8 +184,8 @@ KINDS = {
 def test_the_nominal_run_is_the_one_that_flies(kind):
     """The flight computer with a model of its own of the actuators flies as the one that is told what they did."""
     law = {"controller": {"t_f": 10.0, "delta": 0.5}}
-    parts = linear.quiet(scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts)
-    log = rollout.simulate_jit(parts, record=True).log
+    parts = scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts
+    log = fly(linear.quiet(parts)).log
     run = linear.nominal_jit(parts)
     sizes = jax.jit(jax.vmap(parts.plant.local_coordinates))(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
     np.testing.assert_allclose(sizes, 0.0, atol=1e-11)  # rounding, in rad and rad/s of order 1

@@ -1,13 +1,12 @@
 """What a mode that the law does not know does to the loop: linear theory."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, linear, margins, run_margins
+from tests.helpers import fly
 
 # one mode about x that a late loop of some bandwidth drives; no noise, no switching term, small angles: it is linear
 SPILLS = {
@@ -55,6 +54,13 @@ def parts_of(**changes):
     return scenario.study(scenario.from_tables(tables)).parts
 
 
+def in_hold(parts):
+    """The loop of the last period."""
+    run = linear.nominal_jit(parts)
+    index = linear.full_periods(parts, run, hold=True)[-1:]
+    return jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, run, index))
+
+
 def slowest_pair(y):
     """Modulus of the pair of poles that a free oscillation y(k) ends in: y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k)."""
     return np.sqrt(-np.linalg.lstsq(np.stack([y[1:-1], y[:-2]], axis=1), y[2:])[0][1])
@@ -63,14 +69,12 @@ def slowest_pair(y):
 @pytest.mark.parametrize(("damping", "grows"), [(0.02, True), (0.06, False)])
 def test_a_flown_mode_grows_or_decays_as_the_poles_of_its_loop_say(damping, grows):
     """The last 70 periods of hold, in which faster motions are gone; the rigid design is stable either way."""
-    rigid = run_margins.at_ends(parts_of(flexible=None))["hold"][1]
-    assert rigid < 1.0 + margins.NEUTRAL
+    assert linear.radius(in_hold(parts_of(flexible=None))) < 1.0 + margins.NEUTRAL
     parts = parts_of(flexible={**SPILLS["flexible"], "damping": [damping]})
-    loop = jax.tree.map(lambda v: np.asarray(v)[-1], run_margins.at(parts, jnp.ones(1)).loops)
+    loop = in_hold(parts)
     poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
     radius = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
     assert radius > 1.01 if grows else radius < 0.99
-    run = rollout.simulate_jit(parts, record=True)
-    assert run.log is not None
-    ringing = np.asarray(run.log.x.modes.e)[np.asarray(run.log.has_length)][-72:-1, 0]
+    log = fly(parts).log
+    ringing = log.x.modes.e[log.has_length][-72:-1, 0]
     np.testing.assert_allclose(slowest_pair(ringing) ** 70, radius**70, rtol=2e-3)
