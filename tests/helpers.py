@@ -57,6 +57,32 @@ starts = 2
 steps = 4
 """
 
+# the same for a chain, whose programs are compiled in a quarter of the time: for what hangs on no spacecraft
+SHORT_CHAIN = """
+[plant]
+kind = "chain"
+x0 = [1.0, 0.0]
+[controller]
+t_f = 5.0
+delta = 0.5
+[loop]
+mode = "sampled"
+period = 0.1
+t_end = 6.5
+[hardware]
+state_noise = [2e-5, 1e-5]
+[dispersion]
+x0 = { kind = "uniform", half_width = [0.5, 0.1] }
+[requirements]
+peak_torque = 3.0
+[tune]
+free = ["eta", "delta"]
+bounds = { eta = [2.6, 3.1], delta = [0.1, 2.0] }
+trials = 8
+starts = 2
+steps = 4
+"""
+
 
 def roomy(timing: Any) -> Any:
     """The clock with more steps, or periods of length zero, so that runs of other times are the same program."""

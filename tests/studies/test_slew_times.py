@@ -9,7 +9,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import small_search
+from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
 from tuning.output import sentences
 from tuning.studies import slew_times
@@ -18,7 +18,8 @@ from tuning.studies import slew_times
 def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
     """Two times, few steps: the peak torque of a slew goes with 1 / t_f^2, the rate with 1 / t_f."""
     small_search(monkeypatch, 60)
-    status, out, err = command("pareto", "s.toml", "--against", "t_f", "--times", "4,8", "--out", "cost")
+    (tmp_path / "c.toml").write_text(SHORT_CHAIN)
+    status, out, err = command("pareto", "c.toml", "--against", "t_f", "--times", "4,8", "--out", "cost")
     assert status == 0, err
     assert "gains tuned for 2 prescribed times, each judged on 60 fresh trials" in out
     with (tmp_path / "cost" / "slew_times.csv").open() as file:
@@ -38,7 +39,7 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert f"At {met} of 2 prescribed times gains meet every requirement" in page.text
     assert "--against t_f --times 4,8" in page.text
     assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
-    assert "already done" in command("pareto", "s.toml", "--against", "t_f", "--times", "8,4", "--out", "cost")[1]
+    assert "already done" in command("pareto", "c.toml", "--against", "t_f", "--times", "8,4", "--out", "cost")[1]
 
 
 @pytest.mark.parametrize(
