@@ -19,6 +19,13 @@ controller = { t_f = 5.0, delta = 0.5 }
 hardware = { attitude_noise = 2e-5, rate_noise = 1e-6 }
 dispersion.attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 60.0 }
 """
+CHAIN = """
+plant = { kind = "chain", x0 = [1.0, 0.0] }
+loop = { mode = "sampled", period = 0.1, t_end = 7.0, clock = "flight" }
+controller = { t_f = 5.0, delta = 0.5 }
+hardware.state_noise = [2e-5, 1e-6]
+dispersion.x0 = { kind = "uniform", half_width = [0.5, 0.1] }
+"""
 
 
 def asked(x, y, text=SHORT):
@@ -54,7 +61,7 @@ def test_bad_axes_are_refused_in_a_sentence(text):
 
 @pytest.fixture(scope="module")
 def mapped():
-    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2")
+    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
 
 
 def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped):
