@@ -65,9 +65,9 @@ def test_the_plan_is_what_is_flown(flown):
 
 
 def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
-    """Gains beyond what the period allows: a third of the trials comes upon the law's singularity, or tumbles."""
-    wild = scenario.replace(scenario.from_tables(TABLES), controller__eta=8.75, controller__delta=0.1)
-    made = campaign.Campaign(scenario.study(wild), 0)
+    """Starts near 180 deg: a third of the trials comes upon the law's singularity, or tumbles."""
+    far = {"kind": "axis_angle", "min_deg": 170.0, "max_deg": 180.0}
+    made = campaign.Campaign(scenario.study(scenario.from_tables({**TABLES, "dispersion": {"attitude": far}})), 0)
     frame = made.fly(range(600))
     bad = frame.filter(pl.col("status").is_in(["diverged", "singular"]))
     assert 0.2 < bad.height / 600 < 0.5
@@ -84,7 +84,7 @@ def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
         got = getattr(alone.metrics, name)
         np.testing.assert_array_equal(np.isnan(got), good[name].is_null().to_numpy())
         known = ~np.isnan(got)
-        # the loop is unstable there: what rounding differs by grows with it, but the same program flies both
+        # rounding grows near the singularity, but the same program flies both
         np.testing.assert_array_equal(got[known], good[name].to_numpy()[known], err_msg=name)
 
 
@@ -120,6 +120,7 @@ def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, togethe
     """As accelerators make them: some of a shard's, which do not follow one another, and the last one is short."""
     made, frame = flown
     monkeypatch.setattr(campaign, "PART", 40)
+    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # the program of `flown`
     monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(jax.local_devices()))
     flights = []
 

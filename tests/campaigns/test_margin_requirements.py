@@ -102,7 +102,10 @@ def drawn():
 
     A loop hangs on where on its way it is linearised, and so on its start.
     """
-    inertia, attitude = {"kind": "relative_normal", "std": 0.05}, {"kind": "axis_angle", "min_deg": 10.0, "max_deg": 30.0}
+    inertia, attitude = (
+        {"kind": "relative_normal", "std": 0.05},
+        {"kind": "axis_angle", "min_deg": 10.0, "max_deg": 30.0},
+    )
     tables = {**BODY, "dispersion": {"inertia": inertia, "attitude": attitude}}
     tables["requirements"] = {**BODY["requirements"], "peak_torque": 5.0}
     with pytest.MonkeyPatch.context() as patch:

@@ -1,19 +1,12 @@
-import tomllib
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.devices import actuators, sensors
 from ptsmc_jax.dispersions import attitudes, variation
-from ptsmc_jax.numerics import pytrees
-from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import rollout
 from tests.helpers import FIRST_FLIGHT, parts, short, vector
 
@@ -35,15 +28,16 @@ def flown():
 
 
 def test_256_trials_equal_the_loop_over_them(flown):
+    """Each replayed alone, with its history."""
     run, trials = flown
-    alone = jax.jit(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial))
+    draw = jax.jit(lambda trial: SPREAD.apply(run, np.uint32(5), trial))
     for k in range(256):
-        metrics, status, _, drawn, _ = alone(np.uint32(k))
-        assert int(status) == trials.status[k]
-        for name, value in drawn.items():
-            np.testing.assert_allclose(value, trials.drawn[name][k], atol=1e-15)
-        for name in metrics._fields:
-            a, b = float(getattr(metrics, name)), float(getattr(trials.metrics, name)[k])
+        drawn = draw(np.uint32(k))
+        alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k), record=True)
+        assert int(alone.status) == trials.status[k]
+        np.testing.assert_allclose(drawn.initial.q, trials.vectors("initial_q")[k], atol=1e-15)
+        for name in alone.metrics._fields:
+            a, b = float(getattr(alone.metrics, name)), float(getattr(trials.metrics, name)[k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
 
 
@@ -58,6 +52,7 @@ def test_any_number_of_trials_is_flown(flown, count):
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
 
 
+@pytest.mark.long  # campaigns of several calls: `test_campaign.py`
 def test_more_trials_than_one_call_takes(flown, monkeypatch):
     run, trials = flown
     monkeypatch.setattr(montecarlo, "CAPACITY", 64)
@@ -83,91 +78,6 @@ def test_a_trial_does_not_depend_on_the_others(flown):
     np.testing.assert_allclose(again.vectors("initial_q"), trials.vectors("initial_q")[some], atol=1e-15)
     other = montecarlo.run(run, SPREAD, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
-
-
-def test_a_trial_replayed_alone_with_its_history_equals_its_row(flown):
-    run, trials = flown
-    drawn = SPREAD.apply(run, np.uint32(5), np.uint32(42))
-    result = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(42), record=True)
-    for name in result.metrics._fields:
-        a, b = float(getattr(result.metrics, name)), float(getattr(trials.metrics, name)[42])
-        assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), name
-
-
-EVERYTHING = """
-[spacecraft]
-inertia = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
-[controller]
-t_f = 12.0
-delta = 0.5
-[disturbance]
-bias = [0.001, 0.0, -0.002]
-[loop]
-mode = "sampled"
-period = 0.1
-t_end = 13.0
-[hardware]
-attitude_noise = 2e-5
-rate_noise = 1e-6
-rate_bias = 1e-5
-torque_limit = 1.0
-[dispersion]
-attitude = { kind = "normal", std_deg = 20.0 }
-rate = { kind = "normal", std = 0.01 }
-inertia = { kind = "relative_normal", std = 0.05, axes_deg = 2.0 }
-reference = { kind = "normal", std_deg = 3.0 }
-disturbance_phase = {}
-disturbance_amplitude = { kind = "relative_normal", std = 0.2 }
-disturbance_bias = { kind = "uniform", half_width = 0.003 }
-attitude_noise = { kind = "relative_uniform", half_width = 0.5 }
-rate_noise = { kind = "relative_normal", std = 0.2 }
-torque_limit = { kind = "relative_normal", std = 0.2 }
-"""
-
-
-@pytrees.pytree
-class _Biased(sensors.Sensors):
-    """Sensors with a gyro that is off by what is given, not by what is drawn."""
-
-    def first_bias(self, seed, trial):
-        return jnp.asarray(self.rate_bias)
-
-
-def test_a_trial_made_by_hand_from_its_row_is_the_trial():
-    """Every drawn number stands in the row, and is the one that was flown: the nominal parts with it fly the same."""
-    ready = scenario.study(scenario.from_tables(tomllib.loads(EVERYTHING)))
-    trials = montecarlo.run(ready.parts, ready.dispersion, 3, np.arange(5))
-    assert set(trials.status) == {rollout.OK}
-    for k in range(5):
-        row = {name: vector(values[k]) for name, values in trials.drawn.items()}
-
-        def numbers(name, count, row=row):
-            return jnp.stack([row.pop(f"{name}{j}") for j in range(1, count + 1)])
-
-        upper = [[row.pop(f"inertia_{min(i, j)}{max(i, j)}", None) for j in (1, 2, 3)] for i in (1, 2, 3)]
-        body = np.zeros((3, 3))
-        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-            body[i, j] = body[j, i] = upper[i][j]
-        sine = ready.parts.disturbance
-        swing, phase = numbers("disturbance_amplitude_", 3), numbers("disturbance_phase_", 3)
-        d = disturbances.Sinusoid(swing, sine.frequency, phase, sine.bias + numbers("disturbance_bias_", 3))
-        eyes = _Biased(row.pop("attitude_noise"), row.pop("rate_noise"), numbers("rate_bias_", 3))
-        by_hand = replace(
-            ready.parts,
-            plant=rigid_body.spacecraft(body),
-            initial=rigid_body.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
-            reference=references.Fixed(numbers("reference_q", 4)),
-            disturbance=d,
-            sensors=eyes,
-            actuators=actuators.Actuators(torque_limit=row.pop("torque_limit")),
-        )
-        turn = Rotation.from_quat(by_hand.reference.q).inv() * Rotation.from_quat(by_hand.initial.q)
-        assert float(row.pop("initial_angle")) == pytest.approx(turn.magnitude(), rel=1e-12)
-        assert not row  # nothing else was drawn
-        found = rollout.simulate_jit(by_hand, np.uint32(3), np.uint32(k)).metrics
-        for name in found._fields:
-            a, b = float(getattr(found, name)), float(getattr(trials.metrics, name)[k])
-            assert a == pytest.approx(b, rel=1e-9, abs=1e-12, nan_ok=True), (k, name)
 
 
 def test_failed_trials_are_counted_and_leave_the_others_alone(flown):

@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation import catalogues, rollout
 from tests.helpers import vector
 
 SEED, FLOWN = 3, 50  # trials, so few that the program of two of them flies them
@@ -47,6 +47,7 @@ disturbance_phase = { kind = "uniform" }
 disturbance_amplitude = { kind = "relative_normal" }
 disturbance_bias = { kind = "normal" }
 attitude_noise = { kind = "relative_normal" }
+rate_noise = { kind = "relative_uniform" }
 torque_limit = { kind = "relative_uniform" }
 """
 CHAIN = """
@@ -109,46 +110,63 @@ def corners(everything):
     return table, of_plan(made, table).fly(range(2))
 
 
-def test_what_a_row_gives_is_what_is_flown(everything, corners):
-    """Against parts set by hand, from the nominal ones alone."""
-    made, (table, flown) = everything[0], corners
-    assert flown["plan_trial"].to_list() == [5, 9]
-    assert flown["plan_seed"].to_list() == [SEED, 11]
-    for k, row in enumerate(table.iter_rows(named=True)):
-        parts = made.ready.parts
-
-        def numbers(name, row=row):
-            return vector([value for key, value in row.items() if key.startswith(name) and key[len(name) :].isdigit()])
-
-        upper = np.triu(np.ones((3, 3)), 0) > 0
-        inertia = np.zeros((3, 3))
-        inertia[upper] = [row[f"inertia_{i}{j}"] for i in (1, 2, 3) for j in range(i, 4)]
-        inertia = np.where(upper, inertia, inertia.T)
-        sinusoid, gradient = parts.disturbance.terms
-        phases, amplitudes = numbers("disturbance_phase_"), numbers("disturbance_amplitude_")
-        acting = disturbances.Sum((
-            dataclasses.replace(sinusoid, phase=phases[:3], amplitude=amplitudes),
-            dataclasses.replace(gradient, phase=phases[3], inertia=vector(inertia)),
-            disturbances.Constant(numbers("disturbance_bias_")),
-        ))  # fmt: skip
-        by_hand = dataclasses.replace(
-            parts,
-            plant=rigid_body.spacecraft(inertia),
-            disturbance=acting,
-            initial=rigid_body.AttitudeState(numbers("initial_q"), numbers("initial_w")),
-            reference=dataclasses.replace(parts.reference, q=numbers("reference_q")),
-            sensors=dataclasses.replace(
-                parts.sensors, attitude_noise=vector(row["attitude_noise"]), given_bias=numbers("rate_bias_")
-            ),
-            actuators=dataclasses.replace(parts.actuators, torque_limit=vector(row["torque_limit"])),
-        )
-        run = rollout.simulate_jit(by_hand, jnp.uint32(row["seed"]), jnp.uint32(row["trial"]))
-        assert rollout.STATUS[int(run.status)][0] == flown["status"][k]
+def test_what_stands_in_a_row_is_what_is_flown(everything, corners):
+    """Drawn or given, every number: against parts set by hand, from the nominal ones alone."""
+    made, drawn, _ = everything
+    table, given = corners
+    assert given["plan_trial"].to_list() == [5, 9]
+    assert given["plan_seed"].to_list() == [SEED, 11]
+    for row in (*drawn.head(2).iter_rows(named=True), *given.iter_rows(named=True)):
+        by_hand = set_by_hand(made.ready.parts, row)
+        seed, trial = row.get("plan_seed", SEED), row.get("plan_trial", row["trial"])
+        run = rollout.simulate_jit(by_hand, jnp.uint32(seed), jnp.uint32(trial))
+        assert rollout.STATUS[int(run.status)][0] == row["status"]
         for name in made.ready.catalogue:
             value = float(getattr(run.metrics, name))
-            assert flown[name][k] == pytest.approx(value, rel=1e-11) or np.isnan(value), name
-        for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
-            assert flown[name][k] == pytest.approx(row[name], rel=1e-12), name
+            assert row[name] == pytest.approx(value, rel=1e-11) or np.isnan(value), name
+        turn = Rotation.from_quat(by_hand.reference.q).inv() * Rotation.from_quat(by_hand.initial.q)
+        assert row["initial_angle"] == pytest.approx(turn.magnitude(), rel=1e-12)
+    for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
+        np.testing.assert_allclose(given[name], table[name], rtol=1e-12, err_msg=name)
+
+
+def set_by_hand(parts, row):
+    """The nominal parts with every number that a row has of a spacecraft."""
+    row = dict(row)
+
+    def numbers(name, count):
+        return vector([row.pop(f"{name}{k}") for k in range(1, count + 1)])
+
+    for what in (*made_of_a_run(), "initial_angle"):
+        row.pop(what, None)
+    inertia = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            inertia[i, j] = inertia[j, i] = row.pop(f"inertia_{i + 1}{j + 1}")
+    sinusoid, gradient = parts.disturbance.terms
+    phases, amplitudes = numbers("disturbance_phase_", 4), numbers("disturbance_amplitude_", 3)
+    acting = disturbances.Sum((
+        dataclasses.replace(sinusoid, phase=phases[:3], amplitude=amplitudes),
+        dataclasses.replace(gradient, phase=phases[3], inertia=vector(inertia)),
+        disturbances.Constant(numbers("disturbance_bias_", 3)),
+    ))  # fmt: skip
+    noises = {name: vector(row.pop(name)) for name in ("attitude_noise", "rate_noise")}
+    by_hand = dataclasses.replace(
+        parts,
+        plant=rigid_body.spacecraft(inertia),
+        disturbance=acting,
+        initial=rigid_body.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
+        reference=dataclasses.replace(parts.reference, q=numbers("reference_q", 4)),
+        sensors=dataclasses.replace(parts.sensors, given_bias=numbers("rate_bias_", 3), **noises),
+        actuators=dataclasses.replace(parts.actuators, torque_limit=vector(row.pop("torque_limit"))),
+    )
+    assert not row  # nothing else was drawn
+    return by_hand
+
+
+def made_of_a_run():
+    """Columns of a row that are no number that it is flown with."""
+    return ("trial", "plan_trial", "plan_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
 def test_what_a_row_does_not_give_is_drawn(everything):
