@@ -261,9 +261,9 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(starts, "SWEPT", 64)
-    some = problem(dispersion=TURNED, peak_torque=0.9)
+    some = problem(peak_torque=1.4)
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-    wanted = (Requirement("peak_torque", 0.9),)
+    wanted = (Requirement("peak_torque", 1.4),)
     seen = []
     evaluate = Evaluator(limits)
     found = optimise.search(
@@ -289,8 +289,9 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     # hand-overs on samples, as they are flown
     grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 49), 0.2 * np.arange(1, 26)), axis=-1).reshape(-1, 2)
     f, c = scan(jnp.asarray(grid))
-    best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= 0.0].min())
+    best = np.exp(np.asarray(f)[np.asarray(c).max(axis=(1, 2)) <= -found.margin].min())  # which it keeps
     assert found.value <= best * 1.01
+    assert found.worst[0] > 1.0 - 1.5 * found.margin  # and no more than it must
     f, c, _ = measure(final, jnp.asarray(found.gains))
     np.testing.assert_allclose(np.exp(f), found.value, rtol=1e-9)
     assert np.asarray(c).max() <= 0.0
@@ -449,12 +450,14 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
 
 
 def test_statistics_count_failures_and_average_the_rest():
-    run = parts(20.0, 3.0, 0.5, period=0.2, t_end=21.0)
-    wide = variation.Dispersion(attitudes.AxisAngle(vector(np.pi - 0.05), vector(np.pi)))
-    trials = montecarlo.run(run, wide, 5, np.arange(64))
-    told = tune_files.statistics(trials, "spacecraft")
-    assert told["trials"] == 64
-    assert 0 < told["counts"]["singular"] < 64
+    trials = montecarlo.run(problem().parts, SPREAD, 3, np.arange(8))
+    lost = np.array([1, 4, 6])
+    trials.status[lost] = rollout.SINGULAR
+    for values in trials.metrics:
+        values[lost] = np.nan
+    told = tune_files.statistics(trials, "chain")
+    assert told["trials"] == 8
+    assert told["counts"]["singular"] == 3
     errors = trials.metrics.window_error[trials.ok]
     np.testing.assert_allclose(told["window_error"]["rms"], np.sqrt(np.mean(errors**2)))
     np.testing.assert_allclose(told["peak_torque"]["max"], trials.metrics.peak_torque[trials.ok].max())
