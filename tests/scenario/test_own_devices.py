@@ -102,7 +102,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     sample = np.asarray(ticks.sample)[np.asarray(ticks.t_next > ticks.t)]
     key = draws.stream(np.uint32(3), np.uint32(7), OWN_NOISE)
-    noise = np.array([draws.normals(key, 2, k) for k in sample[1:]])
+    noise = np.asarray(jax.jit(jax.vmap(lambda k: draws.normals(key, 2, k)))(sample[1:]))
     seen = x[1:-1] + np.array([0.02, 0.03]) * noise
     wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # its first one lies a sample back
     np.testing.assert_allclose(u[2:-1, 0], wanted, rtol=0.0, atol=1e-13)

@@ -11,7 +11,7 @@ from scipy.stats import binom
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from tests import helpers
-from tests.search.test_tuning import SPREAD, problem
+from tests.search.test_tuning import SPREAD, measure, problem
 from tuning.search import confirm, gains, objective, optimise, rounds, shares
 from tuning.search.evaluate import Evaluator
 
@@ -92,11 +92,11 @@ def test_a_band_stands_for_the_training_trials():
     ratios = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
     torque, effort = (np.asarray(v) for v in (ratios.metrics.peak_torque / 0.7 - 1, ratios.metrics.effort / 5.0 - 1))
     search = rounds.Rounds(Evaluator(shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0))), banded, wanted, robust=False)
-    before = np.asarray(objective.measure(objective.fewer_trials(search.problem, 8), at)[1])
+    before = np.asarray(measure(objective.fewer_trials(search.problem, 8), at)[1])
     np.testing.assert_allclose(before[0, :8], torque[:8], rtol=1e-10)  # at first each training trial must keep it
     assert before[0, 8:].max() == -1.0
     joined = rounds._with_bands(search.problem, {0: np.array([8, 9, 10, 0, 1])})
-    after = np.asarray(objective.measure(joined, at)[1])
+    after = np.asarray(measure(joined, at)[1])
     band = torque[[8, 9, 10, 0, 1]]
     np.testing.assert_allclose(np.sort(after[0])[-5:], np.sort(np.minimum(band, np.sort(band)[-3])), rtol=1e-10)
     assert np.sort(after[0])[-6] == -1.0
