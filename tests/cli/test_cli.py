@@ -15,7 +15,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs, store
 from ptsmc_jax.scenario import parsing, timing
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, short, small_search, tree
+from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
 from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
 from tests.scenario.bad_scenarios import check_sentence
@@ -556,22 +556,23 @@ def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_le
 
 
 def test_map_leaves_what_the_contract_says(command, tmp_path):
+    (tmp_path / "c.toml").write_text(SHORT_CHAIN)
     pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.k1=0.8:1.6:2")  # of one program
-    status, out, _ = command("map", "s.toml", *pairs, "--trials", 2)
+    status, out, _ = command("map", "c.toml", *pairs, "--trials", 2)
     assert status == 0
     assert "4 of 4 pairs flown" in out
-    assert set(tree(tmp_path / "out" / "map-s")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
+    assert set(tree(tmp_path / "out" / "map-c")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
     again = "ptsmc map scenario.toml --x controller.eta=2.7:2.9:2 --y controller.k1=0.8:1.6:2 --trials 2 --seed 0"
-    read = checked(tmp_path / "out" / "map-s")
+    read = checked(tmp_path / "out" / "map-c")
     assert again in read.text
-    assert "linear_torque [N m]" in read.text
+    assert "linear_torque [u]" in read.text
     assert "gain_margin [" not in read.text  # a factor
     first = out.splitlines()[0]
     assert first.startswith("the smallest RMS window error is ")
     assert read.text.index(first[1:]) < read.text.index("Pairs")
     for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.k1=0.8:1.6:2"),
                 ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
-        status, out, err = command("map", "s.toml", *pairs, "--out", "bad", *bad)
+        status, out, err = command("map", "c.toml", *pairs, "--out", "bad", *bad)
         assert (status, out) == (2, "")
         assert err.startswith("ptsmc: ")
         assert "Traceback" not in err

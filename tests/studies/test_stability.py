@@ -2,13 +2,14 @@
 
 import csv
 import json
+import tomllib
 
 import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.theory import run_margins
-from tests.helpers import SHORT, short
+from tests.helpers import SHORT, SHORT_CHAIN, short
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
 
@@ -49,7 +50,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
 
 def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     asked = "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
-    (tmp_path / "asks.toml").write_text(SHORT.split("[requirements]")[0] + asked)
+    (tmp_path / "asks.toml").write_text(SHORT_CHAIN.split("[requirements]")[0] + asked)
     status, out, _ = command("simulate", "asks.toml", "--no-figures")
     assert status == 1
     assert "gain_margin at least 1 dB" in out
@@ -110,11 +111,9 @@ def test_few_margins_are_warned_of():
 
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
 def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
-    """t_f - delta is half a period: no sample before the hand-over lasts a whole one. Else as `SHORT`."""
-    law = {"t_f": 5.0, "delta": 5.0 - 0.5 * period}
-    loop = {"mode": "sampled", "period": period, "t_end": 6.5}
-    noise = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
-    tables = {"controller": law, "loop": loop, "hardware": noise}
+    """t_f - delta is half a period: no sample before the hand-over lasts a whole one."""
+    tables = {**tomllib.loads(SHORT_CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
+    tables["loop"]["period"] = period
     parts = scenario.study(scenario.from_tables(tables)).parts
     ends = run_margins.at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
