@@ -40,6 +40,8 @@ HOUSE = {
             interval
             assembly metric_rows requirements
             computer gains metrics
+            run_state
+            continuous sampled
             rollout
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",

@@ -60,7 +60,7 @@ class OwnSensors(Sensor):
         key = draws.stream(seed, trial, OWN_NOISE)
         return key, self.noise(key, now.sample), self.own.begin(x0)
 
-    def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, tuple]:
+    def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, tuple]:
         """The measured state, and the memory; a period without a length [s] does not change the memory."""
         key, noise, own_memory = memory
         noise_next = self.noise(key, now.sample + 1)

@@ -1,9 +1,9 @@
-"""What the law sees: star tracker and gyro, raw or through a gyro-propagated attitude filter; a chain's states.
+"""Sensors: star tracker and gyro, raw or through a gyro-propagated attitude filter; a chain's states.
 
 White noise is 1 sigma per sample, density / sqrt(period) (IEEE Std 952): attitudes in rad, rates in rad/s, a chain's
 states in the states' own units. A sensor has a memory (noise of the sample, bias, estimate) that the rollout carries;
-its noise belongs to (seed, trial, sample). In the partial first period of the anchored clock everything a sample does
-is weighted by the period's share, so that nothing jumps where that period vanishes.
+its noise belongs to (seed, trial, sample). In the partial first period of the anchored clock all effects of a sample
+are weighted by the period's share, so that nothing jumps where that period vanishes.
 """
 
 from abc import ABC, abstractmethod
@@ -27,18 +27,29 @@ RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_star
 
 
 class Sensor(ABC):
-    """What the rollout, linear theory and campaigns ask of a sensor."""
+    """What the rollout, linear theory and campaigns ask of a sensor.
+
+    A true state x is what sensors can see of it, `Plant.visible`.
+    """
 
     @abstractmethod
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
-        """Memory before the first sample of positive length [s], which is now."""
+        """Memory before the first sample of positive length [s], which is now; x0: true state."""
 
     @abstractmethod
-    def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
-        """The state as the law sees it, and the memory; dt: length of the period just ended [s]."""
+    def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
+        """The measured state, as the law uses it, and the memory.
 
-    def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar) -> tuple[Any, Any]:
-        """The state as it is read before any filter, and the memory; dt as in `measure` [s]."""
+        Args:
+            memory: from `begin`, or from the sample before.
+            x: true state.
+            now: the control period that the sample begins.
+            dt: length of the period just ended [s].
+            star_x: true state when a star tracker with times of its own sampled in that period; None without one.
+        """
+
+    def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
+        """The state as it is read before any filter, and the memory; arguments as in `measure`."""
         return self.measure(memory, x, now, dt)
 
     @abstractmethod
@@ -55,29 +66,29 @@ class Sensor(ABC):
 
 
 class Reading(NamedTuple):
-    """What a sensor says of a state near the true one, to first order, for `error_floor`.
+    """A sensor to first order, for `error_floor`: its readings of a state near the true one.
 
     Of (x, own): local coordinates (n,) of the plant, see `Plant.retract`, then the sensor's own states, a gyro's bias.
     """
 
-    rows: np.ndarray  # (m, n + own) what is read of them
+    rows: np.ndarray  # (m, n + own) of the readings by these coordinates
     noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
     every: np.ndarray  # (m,) control periods from one reading to the next; 0: it is read at `own_times`
     own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
     own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
     start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
     own_times: StarTimes | None = None
-    slopes: np.ndarray | None = None  # (m, n + own) rates of what is read, where it is read at own times
+    slopes: np.ndarray | None = None  # (m, n + own) derivatives of `rows`, for readings at own times [1/s]
 
-    def there(self, sample: np.ndarray) -> np.ndarray:
+    def available(self, sample: np.ndarray) -> np.ndarray:
         """Whether control samples (N,), by their numbers, have each of the readings, (N, m) bool [-]."""
-        found = sample[:, None] % np.maximum(self.every, 1) == 0
+        by_count = sample[:, None] % np.maximum(self.every, 1) == 0
         if self.own_times is None:
-            return found
-        return np.where(self.every == 0, np.asarray(self.own_times.due(sample))[:, None], found)
+            return by_count
+        return np.where(self.every == 0, np.asarray(self.own_times.due(sample))[:, None], by_count)
 
     def rows_at(self, sample: np.ndarray, dt: np.ndarray) -> np.ndarray:
-        """What is read at control samples (N,), (N, m, n + own), to first order in how old it is.
+        """The rows at control samples (N,), (N, m, n + own), to first order in the age of the readings.
 
         dt: lengths of the periods before them, (N,) [s].
         """
@@ -88,10 +99,10 @@ class Reading(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What `Sensors` carries from sample to sample."""
+    """Memory of `Sensors` between samples."""
 
-    keys: tuple
-    noise: tuple[Array, Array]  # of the sample to come
+    keys: tuple[draws.Key, draws.Key, draws.Key]  # see `Sensors.keys`
+    noise: tuple[Array, Array]  # of the next sample
     bias: Any  # (3,) of the gyro [rad/s]; None without one
     estimate: Any  # Estimate; None without a filter
     rate: Any  # (3,) as last measured [rad/s]; None without a filter
@@ -112,13 +123,13 @@ class Sensors(Sensor):
     filter: AttitudeFilter | None = None
     every: int = field(default=1, metadata={"static": True})  # periods between star tracker samples, with a filter
     given_bias: Leaf | None = None  # (3,) at the first sample, where it is not drawn [rad/s]
-    # as they are, where that is not as the flight software takes them
+    # misfits: how the true sensors differ from those that the flight software knows
     misalignment: Leaf | None = None  # (3,) rotation vector of the star tracker in the body [rad]
-    rate_scale: Leaf | None = None  # (3,) what the gyro reads of the rate [-]
-    outage: Leaf | None = None  # (2,) from when to when the star tracker has no samples [s]; with a filter
+    rate_scale: Leaf | None = None  # (3,) reading of the gyro over the true rate [-]
+    outage: Leaf | None = None  # (2,) start and end of the time without star tracker samples [s]; with a filter
     own_times: StarTimes | None = None  # of the star tracker where `every` is no whole number, with a filter
 
-    def turned(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
+    def star_attitude(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
         """The attitude (4,) of the star tracker, a unit quaternion, for that of the body."""
         if self.misalignment is None:
             return q
@@ -126,8 +137,8 @@ class Sensors(Sensor):
 
     def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
         """The sensors with a filter of another bandwidth [rad/s]; period: of control [s]."""
-        walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
-        noises = self.attitude_noise, self.rate_noise, walk
+        bias_walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
+        noises = self.attitude_noise, self.rate_noise, bias_walk
         if self.own_times is None:
             return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
         times = self.own_times
@@ -140,7 +151,7 @@ class Sensors(Sensor):
         return -0.5 * jnp.log1p(-self.filter.attitude_gain) / interval
 
     def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key]:
-        """Streams of a trial's noise: attitude, rate, change of the bias."""
+        """Keys of a trial's noise: attitude, rate, change of the bias."""
         attitude, rate, walk = draws.streams(seed, trial, (ATTITUDE_NOISE, RATE_NOISE, BIAS_WALK))
         return attitude, rate, walk
 
@@ -162,18 +173,18 @@ class Sensors(Sensor):
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> Memory:
         """Memory before the first sample of positive length, which is now."""
         keys, bias, estimate = self.keys(seed, trial), None, None
-        if any(bias is not None for bias in (self.rate_bias, self.bias_rate, self.given_bias)):
+        if any(source is not None for source in (self.rate_bias, self.bias_rate, self.given_bias)):
             bias = self.first_bias(seed, trial)
         if self.filter is not None:
             normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
-            none = jnp.zeros(3) if bias is None else bias
-            estimate = self.filter.begin(self.turned(x0.q), none, normals, now.sample, now.noise_weight)
+            true_bias = jnp.zeros(3) if bias is None else bias
+            estimate = self.filter.begin(self.star_attitude(x0.q), true_bias, normals, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
     def sample(
-        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, within: AttitudeState | None = None
+        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
     ) -> tuple[AttitudeState, Memory]:
-        """Attitude and rate as star tracker and gyro say them, and the memory; dt, within: see `measure`."""
+        """Attitude and rate as star tracker and gyro measure them, and the memory."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
         bias = memory.bias
@@ -182,51 +193,55 @@ class Sensors(Sensor):
         w = jnp.add(x.w if self.rate_scale is None else self.rate_scale * x.w, shift)
         if bias is not None:
             w = w + bias
-        q = self.turned(x.q if within is None else within.q)
+        q = self.star_attitude(x.q if star_x is None else star_x.q)
         q = attitude.multiply(q, attitude.from_rotation_vector(turn))
         return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
 
     def star_weight(self, now: Ticks) -> Scalar:
-        """How much a star tracker sample counts at this sample; 0: there is none."""
-        there, t = now.sample % self.every == 0, now.t
+        """The weight of a star tracker measurement at this sample; 0: there is none."""
+        due, t = now.sample % self.every == 0, now.t
         if self.own_times is not None:
-            there, t = self.own_times.due(now.sample), now.t - self.own_times.age(now.sample)
-        weight = jnp.where(there, now.noise_weight, 0.0)
+            due, t = self.own_times.due(now.sample), now.t - self.own_times.age(now.sample)
+        weight = jnp.where(due, now.noise_weight, 0.0)
         if self.outage is not None:
             weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
         return weight
 
     def star_age(self, sample: Int[Array, ""], dt: Scalar) -> Scalar:
-        """How long before a sample the star tracker took what it says there [s]; dt: of the period between [s].
+        """Age of the star tracker's measurement at a sample [s]; dt: length of the period before the sample [s].
 
-        Whatever is older, a sample of before t = 0 or one that is known already, is as old as the period.
+        Older ones, from before t = 0 or used already, count as old as the period.
         """
         return jnp.zeros_like(dt) if self.own_times is None else jnp.minimum(self.own_times.age(sample), dt)
 
     def measure(
-        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, within: AttitudeState | None = None
+        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
     ) -> tuple[AttitudeState, Memory]:
-        """Attitude and rate as the law sees them, and the memory; dt: length of the period just ended [s].
-
-        within: the true state at the star tracker's own time in that period, where it has its own.
-        """
-        read, kept = self.sample(memory, x, now, dt, within)
+        """Attitude and rate for the law: the samples, or the filter's attitude and the rate less its bias."""
+        read, memory_next = self.sample(memory, x, now, dt, star_x)
         if self.filter is None:
-            return read, kept
+            return read, memory_next
         old, rate, weight = memory.estimate, memory.rate, self.star_weight(now)
         if self.own_times is None:
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
             age = self.star_age(now.sample, dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
-        return AttitudeState(estimate.q, read.w - estimate.bias), kept._replace(estimate=estimate, rate=read.w)
+        return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
 
     def quiet(self) -> "Sensors":
         """The sensors without noise and bias; the filter keeps its gains."""
-        known = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
-        none = jnp.zeros_like(jnp.asarray(self.attitude_noise))
-        quiet = replace(self, attitude_noise=none, rate_noise=none, filter=known)
-        return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
+        exact = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
+        zero = jnp.zeros_like(jnp.asarray(self.attitude_noise))
+        return replace(
+            self,
+            attitude_noise=zero,
+            rate_noise=zero,
+            filter=exact,
+            rate_bias=None,
+            bias_rate=None,
+            given_bias=None,
+        )
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Bias of the gyro at the first sample [rad/s]."""
@@ -236,7 +251,7 @@ class Sensors(Sensor):
         return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
 
     def retract(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
-        """A memory near another one: the filter's attitude turned [rad], its bias and its rate changed [rad/s]."""
+        """The memory near another one at local coordinates: rotation of the filter's attitude [rad], bias and rate."""
         if memory.estimate is None:
             return memory
         turn, bias, rate = by.reshape(3, 3)
@@ -244,37 +259,42 @@ class Sensors(Sensor):
         return memory._replace(estimate=Estimate(q, memory.estimate.bias + bias), rate=memory.rate + rate)
 
     def local_coordinates(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
-        """What `retract` takes a memory to another one by, to first order."""
-        if memory.estimate is None:
+        """Local coordinates (n,) [rad, rad/s] of a memory near another one, to first order."""
+        if memory.estimate is None or other.estimate is None:
             return jnp.zeros(0)
         turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
     def reading(self, period: float) -> Reading:
-        """Rotation [rad], every so many periods behind a filter, and rate with its bias [rad/s], every period [s]."""
-        one, none = np.eye(3), np.zeros((3, 3))
+        """Rotation [rad], behind a filter every `every` periods, and rate with its bias [rad/s], every period [s]."""
+        one, zero = np.eye(3), np.zeros((3, 3))
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
-        start, every, times = None, 1, self.own_times
+        start, star_every = None, 1
         if self.filter is not None:
-            root, every = np.asarray(self.filter.spread[-1]), self.every
-            start = np.block([[one, none, none], [none, none, one]]), np.kron(root @ root.T, one)
-        rows = np.block([[one, none, none], [none, one, one]])
-        kept, slopes = np.repeat([every if times is None else 0, 1], 3), np.block([[none, one, none], [none] * 3])
-        noises = np.repeat([star, gyro], 3)
-        return Reading(rows, noises, kept, np.full(3, bias), np.full(3, drift), start, times, slopes)
+            root, star_every = np.asarray(self.filter.spread[-1]), self.every
+            start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root @ root.T, one)
+        return Reading(
+            rows=np.block([[one, zero, zero], [zero, one, one]]),
+            noise=np.repeat([star, gyro], 3),
+            every=np.repeat([star_every if self.own_times is None else 0, 1], 3),
+            own=np.full(3, bias),
+            own_drift=np.full(3, drift),
+            start=start,
+            own_times=self.own_times,
+            slopes=np.block([[zero, one, zero], [zero, zero, zero]]),
+        )
 
     def in_step(self) -> "Sensors":
-        """The same with a star tracker that counts a little at every control sample, where it has its own times.
+        """The sensors with a star tracker of weaker measurements at every control sample, where it has its own times.
 
-        As much in the mean, and as noisy: by the share of a sample a period, of white noise in proportion.
+        With the share of a sample in a period as weight, and white noise in proportion, they tell as much in the mean.
         """
         if self.own_times is None or self.filter is None:
             return self
-        share = self.own_times.period / self.own_times.interval
-        known = self.filter
-        known = replace(known, attitude_gain=share * known.attitude_gain, bias_gain=share * known.bias_gain)
-        return replace(self, attitude_noise=self.attitude_noise / jnp.sqrt(share), filter=known, own_times=None)
+        share, old = self.own_times.period / self.own_times.interval, self.filter
+        weaker = replace(old, attitude_gain=share * old.attitude_gain, bias_gain=share * old.bias_gain)
+        return replace(self, attitude_noise=self.attitude_noise / jnp.sqrt(share), filter=weaker, own_times=None)
 
 
 @pytree
@@ -285,7 +305,7 @@ class StateSensor(Sensor):
     sigma: Leaf  # (n,) 1 sigma of each state
 
     def key(self, seed: WholeNumber, trial: WholeNumber) -> draws.Key:
-        """Stream of a trial's noise."""
+        """Key of a trial's noise."""
         return draws.stream(seed, trial, STATE_NOISE)
 
     def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " n"]:
@@ -297,7 +317,9 @@ class StateSensor(Sensor):
         key = self.key(seed, trial)
         return key, self.noise(key, now.sample)
 
-    def measure(self, memory: tuple, x: Float[Array, " n"], now: Ticks, dt: Scalar) -> tuple[Float[Array, " n"], tuple]:
+    def measure(
+        self, memory: tuple, x: Float[Array, " n"], now: Ticks, dt: Scalar, star_x: None = None
+    ) -> tuple[Float[Array, " n"], tuple]:
         """The states as measured, and the memory."""
         key, noise = memory
         noise_next = self.noise(key, now.sample + 1)

@@ -12,20 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.dispersions.base import Drawn, Numbers, Quantity, UnfitError, numbered, positive
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation.assembly import Parts
 
 
-def _actuators(parts: Parts) -> Actuators:
-    return Actuators() if parts.actuators is None else parts.actuators
-
-
 def channels(parts: Parts) -> Float[Array, "m channels"]:
     """Directions (m, channels) [-] in which flight software takes its channels to act: body axes, or wheels."""
-    wheels = _actuators(parts).wheels
+    wheels = parts.effective_actuators.wheels
     return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
 
 
@@ -43,11 +38,11 @@ def _paired(name: str, count: int) -> list[str]:
 
 def _of_actuators(name: str, key: str, columns: Callable, nominal: Callable, write: Callable, checked: Any) -> Quantity:
     def read(parts: Parts) -> Numbers:
-        found = getattr(_actuators(parts), key)
+        found = getattr(parts.effective_actuators, key)
         return jnp.ravel((nominal(parts) if found is None else found).T)
 
     def written(parts: Parts, given: Numbers) -> Parts:
-        return replace(parts, actuators=replace(_actuators(parts), **{key: write(given)}))
+        return replace(parts, actuators=replace(parts.effective_actuators, **{key: write(given)}))
 
     return Quantity(lambda parts: columns(name, _size(parts)), read, written, checked)
 
@@ -63,16 +58,15 @@ def _unit_vectors(given: np.ndarray) -> np.ndarray:
 
 def _failure() -> Quantity:
     def read(parts: Parts) -> Numbers:
-        fails = _actuators(parts).failure_times
+        fails = parts.effective_actuators.failure_times
         if fails is None:
             return jnp.array([jnp.inf, 0.0])
         return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
 
     def write(parts: Parts, given: Numbers) -> Parts:
         wheel = jnp.arange(channels(parts).shape[1]) + 1.0
-        return replace(
-            parts, actuators=replace(_actuators(parts), failure_times=jnp.where(wheel == given[1], given[0], jnp.inf))
-        )
+        failure_times = jnp.where(wheel == given[1], given[0], jnp.inf)
+        return replace(parts, actuators=replace(parts.effective_actuators, failure_times=failure_times))
 
     def with_whole_wheel(given: np.ndarray) -> np.ndarray:
         UnfitError.check(given[:, 1] == np.round(given[:, 1]), lambda k: "a time and the number of a wheel, from 1 on")

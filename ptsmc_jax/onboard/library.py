@@ -168,21 +168,19 @@ class InTheLoop:
         """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""
         computer = OURS.boot(parts, seed, trial, x0, first)
         state = jnp.asarray(self.library.first())
-        estimate = getattr(computer.sensing, "estimate", None)
+        estimate = getattr(computer.sensors, "estimate", None)
         if estimate is not None:
             state = self._with(self._with(state, "attitude", estimate.q), "bias", estimate.bias)
-        return computer._replace(sensing=(computer.sensing, state))
+        return computer._replace(sensors=(computer.sensors, state))
 
     def decide(
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
-        (now, dt_before, *_), (sensing, state) = period, computer.sensing
+        (now, dt_before, *_), (sensing, state) = period, computer.sensors
         read, sensors = x, parts.sensors
         if sensors is not None:
-            read, sensing = sensors.sample(
-                sensing, x, now, dt_before, *(() if period.within is None else (period.within,))
-            )
+            read, sensing = sensors.sample(sensing, x, now, dt_before, period.star_x)
         inputs = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             inputs["applied"] = computer.applied[0]

@@ -1,6 +1,5 @@
 """What a flight computer is given and gives, sample by sample, as the simulator flies it: what C is checked by."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,14 +8,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
-from ptsmc_jax.devices.actuators import Actuators, Drive
-from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import boot, brought_about, decide, schedule, seen_within
-from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, over_period, walk_stream
+from ptsmc_jax.simulation.computer import assumed_torque, boot, decide, schedule, star_state
+from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
+from ptsmc_jax.simulation.sampled import PeriodMotion, walk_stream
 
 
 class Samples(NamedTuple):
@@ -51,59 +49,55 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     """A trial by samples: the sampled loop of `rollout` without its metrics."""
     parts = dispersion.apply(parts, seed, trial)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    law, actuators = parts.controller, Actuators() if parts.actuators is None else parts.actuators
+    law, actuators = parts.controller, parts.effective_actuators
     target = parts.reference(jnp.zeros_like(parts.t_end))
     x0 = law.align(parts.initial, target)
     k2 = parts.observer.error_bound()
     listed, period_of, started = schedule(parts, ticks)
-    walk = walk_stream(seed, trial)
+    walk_key = walk_stream(seed, trial)
     sensors, wheels = parts.sensors, actuators.wheels
 
     def flown(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
-        (now, dt_before, *_), (x, computer, acting, pushed, unit, within) = tick, carry
+        (now, dt_before, *_), (x, computer, acting, walk, unit, star_x) = tick, carry
         dt = now.t_next - now.t
-        there, sensing = parts.plant.visible(x), computer.sensing
+        there, sensing = parts.plant.visible(x), computer.sensors
         measured = there
         if sensors is not None:
-            measured, _ = sensors.sample(sensing, there, now, dt_before, *(() if within is None else (within,)))
+            measured, _ = sensors.sample(sensing, there, now, dt_before, star_x)
         before = getattr(sensing, "estimate", None)
         applied = computer.applied[0]
-        period = period_of(tick)._replace(within=within)
+        period = period_of(tick)._replace(star_x=star_x)
         (target, d_hat, u, s, w, _), computer = decide(parts, k2, period, computer, there)
         drive, queue = actuators.command(acting, u, w, now.t, dt, now.noise_weight)
-        if pushed is not None:
-            pushed = pushed + parts.walk_rate * dt * draws.normals(walk, parts.plant.inputs, now.sample)
-        until = partial(_until, parts, now, x, drive, pushed)
-        x_next, after = until(now.t_next), seen_within(parts, now, until)
-        brought = (drive.c, None) if actuators.holds else brought_about(actuators, drive, dt)
+        if walk is not None:
+            walk = walk + parts.walk_rate * dt * draws.normals(walk_key, parts.plant.inputs, now.sample)
+        motion = PeriodMotion(parts, now.t, x, drive, walk)
+        x_next, next_star_x = motion.at(now.t_next), star_state(parts, now, motion.at)
+        brought = (drive.c, None) if actuators.holds else assumed_torque(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=dt > 0.0, measured=measured,
             valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
-            age=None if within is None or sensors is None else sensors.star_age(now.sample, dt_before),
-            before=before, estimate=getattr(computer.sensing, "estimate", None),
-            gyro=getattr(computer.sensing, "rate", None),
-            applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.memory,
+            age=None if star_x is None or sensors is None else sensors.star_age(now.sample, dt_before),
+            before=before, estimate=getattr(computer.sensors, "estimate", None),
+            gyro=getattr(computer.sensors, "rate", None),
+            applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.observer,
             law=computer.law, queue=queue, d_hat=d_hat, command=u, s=s,
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
         )  # fmt: skip
         computer, acting = computer._replace(applied=brought), actuators.end(acting, drive, queue, dt)
-        return (x_next, computer, acting, pushed, unit, after), row
+        return (x_next, computer, acting, walk, unit, next_star_x), row
 
     computer = boot(parts, seed, trial, parts.plant.visible(x0), started)
     if actuators.holds:
         computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
-    pushed = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    unknown, within = jnp.full_like(parts.t_end, jnp.nan), seen_within(parts, started, lambda t: x0)
-    start = x0, computer, actuators.begin(parts.plant.inputs), pushed, unknown, within
+    walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+    unknown, star_x = jnp.full_like(parts.t_end, jnp.nan), star_state(parts, started, lambda t: x0)
+    start = x0, computer, actuators.begin(parts.plant.inputs), walk, unknown, star_x
     return jax.lax.scan(flown, start, listed)[1]
-
-
-def _until(parts: Parts, now: Ticks, x: Any, drive: Drive, pushed: Array | None, t: Array) -> Any:
-    return over_period(parts, now.t, x, drive, pushed, t - now.t)
 
 
 @programs.jit(compiler_options=programs.QUICKLY)

@@ -1,4 +1,4 @@
-"""What a run is made of."""
+"""The parts of a run."""
 
 from dataclasses import dataclass, field, fields, replace
 from types import FunctionType
@@ -19,13 +19,13 @@ _Setup = TypeVar("_Setup", bound="Setup")
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """What a run is made of but for its clock. `plant` is the truth; controller and observer hold a nominal model."""
+    """The parts of a run but for its clock. `plant` is the truth; controller and observer hold a nominal model."""
 
     plant: Plant
     disturbance: Any  # callable: t [s], true state -> (m,) [N m]
-    reference: Any  # callable: t [s] -> what the law is to reach, a Target for spacecraft
-    controller: Any  # laws.Law
-    observer: Any  # observers.Observer
+    reference: Any  # callable: t [s] -> the target of the law, a `references.Target` for spacecraft
+    controller: Any  # laws.base.Law
+    observer: Any  # observers.base.Observer
     sensors: Any  # sensors.Sensor, or None: the law sees the true state
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
@@ -34,11 +34,11 @@ class Setup:
     actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     command_filter: CommandFilter | None = None  # between the law and the actuators
-    jitter: Leaf | None = None  # by which a sample comes early or late at most, as a share of the control period [-]
-    pointing: Pointing | None = None  # what pointing error indices are taken of
+    jitter: Leaf | None = None  # by how much a sample comes early or late at most, as a share of the control period [-]
+    pointing: Pointing | None = None  # which pointing errors are observed
 
     def __post_init__(self) -> None:
-        """A plain function, or a lambda, is a disturbance and a reference too; an attitude may be its quaternion."""
+        """Wraps plain functions and lambdas as disturbance or reference; that of an attitude may give a quaternion."""
         for name in ("disturbance", "reference"):
             value = getattr(self, name)
             if isinstance(value, FunctionType):
@@ -56,17 +56,24 @@ class Setup:
         known: the law and the observer know it; else it is that of the truth alone. Raises ValueError where a plant
         has none.
         """
-        body, moved = spacecraft(inertia), dict[str, Any](plant=self.plant)
-        if known:
-            both = {"controller": self.controller, "observer": self.observer}
-            moved |= {name: part.model for name, part in both.items() if hasattr(part, "model")}
-        for name, plant in moved.items():
+        body = spacecraft(inertia)
+
+        def changed(plant: Any, name: str) -> Any:
             if not hasattr(plant, "with_inertia"):
-                of = "plant" if name == "plant" else f"model of the {name}"
-                raise ValueError(f"the {of} is a {type(plant).__name__}, but with_inertia goes with a spacecraft")
-        changed = {name: plant.with_inertia(body.inertia, body.inertia_inverse) for name, plant in moved.items()}
-        models = {name: replace(getattr(self, name), model=model) for name, model in changed.items() if name != "plant"}
-        return replace(self, plant=changed["plant"], **models)
+                raise ValueError(f"the {name} is a {type(plant).__name__}, but with_inertia goes with a spacecraft")
+            return plant.with_inertia(body.inertia, body.inertia_inverse)
+
+        changes = {"plant": changed(self.plant, "plant")}
+        for name in ("controller", "observer") if known else ():
+            part = getattr(self, name)
+            if hasattr(part, "model"):
+                changes[name] = replace(part, model=changed(part.model, f"model of the {name}"))
+        return replace(self, **changes)
+
+    @property
+    def effective_actuators(self) -> Actuators:
+        """The actuators; perfect ones where there are none."""
+        return Actuators() if self.actuators is None else self.actuators
 
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """The parts of a run by this clock."""

@@ -1,4 +1,4 @@
-"""One interval of a run as its metrics see it: both ends, the torques in between, what the run is judged by."""
+"""One interval of a run as its metrics see it: both ends, the torques in between, and the criteria of the run."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ptsmc_jax.simulation.pointing import Course, Pointing
+from ptsmc_jax.simulation.pointing import ErrorPath, Pointing
 
 
 class Criteria(NamedTuple):
@@ -20,7 +20,7 @@ class Criteria(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """What the metrics see of the true state at one time."""
+    """The true state at one time, as far as the metrics need it."""
 
     angle: Array  # to the reference [rad]; for other plants |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
@@ -29,7 +29,7 @@ class Snapshot(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What the metrics see at t = 0."""
+    """A run at t = 0."""
 
     snapshot: Snapshot
     inputs: int  # of the plant
@@ -38,14 +38,14 @@ class Start(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """The true state at t_f as the law sees it; zero before."""
+    """The true state at t_f; zero before."""
 
-    error: Array  # (m,) what the law drives to zero [-], for other plants x_1
+    error: Array  # (m,) that the law drives to zero [-], for other plants x_1
     angle: Array  # to the reference [rad]
 
 
 class Errors(NamedTuple):
-    """What the law drives to zero at both ends of an interval, (m,) [-], for other plants x_1, and its rate [1/s]."""
+    """The error that the law drives to zero at both ends of an interval, (m,) [-], and its rate [1/s]."""
 
     start: Array
     start_rate: Array
@@ -53,27 +53,32 @@ class Errors(NamedTuple):
     end_rate: Array
 
 
-class Interval(NamedTuple):
-    """A control period, or a step of the continuous loop; torques at `weights`, quadrature nodes in it.
+class Torques(NamedTuple):
+    """Torques of an interval at the quadrature nodes of `weights`: one where they are held, else start, middle, end."""
 
-    There is one node where the torque is held.
-    """
-
-    t: Array  # [s]
-    t_next: Array
-    start: Snapshot
-    end: Snapshot
-    errors: Callable[[], Errors]  # made from t_f on only
-    arrival: Callable[[], Arrival]  # of an interval that t_f lies in
-    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
     commanded: tuple[Array, ...]  # (m,) each [N m]
-    delivered: tuple[Array, ...]
+    delivered: tuple[Array, ...]  # (m,) each [N m]
     weights: tuple[float, ...]  # sum to 1
     limited: Array  # bool: a limit of the actuators cuts the command
     wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
     wheel_torque: Array | None = None  # (times, wheels) at both ends [N m]
-    pointing: Callable[[], Course] | None = None  # error of the attitude in it, where that is observed
-    knowledge: Callable[[], Course] | None = None  # error of what the law is told of it, as long as that is the newest
+
+
+class Interval(NamedTuple):
+    """A control period, or a step of the continuous loop."""
+
+    t: Array  # [s]
+    t_next: Array  # [s]
+    start: Snapshot
+    end: Snapshot
+    errors: Callable[[], Errors]  # called from t_f on only
+    arrival: Callable[[], Arrival]  # called in the interval that t_f lies in only
+    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
+    torques: Torques
+    attitude_error: Callable[[], ErrorPath] | None = None  # where pointing is observed
+    knowledge_error: Callable[[], ErrorPath] | None = (
+        None  # of the attitude measured at the start, where it is measured
+    )
 
     @property
     def length(self) -> Array:

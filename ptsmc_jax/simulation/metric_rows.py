@@ -10,11 +10,12 @@ from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.simulation import pointing
+from ptsmc_jax.simulation.catalogues import WITHIN
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, integral_in_window
 
 
 class Running(NamedTuple):
-    """Where a run stands: the state at t_f, and what each metric remembers, by its name."""
+    """The metrics of a run so far: the state at t_f, and what each metric remembers, by its name."""
 
     arrival: Arrival
     memories: dict[str, Any]
@@ -22,11 +23,11 @@ class Running(NamedTuple):
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric comes about; its unit and meaning stand in `catalogues`, for the plants that have it.
+    """How a metric is computed; its unit and meaning stand in `catalogues`, for the plants that have it.
 
-    It changes after every interval of positive length by `update`, or by `update_after_t_f`, which sees intervals that
-    reach beyond t_f only, and the errors at their ends. Its value is what it remembers at t_end, unless `value` makes
-    another one of it. A metric that a run lacks is NaN from t = 0 on.
+    Its memory from `begin` changes after every interval of positive length by `update`, or by `update_after_t_f`, which
+    is called for intervals that reach beyond t_f only, with the errors at their ends. Its value is the memory at t_end,
+    or what `value` makes of it. A metric that a run lacks is NaN from t = 0 on.
     """
 
     begin: Callable[[Start, Criteria], Any] = lambda start, criteria: jnp.zeros_like(criteria.t_f)
@@ -39,15 +40,15 @@ class Metric:
 def _peak(
     during: Callable[[Interval], Array | None], at_start: Callable[[Start], Array | None] | None = None
 ) -> Metric:
-    """The largest of what there is at t = 0, by default 0, and in every interval; None: the run lacks it."""
+    """The largest value at t = 0, by default 0, and in every interval; None: the run lacks it."""
 
     def begin(start: Start, criteria: Criteria) -> Array:
         first = jnp.zeros_like(criteria.t_f) if at_start is None else at_start(start)
         return jnp.full_like(criteria.t_f, jnp.nan) if first is None else first
 
     def update(largest: Array, interval: Interval, criteria: Criteria) -> Array:
-        present = during(interval)
-        return largest if present is None else jnp.maximum(largest, present)
+        value = during(interval)
+        return largest if value is None else jnp.maximum(largest, value)
 
     return Metric(begin, update)
 
@@ -61,7 +62,8 @@ def _size(of_wheels: Array | None) -> Array | None:
 
 
 def _effort(effort: Array, interval: Interval, criteria: Criteria) -> Array:
-    norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(interval.weights, interval.delivered, strict=True))
+    torques = interval.torques
+    norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(torques.weights, torques.delivered, strict=True))
     return effort + interval.length * sum(norms)
 
 
@@ -95,15 +97,15 @@ def _hold_error(largest: Array, interval: Interval, errors: Errors, criteria: Cr
 
 def _variation(variation: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     """Total variation of the torque delivered from t_f on, (m,) [N m]: the jump at its start, then inside."""
-    delivered = interval.delivered
+    delivered = interval.torques.delivered
     jump = jnp.where(interval.t > criteria.t_f, jnp.abs(delivered[0] - interval.last_torque), 0.0)
     inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
     return variation + jump + jnp.where(interval.t >= criteria.t_f, inside, 0.0)
 
 
 def _chattering(variation: Array, running: Running, criteria: Criteria) -> Array:
-    still = criteria.t_end - criteria.t_f
-    return jnp.max(variation) / jnp.where(still > 0.0, still, 1.0)
+    length = criteria.t_end - criteria.t_f
+    return jnp.max(variation) / jnp.where(length > 0.0, length, 1.0)
 
 
 def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
@@ -117,7 +119,7 @@ def _hold_angle(largest: Array, interval: Interval, errors: Errors, criteria: Cr
     return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, interval.end.angle), largest)
 
 
-def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -> Array:
+def _residual_modal(largest: Array, interval: Interval, criteria: Criteria) -> Array:
     """The largest at ends of intervals from t_f on; before, what it was."""
     amplitude = interval.end.modal_amplitude
     if amplitude is None:
@@ -127,33 +129,58 @@ def _ringing_after_t_f(largest: Array, interval: Interval, criteria: Criteria) -
     return jnp.where(reached, jnp.where(early, amplitude, jnp.maximum(largest, amplitude)), largest)
 
 
-# absolute, mean and relative index: of the attitude's error, and of what the law is told of it
-OF_ATTITUDE, OF_KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")
+def _pointing_rows(
+    absolute: str,
+    mean: str,
+    relative: str,
+    error_of: Callable[[Interval], Callable[[], pointing.ErrorPath] | None],
+    *,
+    measured: bool,
+    drift: str | None = None,
+) -> dict[str, Metric]:
+    """A row for each index of an error and each axis; they share the tally that the first of them keeps.
 
+    absolute, mean, relative, drift: names of the indices; measured: the error is that of a measurement.
+    """
+    keeper = f"{absolute}_{pointing.AXES[0]}"
 
-def _tally(indices: tuple[str, str, str], criteria: Criteria) -> pointing.Tally | None:
-    """Of an error whose indices, absolute, mean and relative, are these; None: no pointing is observed."""
-    asked = criteria.pointing
-    return None if asked is None else pointing.begin(jnp.zeros_like(criteria.t_f), asked.segments(indices[2]))
+    def begin(start: Start, criteria: Criteria) -> pointing.Tally | None:
+        if criteria.pointing is None or (measured and not start.measured):
+            return None
+        return pointing.begin(jnp.zeros_like(criteria.t_f), criteria.pointing.segments(relative))
 
+    def update(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> pointing.Tally | None:
+        observed, error = criteria.pointing, error_of(interval)
+        if tally is None or observed is None or error is None:
+            return tally
+        path = error()
+        limits = [
+            [jnp.asarray(observed.limits.get(f"{index}_{axis}", jnp.inf)) for axis in pointing.AXES]
+            for index in (absolute, mean, relative)
+        ]
+        limits = jnp.stack([jnp.stack(of_axes) for of_axes in limits])
+        begins = criteria.t_f + observed.after
+        return pointing.update(tally, path, interval.t, interval.t_next, begins, observed.window, limits)
 
-def _observed(
-    tally: Any, course: pointing.Course, indices: tuple[str, str, str], interval: Interval, criteria: Criteria
-) -> pointing.Tally:
-    assert criteria.pointing is not None
-    asked = criteria.pointing
-    each = [[jnp.asarray(asked.limits.get(f"{name}_{axis}", jnp.inf)) for axis in pointing.AXES] for name in indices]
-    limits = jnp.stack([jnp.stack(some) for some in each])
-    begins = criteria.t_f + asked.after
-    return pointing.update(tally, course, interval.t, interval.t_next, begins, asked.window, limits)
+    def row(index: Callable[[pointing.Tally, Criteria], Array], axis: int) -> Metric:
+        def value(memory: Any, running: Running, criteria: Criteria) -> Array:
+            tally = running.memories[keeper]
+            return jnp.full_like(criteria.t_f, jnp.nan) if tally is None else index(tally, criteria)[axis]
 
+        return Metric(begin=lambda start, criteria: None, value=value, may_lack=True)
 
-def _pointing(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.pointing(), OF_ATTITUDE, interval, criteria)  # pyright: ignore[reportOptionalCall]
-
-
-def _knowledge(tally: Any, interval: Interval, errors: Errors, criteria: Criteria) -> Any:
-    return tally if tally is None else _observed(tally, interval.knowledge(), OF_KNOWLEDGE, interval, criteria)  # pyright: ignore[reportOptionalCall]
+    # index -> its values so far (4,)
+    indices: dict[str, Callable[[pointing.Tally, Criteria], Array]] = {
+        absolute: lambda tally, criteria: tally.largest,
+        mean: lambda tally, criteria: tally.mean,
+        relative: lambda tally, criteria: tally.relative,
+        **({drift: lambda tally, criteria: pointing.drift(tally)} if drift is not None else {}),
+        f"{WITHIN}{absolute}": _time_within,
+        f"{WITHIN}{mean}": lambda tally, criteria: _share_of_windows(tally.means_beyond, tally, criteria),
+        f"{WITHIN}{relative}": lambda tally, criteria: _share_of_windows(tally.relative_beyond, tally, criteria),
+    }
+    rows = {f"{name}_{axis}": row(index, k) for name, index in indices.items() for k, axis in enumerate(pointing.AXES)}
+    return {**rows, keeper: replace(rows[keeper], begin=begin, update_after_t_f=update)}
 
 
 def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
@@ -161,68 +188,14 @@ def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
     return 1.0 - tally.beyond / (criteria.t_end - criteria.t_f - criteria.pointing.after)
 
 
-def _means_within(tally: pointing.Tally, criteria: Criteria) -> Array:
-    return _of_windows(tally.means_beyond, tally, criteria)
-
-
-def _relative_within(tally: pointing.Tally, criteria: Criteria) -> Array:
-    return _of_windows(tally.relative_beyond, tally, criteria)
-
-
-def _of_windows(beyond: Array, tally: pointing.Tally, criteria: Criteria) -> Array:
-    """What a time beyond limits leaves of that in whole windows, as a share of it; NaN where none is over."""
+def _share_of_windows(beyond: Array, tally: pointing.Tally, criteria: Criteria) -> Array:
+    """Share of the time in whole windows that a time beyond limits leaves; NaN where no window has ended."""
     assert criteria.pointing is not None
     observed = tally.windows * criteria.pointing.window
     return jnp.where(observed > 0.0, 1.0 - beyond / jnp.where(observed > 0.0, observed, 1.0), jnp.nan)
 
 
-def _from(first: str, index: Callable[[pointing.Tally, Criteria], Array], axis: int) -> Callable:
-    """The value of a metric that the tally kept under the name `first` knows; NaN without one."""
-
-    def value(memory: Any, running: Running, criteria: Criteria) -> Array:
-        tally = running.memories[first]
-        return jnp.full_like(criteria.t_f, jnp.nan) if tally is None else index(tally, criteria)[axis]
-
-    return value
-
-
-# index -> what a tally knows of it, (4,)
-POINTING = {
-    "ape": lambda tally, criteria: tally.largest,
-    "mpe": lambda tally, criteria: tally.mean,
-    "rpe": lambda tally, criteria: tally.relative,
-    "pde": lambda tally, criteria: pointing.drift(tally),
-    "within_ape": _time_within,
-    "within_mpe": _means_within,
-    "within_rpe": _relative_within,
-}
-KNOWLEDGE = {
-    "ake": POINTING["ape"],
-    "mke": POINTING["mpe"],
-    "rke": POINTING["rpe"],
-    "within_ake": _time_within,
-    "within_mke": _means_within,
-    "within_rke": _relative_within,
-}
-
-
-def _pointing_rows() -> dict[str, Metric]:
-    """A row for each index and axis; those of one error share the tally that the first of them keeps."""
-    found = {}
-    for indices in (POINTING, KNOWLEDGE):
-        first = f"{next(iter(indices))}_{pointing.AXES[0]}"
-        for index, of in indices.items():
-            for k, axis in enumerate(pointing.AXES):
-                none, value = (lambda start, criteria: None), _from(first, of, k)
-                found[f"{index}_{axis}"] = Metric(begin=none, value=value, may_lack=True)
-    told = lambda start, criteria: _tally(OF_ATTITUDE, criteria)  # noqa: E731
-    found["ape_x"] = replace(found["ape_x"], begin=told, update_after_t_f=_pointing)
-    measured = lambda start, criteria: _tally(OF_KNOWLEDGE, criteria) if start.measured else None  # noqa: E731
-    found["ake_x"] = replace(found["ake_x"], begin=measured, update_after_t_f=_knowledge)
-    return found
-
-
-_RINGING = _peak(lambda interval: interval.end.modal_amplitude, lambda start: start.snapshot.modal_amplitude)
+_PEAK_MODAL = _peak(lambda interval: interval.end.modal_amplitude, lambda start: start.snapshot.modal_amplitude)
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
@@ -239,10 +212,10 @@ METRICS = {
     "hold_angle": Metric(
         update_after_t_f=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
     ),
-    "peak_torque": _peak(lambda interval: _largest_of(interval.commanded)),
-    "peak_torque_delivered": _peak(lambda interval: _largest_of(interval.delivered)),
+    "peak_torque": _peak(lambda interval: _largest_of(interval.torques.commanded)),
+    "peak_torque_delivered": _peak(lambda interval: _largest_of(interval.torques.delivered)),
     "saturated": Metric(
-        update=lambda limited_for, interval, criteria: limited_for + interval.length * interval.limited,
+        update=lambda limited_for, interval, criteria: limited_for + interval.length * interval.torques.limited,
         value=lambda limited_for, run, criteria: jnp.where(
             jnp.isnan(run.memories["effort"]), jnp.nan, limited_for / criteria.t_end
         ),
@@ -260,13 +233,14 @@ METRICS = {
     "peak_rate": _peak(lambda interval: interval.end.rate, lambda start: start.snapshot.rate),
     "peak_momentum": _peak(lambda interval: interval.end.momentum, lambda start: start.snapshot.momentum),
     "peak_wheel_momentum": _peak(
-        lambda interval: _size(interval.wheel_momentum), lambda start: _size(start.wheel_momentum)
+        lambda interval: _size(interval.torques.wheel_momentum), lambda start: _size(start.wheel_momentum)
     ),
     "peak_wheel_torque": _peak(
-        lambda interval: _size(interval.wheel_torque),
+        lambda interval: _size(interval.torques.wheel_torque),
         lambda start: None if start.wheel_momentum is None else jnp.zeros_like(start.snapshot.angle),
     ),
-    "peak_modal": _RINGING,
-    "residual_modal": replace(_RINGING, update=_ringing_after_t_f),
-    **_pointing_rows(),
+    "peak_modal": _PEAK_MODAL,
+    "residual_modal": replace(_PEAK_MODAL, update=_residual_modal),
+    **_pointing_rows("ape", "mpe", "rpe", lambda interval: interval.attitude_error, measured=False, drift="pde"),
+    **_pointing_rows("ake", "mke", "rke", lambda interval: interval.knowledge_error, measured=True),
 }

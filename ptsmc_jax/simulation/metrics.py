@@ -1,4 +1,4 @@
-"""What a run is judged by, accumulated interval by interval inside the rollout: loops over the rows of `METRICS`."""
+"""The metrics of a run, accumulated interval by interval inside the rollout: loops over the rows of `METRICS`."""
 
 from collections import namedtuple
 from typing import Any
@@ -20,9 +20,9 @@ class Metrics(namedtuple("Metrics", METRICS)):
     __slots__ = ()
 
     def __repr__(self) -> str:
-        """Those that the run has, a line each; of many runs, or traced ones, what stands for them."""
-        known = {name: value for name, value in self._asdict().items() if not _lacks(name, value)}
-        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in known.items())
+        """The metrics that the run has, a line each; of many runs, or traced ones, their type and shape."""
+        present = {name: value for name, value in self._asdict().items() if not _lacks(name, value)}
+        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in present.items())
 
 
 def _lacks(name: str, value: Any) -> bool:
@@ -31,8 +31,8 @@ def _lacks(name: str, value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    known = isinstance(value, core.Tracer) or np.ndim(value) > 0
-    return f"{type(value).__name__} {np.shape(value)}" if known else f"{float(value):.6g}"
+    several = isinstance(value, core.Tracer) or np.ndim(value) > 0
+    return f"{type(value).__name__} {np.shape(value)}" if several else f"{float(value):.6g}"
 
 
 def begin(start: Start, criteria: Criteria) -> Running:
@@ -74,22 +74,15 @@ def finish(running: Running, criteria: Criteria) -> Metrics:
     return Metrics(*(metric.value(running.memories[name], running, criteria) for name, metric in METRICS.items()))
 
 
-def unbounded(found: Metrics, begun: Running) -> Array:
-    """Whether a metric ends infinite or NaN: the square of what it is made of is beyond the largest number, say.
+def unbounded(values: Metrics, begun: Running) -> Array:
+    """Whether a metric ends infinite or NaN, such as the square of a number beyond the square root of the largest one.
 
-    begun: what was remembered at t = 0, which is NaN where the run lacks a metric.
+    begun: the metrics at t = 0, which are NaN where the run lacks one.
     """
-    lacking = {
-        name: jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(memory)]))
-        for name, memory in begun.memories.items()
-        if not METRICS[name].may_lack
-    }
-    return jnp.any(
-        jnp.stack(
-            [
-                jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name])
-                for name, v in found._asdict().items()
-                if not METRICS[name].may_lack
-            ]
-        )
-    )
+
+    def any_nan(memory: Any) -> Array:
+        return jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(memory)]))
+
+    ends = {name: value for name, value in values._asdict().items() if not METRICS[name].may_lack}
+    lacking = {name: any_nan(begun.memories[name]) for name in ends}
+    return jnp.any(jnp.stack([jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name]) for name, v in ends.items()]))

@@ -1,11 +1,10 @@
 """Pointing error indices (ECSS-E-ST-60-10C), accumulated interval by interval.
 
-No history is kept, but that of the window that time is in, where a limit asks for the time in which the relative error
-is within it. Of an error e(t), seen over an observation of consecutive windows of length D: the absolute error |e(t)|,
-its mean over a window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference
-between the means of two windows. Each is reported by its largest value in the observation: about each axis, and as the
-half-cone of the boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of what the law is told of it
-(AKE, MKE, RKE).
+Of an error e(t), over an observation of consecutive windows of length D: the absolute error |e(t)|, its mean over a
+window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference between the means
+of two windows. Each is reported by its largest value in the observation: about each axis, and as the half-cone of the
+boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of its measurement (AKE, MKE, RKE). No history is
+kept but that of the present window, and that only where a limit asks for the time in which the relative error keeps it.
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,22 +22,22 @@ Vector = Float[Array, "3"]
 
 AXES = ("x", "y", "z", "boresight")  # of the indices: body axes, and the half-cone
 
-# across the boresight, over half a turn: what is largest in any of them is, as a half-cone, known to 1/cos(pi/32) - 1,
-# 0.5 %, and said so much larger
+# Directions across the boresight, over half a turn, into which an error is projected. The largest projection gives a
+# half-cone to within 1/cos(pi/32) - 1 = 0.5 %, and is enlarged by as much.
 DIRECTIONS = 16
 ALONG = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-ENOUGH = 1e-9  # of a window: one that ends so shortly after an interval ends with it
+END_TOLERANCE = 1e-9  # share of a window: one that ends by less after an interval ends with it
 
 
 @pytree
 @dataclass(frozen=True)
 class Pointing:
-    """What is observed from when on."""
+    """What is observed of pointing errors, and when."""
 
     frame: Leaf  # (3, 3) rows: the boresight, and two directions across it, in body axes
     after: Leaf  # of t_f, when the observation begins [s]
     window: Leaf  # D [s]
-    limits: dict[str, Leaf] = field(default_factory=dict)  # [rad] by metric: the time within is told of these
+    limits: dict[str, Leaf] = field(default_factory=dict)  # [rad] by metric, whose share of time within them is asked
     samples: int = field(default=0, metadata={"static": True})  # most in a window; 0: as many as the run has
 
     def of_run(self, steps: int) -> "Pointing":
@@ -48,7 +47,8 @@ class Pointing:
     def segments(self, index: str) -> int:
         """How many segments of a window are kept for shares of time of a relative index; 0: no limit asks for them.
 
-        One more than the samples that part it, and one of no length where the window before ended with a sample.
+        Samples divide a window into one more than there are of them; one more has no length where the window before
+        ended with a sample.
         """
         return self.samples + 2 if any(name.startswith(index) for name in self.limits) else 0
 
@@ -62,23 +62,14 @@ def across(boresight: Any) -> np.ndarray:
     return np.stack([b, first, np.cross(b, first)])
 
 
-class Seen(NamedTuple):
-    """An error at one time."""
+def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float[Array, "3 3"]) -> Float[Array, "5"]:
+    """An attitude's error from a target's: rotation vector in body axes (3,), then across the boresight (2,) [rad].
 
-    axes: Array  # (3,) rotation vector in body axes [rad]
-    cross: Array  # (2,) across the boresight: where it points, as an angle and its direction [rad]
-
-    @property
-    def flat(self) -> Array:
-        """(5,)."""
-        return jnp.concatenate([self.axes, self.cross])
-
-
-def seen(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float[Array, "3 3"]) -> Seen:
-    """The error of an attitude from a target's [-]."""
-    off = attitude.multiply(attitude.conjugate(target), q)
-    off = jnp.where(off[3] < 0.0, -off, off)
-    return Seen(attitude.rotation_vector(off[:3]), _cone(attitude.rotate(off, frame[0]), frame))
+    The latter is the angle by which the boresight points off, in its direction; frame: see `Pointing`.
+    """
+    error = attitude.multiply(attitude.conjugate(target), q)
+    error = jnp.where(error[3] < 0.0, -error, error)
+    return jnp.concatenate([attitude.rotation_vector(error[:3]), _cone(attitude.rotate(error, frame[0]), frame)])
 
 
 def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
@@ -91,8 +82,8 @@ def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
     return side * jnp.where(small, 1.0 + square / 6.0, angle / size)
 
 
-class Course(NamedTuple):
-    """An error over an interval: the cubic through both ends and slopes (Hermite), (5,) each, see `Seen.flat`."""
+class ErrorPath(NamedTuple):
+    """An `attitude_error` (5,) over an interval: the cubic through both ends and slopes (Hermite)."""
 
     start: Array  # [rad]
     start_rate: Array  # [rad/s]
@@ -100,56 +91,61 @@ class Course(NamedTuple):
     end_rate: Array
     length: Scalar  # of the interval [s]
 
+    def _coefficients(self) -> tuple[Array, Array, Array]:
+        """Rise r and bends a, b of start + x r + x (1 - x) ((1 - x) a + x b)."""
+        rise = self.end - self.start
+        return rise, self.length * self.start_rate - rise, rise - self.length * self.end_rate
+
     def at(self, x: Scalar) -> Array:
         """The error where a share x of the interval has passed."""
-        rise = self.end - self.start
-        bend = self.length * self.start_rate - rise, rise - self.length * self.end_rate
-        return self.start + x * rise + x * (1.0 - x) * ((1.0 - x) * bend[0] + x * bend[1])
+        rise, a, b = self._coefficients()
+        return self.start + x * rise + x * (1.0 - x) * ((1.0 - x) * a + x * b)
 
     def integral(self, x: Scalar) -> Array:
         """Its integral from the start until then [rad s]."""
-        rise = self.end - self.start
-        bend = self.length * self.start_rate - rise, rise - self.length * self.end_rate
+        rise, a, b = self._coefficients()
         square = x * x
         first = square * (0.5 - x * (2.0 / 3.0 - x / 4.0))
         second = square * x * (1.0 / 3.0 - x / 4.0)
-        return self.length * (x * self.start + square / 2.0 * rise + first * bend[0] + second * bend[1])
+        return self.length * (x * self.start + square / 2.0 * rise + first * a + second * b)
 
 
-def course(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> Course:
+def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
     """The error of an attitude between two (state, target)."""
 
-    def moving(x: Any, target: Any) -> tuple[Array, Array]:
+    def with_rate(x: Any, target: Any) -> tuple[Array, Array]:
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
-        return jax.jvp(lambda q, of: seen(q, of, frame).flat, (x.q, target.q), rates)
+        return jax.jvp(lambda q, target: attitude_error(q, target, frame), (x.q, target.q), rates)
 
-    return Course(*moving(*start), *moving(*end), length)
-
-
-def held(q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3"], length: Scalar) -> Course:
-    """The error of a sample, which is what is known until the next one."""
-    error = seen(q, true, frame).flat
-    return Course(error, jnp.zeros_like(error), error, jnp.zeros_like(error), length)
+    return ErrorPath(*with_rate(*start), *with_rate(*end), length)
 
 
-class Path(NamedTuple):
-    """The error in the window that time is in, segment by segment: its mean is known at its end only."""
+def constant_path(
+    q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3"], length: Scalar
+) -> ErrorPath:
+    """The error of a measured attitude from the true one at its sample, which is known until the next one."""
+    error = attitude_error(q, true, frame)
+    return ErrorPath(error, jnp.zeros_like(error), error, jnp.zeros_like(error), length)
+
+
+class Segments(NamedTuple):
+    """The error in the present window, segment by segment: its mean is known at its end only."""
 
     ends: Array  # (segments, 2, 5) at the start and the end of each [rad]
     lengths: Array  # (segments,) [s], 0 of those to come
     filled: Array  # how many there are
 
-    def added(self, start: Array, end: Array, length: Scalar) -> "Path":
-        """With one segment more; beyond the last there is no room, which `filled` tells."""
-        return Path(
+    def added(self, start: Array, end: Array, length: Scalar) -> "Segments":
+        """With one segment more; beyond the last there is no room, which `filled` shows."""
+        return Segments(
             self.ends.at[self.filled].set(jnp.stack([start, end])),
             self.lengths.at[self.filled].set(length),
             self.filled + 1,
         )
 
-    def emptied(self) -> "Path":
+    def emptied(self) -> "Segments":
         """Without segments."""
-        return Path(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
+        return Segments(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
 
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
         """How long the error less its mean is beyond limits [s]; NaN where there was no room for all of it."""
@@ -162,20 +158,25 @@ class Path(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What is remembered of the window that time is in."""
+    """The present window so far."""
 
     integral: Array  # (5,) of the error [rad s]
-    high: Array  # (3 + DIRECTIONS,) the largest of its projections [rad]
-    low: Array
-    path: Path | None  # None: no limit is on the relative error
+    high: Array  # (3 + DIRECTIONS,) largest of the error's projections [rad]
+    low: Array  # (3 + DIRECTIONS,) smallest of them [rad]
+    segments: Segments | None  # None: no limit is on the relative error
+
+    def including(self, error: Array) -> "Window":
+        """With one more value (5,) of the error among the largest and smallest."""
+        projections = _projections(error)
+        return self._replace(high=jnp.maximum(self.high, projections), low=jnp.minimum(self.low, projections))
 
 
 class Tally(NamedTuple):
-    """Where the indices of one error stand: about each axis, and the half-cone, (4,) each [rad]."""
+    """The indices of one error so far: about each axis, and of the half-cone, (4,) each [rad]."""
 
-    largest: Array
-    mean: Array  # largest of a window
-    relative: Array
+    largest: Array  # of the error
+    mean: Array  # largest mean of a window
+    relative: Array  # largest relative error
     window: Window
     means_high: Array  # (3 + DIRECTIONS,) of the windows so far
     means_low: Array
@@ -188,60 +189,75 @@ class Tally(NamedTuple):
 def begin(zero: Scalar, segments: int = 0) -> Tally:
     """Before the observation; zero: of the run's numbers; segments: of a window that are kept, see `Pointing`."""
     four, many = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
-    path = Path(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
-    window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf, path)
+    kept = Segments(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
+    window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf, kept)
     return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four, four, four)
 
 
 def update(
-    tally: Tally, course: Course, t: Scalar, t_next: Scalar, begins: Scalar, window: Scalar, limits: Float[Array, "3 4"]
+    tally: Tally,
+    error: ErrorPath,
+    t: Scalar,
+    t_next: Scalar,
+    begins: Scalar,
+    window: Scalar,
+    limits: Float[Array, "3 4"],
 ) -> Tally:
-    """After an interval from t to t_next that is no longer than a window; begins: when the observation does [s].
+    """The tally after an interval.
 
-    limits: (3, 4) [rad], on the error, on its means and on the relative error.
+    Args:
+        tally: before it.
+        error: over the interval.
+        t: start of the interval [s].
+        t_next: its end [s]; it is no longer than a window.
+        begins: when the observation does [s].
+        window: length D of a window [s].
+        limits: on the error, on its means and on the relative error, about each axis and of the half-cone [rad].
     """
-    length = course.length
-    share = jnp.clip((begins - t) / length, 0.0, 1.0)
-    end = begins + (tally.windows + 1.0) * window
-    until = jnp.clip((end - t) / length, share, 1.0)
-    observed, closes = t_next > begins, (t_next > begins) & (end <= t_next + ENOUGH * window)
-    first, last = course.at(share), course.at(until)
+    length = error.length
+    share = jnp.clip((begins - t) / length, 0.0, 1.0)  # of the interval that lies before the observation
+    window_end = begins + (tally.windows + 1.0) * window
+    until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
+    observed, closes = t_next > begins, (t_next > begins) & (window_end <= t_next + END_TOLERANCE * window)
+    first, last = error.at(share), error.at(until)
     # the observation's first moment counts; later intervals begin where the ones before have ended
-    opened = guards.select(t <= begins, _with(tally.window, first), tally.window)
-    started = jnp.where(t <= begins, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
-    added = opened.integral + course.integral(until) - course.integral(share)
-    kept = None if opened.path is None else opened.path.added(first, last, length * (until - share))
-    present = _with(opened._replace(integral=added, path=kept), last)
-    sizes = _sizes(first), _sizes(course.end)
-    still = tally._replace(
-        largest=jnp.maximum(started, sizes[1]),
+    opened = guards.select(t <= begins, tally.window.including(first), tally.window)
+    largest = jnp.where(t <= begins, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
+    integral = opened.integral + error.integral(until) - error.integral(share)
+    segments = opened.segments
+    if segments is not None:
+        segments = segments.added(first, last, length * (until - share))
+    present = opened._replace(integral=integral, segments=segments).including(last)
+    first_sizes, end_sizes = _sizes(first), _sizes(error.end)
+    still_open = tally._replace(
+        largest=jnp.maximum(largest, end_sizes),
         window=present,
-        beyond=tally.beyond + length * (1.0 - share) * _share_beyond(*sizes, limits[0]),
+        beyond=tally.beyond + length * (1.0 - share) * _share_beyond(first_sizes, end_sizes, limits[0]),
     )
 
     def closed() -> Tally:
         mean = present.integral / window
-        means = _projected(mean)
-        off = jnp.maximum(present.high - means, means - present.low)
-        rest = course.integral(jnp.ones_like(until)) - course.integral(until)
-        path, beyond = present.path, jnp.zeros(4)
-        if path is not None:
-            beyond = path.time_beyond(mean, limits[2])
-            path = path.emptied().added(last, course.end, length * (1.0 - until))
-        new = _with(_with(Window(rest, 0.0 * means - jnp.inf, 0.0 * means + jnp.inf, path), last), course.end)
-        return still._replace(
-            mean=jnp.maximum(still.mean, _sizes(mean)),
-            relative=jnp.maximum(still.relative, _sizes_of(off)),
+        means = _projections(mean)
+        deviations = jnp.maximum(present.high - means, means - present.low)
+        rest = error.integral(jnp.ones_like(until)) - error.integral(until)
+        segments, beyond = present.segments, jnp.zeros(4)
+        if segments is not None:
+            beyond = segments.time_beyond(mean, limits[2])
+            segments = segments.emptied().added(last, error.end, length * (1.0 - until))
+        new = Window(rest, 0.0 * means - jnp.inf, 0.0 * means + jnp.inf, segments).including(last).including(error.end)
+        return still_open._replace(
+            mean=jnp.maximum(still_open.mean, _sizes(mean)),
+            relative=jnp.maximum(still_open.relative, _sizes_of(deviations)),
             window=new,
-            means_high=jnp.maximum(still.means_high, means),
-            means_low=jnp.minimum(still.means_low, means),
-            windows=still.windows + 1.0,
-            means_beyond=still.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
-            relative_beyond=still.relative_beyond + beyond,
+            means_high=jnp.maximum(still_open.means_high, means),
+            means_low=jnp.minimum(still_open.means_low, means),
+            windows=still_open.windows + 1.0,
+            means_beyond=still_open.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
+            relative_beyond=still_open.relative_beyond + beyond,
         )
 
-    found = jax.lax.cond(closes, closed, lambda: still)
-    return guards.select(observed, found, tally)
+    after = jax.lax.cond(closes, closed, lambda: still_open)
+    return guards.select(observed, after, tally)
 
 
 def drift(tally: Tally) -> Float[Array, "4"]:
@@ -249,30 +265,25 @@ def drift(tally: Tally) -> Float[Array, "4"]:
     return _sizes_of(tally.means_high - tally.means_low)
 
 
-def _projected(error: Array) -> Array:
-    """About each axis, and across the boresight in each of the directions, (3 + DIRECTIONS,)."""
+def _projections(error: Array) -> Array:
+    """The error about each axis, and across the boresight in each of the directions, (3 + DIRECTIONS,) [rad]."""
     return jnp.concatenate([error[:3], np.cos(ALONG) * error[3] + np.sin(ALONG) * error[4]])
 
 
-def _with(window: Window, error: Array) -> Window:
-    shown = _projected(error)
-    return window._replace(high=jnp.maximum(window.high, shown), low=jnp.minimum(window.low, shown))
-
-
 def _sizes(error: Array) -> Array:
-    """About each axis and of the half-cone, (4,)."""
+    """Sizes of an error (5,): about each axis and of the half-cone, (4,) [rad]."""
     return jnp.append(jnp.abs(error[:3]), guards.norm(error[3:]))
 
 
-def _sizes_of(projected: Array) -> Array:
-    """Sizes about each axis and of the half-cone, (4,), from the largest in each direction, see `DIRECTIONS`."""
-    return jnp.append(projected[:3], jnp.max(projected[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
+def _sizes_of(projections: Array) -> Array:
+    """Sizes about each axis and of the half-cone, (4,), from the largest projections, see `DIRECTIONS`."""
+    return jnp.append(projections[:3], jnp.max(projections[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
 def _share_beyond(start: Array, end: Array, limits: Array) -> Array:
     """Share of an interval in which sizes are beyond limits, as if they went straight from start to end."""
-    kept, kept_next = start <= limits, end <= limits
-    both = jnp.where(kept & kept_next, 0.0, 1.0)
-    crosses = kept != kept_next
-    apart = jnp.where(crosses, jnp.abs(start - end), 1.0)
-    return jnp.where(crosses, (jnp.maximum(start, end) - limits) / apart, both)
+    within, within_next = start <= limits, end <= limits
+    uncrossed = jnp.where(within & within_next, 0.0, 1.0)
+    crosses = within != within_next
+    change = jnp.where(crosses, jnp.abs(start - end), 1.0)
+    return jnp.where(crosses, (jnp.maximum(start, end) - limits) / change, uncrossed)

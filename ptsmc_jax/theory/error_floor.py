@@ -25,12 +25,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
-from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
+from ptsmc_jax.simulation.sampled import PeriodMotion
 
 UNKNOWN = 1e5  # 1 sigma of a state at t = 0, in those of its sensor: of no weight beside the first sample
 EXACT = 1e-10  # 1 sigma of a sensor without noise, in those of what is read before the first sample
@@ -176,7 +175,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     return Model(
         start=start,
         rows=wide(said.rows_at(sample, np.append(0.0, lengths[:-1]))),
-        noise=np.where(said.there(sample), said.noise, np.inf),
+        noise=np.where(said.available(sample), said.noise, np.inf),
         kick=lengths[:, None, None] * drift,
         move=move,
         output=output,
@@ -205,7 +204,7 @@ class _Linear(NamedTuple):
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
-    actuators = Actuators() if parts.actuators is None else parts.actuators
+    actuators = parts.effective_actuators
     law, plant = parts.controller, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
@@ -223,7 +222,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
 
         def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array]:
             near = plant.retract(x, z)
-            near_next = rollout.over_period(parts, tick.t, near, drive, pushed + push, dt)
+            near_next = PeriodMotion(parts, tick.t, near, drive, pushed + push).after(dt)
             (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
             middle = (start + end) / 2 + dt / 8 * (rate - rate_next)
             return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end])

@@ -1,7 +1,7 @@
 """The sampled loop linearised by the code that flies it, and opened: at the plant's input and at the sensors.
 
 A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of `computer.decide` and
-`rollout.over_period`): the true state x, the state of the actuators, and what the flight computer keeps, its own model
+`sampled.PeriodMotion`): the true state x, the state of the actuators, and what the flight computer keeps, its own model
 of the actuators among it. Closed are
 
     z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
@@ -25,11 +25,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
-from ptsmc_jax.devices.actuators import Actuators, ActuatorState
+from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
-from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import Computer, Decision, Period, boot, brought_about, decide, schedule
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, assumed_torque, boot, decide, schedule
+from ptsmc_jax.simulation.sampled import PeriodMotion
 
 Scalar = Float[Array, ""]
 
@@ -95,7 +96,7 @@ def nominal(parts: Parts) -> Nominal:
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     listed, period_of, started = schedule(parts, ticks)
-    k2, actuators = parts.observer.error_bound(), _actuators(parts)
+    k2, actuators = parts.observer.error_bound(), parts.effective_actuators
     x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     model = actuators.begin(parts.plant.inputs)
     computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.visible(x0), started)
@@ -115,18 +116,14 @@ def nominal(parts: Parts) -> Nominal:
 nominal_jit = programs.jit(nominal)
 
 
-def _actuators(parts: Parts) -> Actuators:
-    return Actuators() if parts.actuators is None else parts.actuators
-
-
 def _computed(
     parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
 ) -> tuple[Decision, Computer, ActuatorState]:
     """The flight computer's part of a period; seen: the state as the sensors see it."""
-    actuators, dt = _actuators(parts), period.length
+    actuators, dt = parts.effective_actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     drive, queue = actuators.command(carry.model, decision.u, decision.w, period.now.t, dt, period.now.noise_weight)
-    computer = computer._replace(applied=brought_about(actuators, drive, dt))
+    computer = computer._replace(applied=assumed_torque(actuators, drive, dt))
     return decision, computer, actuators.end(carry.model, drive, queue, dt)
 
 
@@ -142,10 +139,10 @@ def _acted(
 
     pushed: a torque on the plant besides, (m,).
     """
-    prompt, x, acting = replace(_actuators(parts), delay=0), carry.x, carry.acting
+    prompt, x, acting = replace(parts.effective_actuators, delay=0), carry.x, carry.acting
     for command, t, length in commands:
         drive, _ = prompt.command(acting, command, w, t, length, period.now.noise_weight)
-        x = rollout.over_period(parts, t, x, drive, pushed, length)
+        x = PeriodMotion(parts, t, x, drive, pushed).after(length)
         acting = prompt.end(acting, drive, None, length)
     return x, acting
 
@@ -159,23 +156,23 @@ class _Local:
         self._turned = hasattr(parts.sensors, "retract")
         start = parts.plant.local_coordinates(base.x, base.x)
         known = self._model.local_coordinates(base.computer.seen, base.computer.seen)
-        sensing = base.computer.sensing
+        sensing = base.computer.sensors
         inside = parts.sensors.local_coordinates(sensing, sensing) if self._turned else jnp.zeros(0)
         rest, self._unravel = ravel_pytree(self._rest(base))
         self.sizes = [start.size, known.size, inside.size, rest.size]
 
     def _rest(self, carry: Carry) -> Any:
         computer = carry.computer
-        kept = None if self._turned else _numbers(computer.sensing)
-        own = _numbers(computer.law), computer.filtered
-        return carry.acting, computer.memory, computer.applied, carry.model, kept, *own
+        kept = None if self._turned else _numbers(computer.sensors)
+        own = _numbers(computer.law), computer.command_filter
+        return carry.acting, computer.observer, computer.applied, carry.model, kept, *own
 
     def retract(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
         near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
         acting, memory, applied, model, kept, law, filtered = near
-        inside = base.computer.sensing
+        inside = base.computer.sensors
         inside = self._sensors.retract(inside, sensing) if self._turned else _with_numbers(inside, kept)
         law = _with_numbers(base.computer.law, law)
         computer = Computer(inside, self._model.retract(base.computer.seen, seen), memory, law, applied, filtered)
@@ -186,7 +183,7 @@ class _Local:
         seen = self._model.local_coordinates(base.computer.seen, other.computer.seen)
         inside = jnp.zeros(0)
         if self._turned:
-            inside = self._sensors.local_coordinates(base.computer.sensing, other.computer.sensing)
+            inside = self._sensors.local_coordinates(base.computer.sensors, other.computer.sensors)
         rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
         return jnp.concatenate([plant.local_coordinates(base.x, other.x), seen, inside, rest])
 
@@ -238,7 +235,7 @@ def opened(parts: Parts, during: Nominal) -> Opened:
 
     (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
     old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
-    loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=_actuators(parts).delay)
+    loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
     error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
     return Opened(loop, error, s_command, s_direct)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from ptsmc_jax.simulation import catalogues, metrics, rollout
-from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
 from tests.helpers import parts, vector
 
 
@@ -86,11 +86,7 @@ def interval(t, t_next, angles, torque=0.0, delivered=None):
         errors=lambda: Errors(*first, *last),
         arrival=lambda: Arrival(last[0], end.angle),
         last_torque=jnp.zeros(3),
-        commanded=(u,),
-        delivered=(got,),
-        weights=(1.0,),
-        limited=jnp.asarray(delivered is not None),
-        wheel_momentum=None,
+        torques=Torques((u,), (got,), (1.0,), jnp.asarray(delivered is not None), None),
     )
 
 
@@ -99,7 +95,7 @@ def judge(intervals, t_end=4.0):
     running, torque = metrics.begin(Start(intervals[0].start, 3, None), criteria), jnp.zeros(3)
     for one in intervals:
         running = metrics.update(running, one._replace(last_torque=torque), criteria)
-        torque = one.delivered[-1] if one.t_next > one.t else torque
+        torque = one.torques.delivered[-1] if one.t_next > one.t else torque
     return metrics.finish(running, criteria)
 
 
@@ -132,7 +128,8 @@ def test_angles_after_t_f_are_the_largest_and_the_rms_of_the_parabola_through_th
 
 def test_the_torque_of_wheels_is_the_largest_of_any():
     wheels = jnp.asarray([[0.1, -0.2], [0.05, 0.3]])
-    one = interval(0, 4, (1.0, 1.0))._replace(wheel_momentum=wheels, wheel_torque=-2.0 * wheels)
+    one = interval(0, 4, (1.0, 1.0))
+    one = one._replace(torques=one.torques._replace(wheel_momentum=wheels, wheel_torque=-2.0 * wheels))
     criteria = Criteria(vector(1.0), vector(4.0), vector(1.0), vector(0.1))
     running = metrics.begin(Start(one.start, 3, jnp.zeros(2)), criteria)
     found = metrics.finish(metrics.update(running, one, criteria), criteria)

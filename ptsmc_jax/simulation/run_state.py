@@ -1,0 +1,198 @@
+"""A run as both loops fly it: what they carry from interval to interval, how intervals are judged, and its result."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.simulation import metrics, pointing
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
+from ptsmc_jax.simulation.metric_rows import Running
+
+OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
+# code: (status, reason)
+STATUS = {
+    OK: ("ok", ""),
+    DIVERGED: ("diverged", "the state is not finite"),
+    TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
+    SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
+    MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
+    UNBOUNDED: ("diverged", "a metric is not finite"),
+    UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples for these"),
+}
+FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
+SINGULAR_CLEARANCE = 1e-3  # there the law's gain, which grows like 1 / clearance, is a thousand times as large
+# a run has missed t_f where its angle then is larger than both of these
+MISSED_SHARE = 0.05  # of the initial angle
+MISSED_SETTLING_ANGLES = 10.0
+
+
+class Log(NamedTuple):
+    """History at the start of each interval and at t_end; arrays (time, component), time (time,)."""
+
+    t: Array  # [s]
+    x: Any  # true state
+    d_hat: Array  # estimated disturbance [N m]
+    u: Array  # delivered torque, from this time on [N m]
+    commanded: Array  # [N m]
+    s: Array  # sliding variable that the law used
+    disturbance: Array  # true disturbance [N m]
+    reference: Any  # target of the reference
+    error: Array  # that the law drives to zero: the attitude error vector [-], for a chain x_1
+    wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
+    has_length: Array  # bool: the row starts an interval of positive length, or is the last
+
+
+class Result(NamedTuple):
+    """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history."""
+
+    metrics: metrics.Metrics
+    status: Array
+    bad_time: Array
+    log: Log | None
+
+
+class Run(NamedTuple):
+    """What stays the same from interval to interval."""
+
+    parts: Parts
+    ticks: Ticks
+    criteria: Criteria
+    x0: Any
+    target_0: Any  # of the reference at t = 0
+    target_t_f: Any  # of the reference at t_f
+    clearance_unit: Array  # that the run's clearances from the law's singularity are divided by
+    gap: Array  # first time that the clock has no samples for [s]; NaN: it has them from t = 0 to t_end
+    record: bool  # the history is asked for
+
+
+class RunState(NamedTuple):
+    """What both loops carry from interval to interval."""
+
+    x: Any  # true state
+    u: Array  # torque delivered at the end of the last interval, (m,) [N m]
+    snapshot: Snapshot
+    running: Running
+    status: Array
+    bad_time: Array
+
+
+class Flown(NamedTuple):
+    """An interval that has been flown."""
+
+    x: Any  # true state at its end
+    x_at: Callable[[Scalar], Any]  # time in it [s] -> true state then
+    torques: Torques
+    step: Scalar  # longest integration step in it [s]
+    seen: Any = None  # state as it was measured at its start; None: the true one
+
+
+def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
+    """The state at t = 0; wheel_momentum: (wheels,) [N m s]."""
+    zero, no_torque = jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
+    snapshot = _snapshot(run.parts, run.target_0, run.x0)
+    state = RunState(
+        x=run.x0,
+        u=no_torque,
+        snapshot=snapshot,
+        running=metrics.begin(_start(run.parts, snapshot, wheel_momentum), run.criteria),
+        status=jnp.int32(OK),
+        bad_time=jnp.full_like(zero, jnp.nan),
+    )
+    return _judged(run, state, run.target_0, zero, zero, no_torque)
+
+
+def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) -> RunState:
+    """The state after an interval: metrics and status; target: of the reference at its start."""
+    law, criteria = run.parts.controller, run.criteria
+    target_next = run.parts.reference(now.t_next)
+    snapshot = _snapshot(run.parts, target_next, flown.x)
+
+    def errors() -> Errors:
+        return Errors(*law.errors(state.x, target), *law.errors(flown.x, target_next))
+
+    def arrival() -> Arrival:
+        x = flown.x_at(criteria.t_f)
+        return Arrival(law.errors(x, run.target_t_f)[0], law.angle(x, run.target_t_f))
+
+    attitude_error = knowledge_error = None
+    if criteria.pointing is not None:
+        frame, length = criteria.pointing.frame, now.t_next - now.t
+        attitude_error = partial(pointing.error_path, (state.x, target), (flown.x, target_next), frame, length)
+        if flown.seen is not None:
+            knowledge_error = partial(pointing.constant_path, flown.seen.q, state.x.q, frame, length)
+    interval = Interval(
+        now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, flown.torques,
+        attitude_error, knowledge_error,
+    )  # fmt: skip
+    u_end = flown.torques.delivered[-1]
+    state = state._replace(
+        x=flown.x,
+        u=jnp.where(now.t_next > now.t, u_end, state.u),
+        snapshot=snapshot,
+        running=metrics.update(state.running, interval, criteria),
+    )
+    return _judged(run, state, target_next, now.t_next, flown.step, u_end)
+
+
+def row(
+    run: Run, t: Scalar, x: Any, target: Any, signals: tuple, has_length: Array, walk: Any = None, wheels: Any = None
+) -> Log:
+    """A row of the history at t [s].
+
+    signals: d_hat, u, commanded and s of `Log`; walk: random walk of the disturbance, (m,) [N m].
+    """
+    d_hat, u, commanded, s = signals
+    d = run.parts.disturbance(t, x)
+    error, _ = run.parts.controller.errors(x, target)
+    return Log(t, x, d_hat, u, commanded, s, d if walk is None else d + walk, target, error, wheels, has_length)
+
+
+def history(rows: Log, last: Log) -> Log:
+    """The rows (time, ..) with the last one."""
+    return jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
+
+
+def finish(run: Run, first: Snapshot, state: RunState, log: Log | None, wheel_momentum: Array | None = None) -> Result:
+    """The result of a run in its state at t_end; first: at t = 0."""
+    criteria, angle_at_t_f = run.criteria, state.running.arrival.angle
+    values = metrics.finish(state.running, criteria)
+    start = _start(run.parts, first, wheel_momentum)
+    unbounded = (state.status == OK) & metrics.unbounded(values, metrics.begin(start, criteria))
+    missed = (state.status == OK) & (
+        angle_at_t_f > jnp.maximum(MISSED_SHARE * first.angle, MISSED_SETTLING_ANGLES * criteria.settling_angle)
+    )
+    cut = (state.status == OK) & ~jnp.isnan(run.gap)
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
+    status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
+    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
+    bad_time = jnp.where(cut, run.gap, bad_time)
+    return Result(values, status, bad_time, log)
+
+
+def _start(parts: Parts, snapshot: Snapshot, wheel_momentum: Array | None) -> Start:
+    return Start(snapshot, parts.plant.inputs, wheel_momentum, measured=parts.sensors is not None)
+
+
+def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
+    angle = parts.controller.angle(x, target)
+    plant = parts.plant
+    return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
+
+
+def _judged(run: Run, state: RunState, target: Any, t: Scalar, step: Scalar, u: Array) -> RunState:
+    """The state at t with its status and first bad time; the first thing that goes wrong stays."""
+    law, plant = run.parts.controller, run.parts.plant
+    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
+    fast = plant.too_fast(state.x, step)
+    near = ~(law.clearance(state.x, target) / run.clearance_unit >= SINGULAR_CLEARANCE)
+    code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
+    first = (state.status == OK) & (code != OK)
+    return state._replace(status=jnp.where(first, code, state.status), bad_time=jnp.where(first, t, state.bad_time))

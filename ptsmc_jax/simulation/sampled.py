@@ -1,0 +1,185 @@
+"""The sampled loop: measured, computed and held over each control period; the plant by RK4 under what acts on it."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.numerics import draws, integrators
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.observers.base import Bound
+from ptsmc_jax.simulation import run_state
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.computer import Computer, Period, Software, assumed_torque, schedule, star_state
+from ptsmc_jax.simulation.interval import Torques
+from ptsmc_jax.simulation.run_state import Flown, Log, Result, Run, RunState
+
+DISTURBANCE_WALK = "disturbance_walk"
+SAMPLE_TIMES = "timing_jitter_samples"
+
+
+def walk_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
+    """Key of the stream that a trial's random walk of the disturbance is drawn from."""
+    return draws.stream(seed, trial, DISTURBANCE_WALK)
+
+
+def jitter_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
+    """Key of the stream that the deviations of a trial's samples from their times are drawn from."""
+    return draws.stream(seed, trial, SAMPLE_TIMES)
+
+
+class PeriodMotion(NamedTuple):
+    """The true plant in a control period, from a state on, under the period's drive and the disturbance."""
+
+    parts: Parts
+    t: Scalar  # start of the period [s]
+    x: Any  # true state then
+    drive: Drive
+    walk: Array | None  # disturbance besides, constant over the period, (m,) [N m]; None: no random walk
+
+    def at(self, time: Scalar) -> Any:
+        """The state at a time [s] in the period."""
+        return self.after(time - self.t)
+
+    def after(self, dt: Scalar) -> Any:
+        """The state dt [s] into the period."""
+        parts, drive, walk = self.parts, self.drive, self.walk
+        actuators = parts.effective_actuators
+        step = dt / parts.substeps
+
+        def substep(k: Scalar, x: Any) -> Any:
+            start, applied = self.t + k * step, actuators.over(drive, k * step, step)
+
+            def rate(time: Scalar, y: Any) -> Any:
+                d = parts.disturbance(time, y)
+                torque = applied.at(time - start, parts.plant.velocity(y))
+                return parts.plant.rate(time, y, torque, d if walk is None else d + walk)
+
+            return integrators.rk4(rate, start, x, step)
+
+        if parts.substeps == 1:
+            return parts.plant.normalise(substep(jnp.zeros_like(dt), self.x))
+        starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+        return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), self.x, starts)[0])
+
+
+def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:
+    """Commanded and delivered torques of a control period, and the momentum of the wheels in it."""
+    zero = jnp.zeros_like(dt)
+    weights, delivered, momentum, torque = (1.0,), (actuators.torque(drive, zero),), None, None
+    if actuators.moves:
+        weights = (1 / 6, 4 / 6, 1 / 6)
+        delivered = (*delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
+    if actuators.wheels is not None:  # momentum in the middle too: a lag may turn the torque around within the period
+        momentum = jnp.stack([actuators.wheels_at(drive, time)[0] for time in (dt / 2, dt)])
+        # torque goes one way in between
+        torque = jnp.stack([actuators.wheels_at(drive, time)[1] for time in (jnp.zeros_like(dt), dt)])
+    return Torques((u,) * len(delivered), delivered, weights, drive.limited, momentum, torque)
+
+
+class _Hardware(NamedTuple):
+    """What the sampled loop carries from period to period, besides `RunState`."""
+
+    computer: Computer
+    actuators: ActuatorState
+    walk: Array | None  # random walk of the disturbance, (m,) [N m]
+    star_x: Any  # `star_state` of the period before
+    offset: Array | None  # by how much the sample comes after its time [s]; None: never
+
+
+class _Loop(NamedTuple):
+    """What stays the same from period to period of a sampled run."""
+
+    run: Run
+    software: Software
+    actuators: Actuators
+    k2: Bound
+    period_of: Callable[[tuple], Period]
+    walk_key: draws.Key
+    jitter_key: draws.Key
+
+    def offset(self, t: Scalar, sample: Array) -> Array | None:
+        """How much later than t a sample comes [s]; the first one and the end of the run are not moved."""
+        parts = self.run.parts
+        if parts.jitter is None:
+            return None
+        largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
+        return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
+
+    def begin(self, actuators: ActuatorState, first: Ticks, seed: WholeNumber, trial: WholeNumber) -> _Hardware:
+        """Before the first sample; first: the first period that has a length."""
+        parts, ticks, x0 = self.run.parts, self.run.ticks, self.run.x0
+        walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+        computer = self.software.boot(parts, seed, trial, parts.plant.visible(x0), first)
+        if self.actuators.holds:  # `RunState.u` is what they did
+            computer = computer._replace(applied=None)
+        offset = self.offset(ticks.t[0], ticks.sample[0])
+        return _Hardware(computer, actuators, walk, star_state(parts, first, lambda t: x0), offset)
+
+    def fly(self, carry: tuple[RunState, _Hardware], tick: tuple) -> tuple[tuple[RunState, _Hardware], Log | None]:
+        """A control period, and its row of the history where that is asked for."""
+        (now, *_), (state, hardware) = tick, carry
+        parts, actuators = self.run.parts, self.actuators
+        nominal_dt = now.t_next - now.t  # flight software takes samples to come at their times
+        next_offset = self.offset(now.t_next, now.sample + 1)
+        if next_offset is not None:
+            now = now._replace(t=now.t + hardware.offset, t_next=now.t_next + next_offset)
+        dt = now.t_next - now.t
+        computer = hardware.computer._replace(applied=(state.u, None)) if actuators.holds else hardware.computer
+        period = self.period_of(tick)._replace(star_x=hardware.star_x)
+        decision, computer = self.software.decide(
+            parts, self.k2, period, computer, parts.plant.visible(state.x), hardware.actuators
+        )
+        drive, queue = actuators.command(hardware.actuators, decision.u, decision.w, now.t, dt, now.noise_weight)
+        if decision.channels is not None:
+            drive = drive._replace(c=decision.channels)
+        walk = hardware.walk
+        if walk is not None:
+            walk = walk + parts.walk_rate * dt * draws.normals(self.walk_key, parts.plant.inputs, now.sample)
+        torques = period_torques(actuators, drive, decision.u, dt)
+        row = None
+        if self.run.record:
+            wheels = None if actuators.wheels is None else actuators.wheels_at(drive, jnp.zeros_like(dt))
+            signals = decision.d_hat, torques.delivered[0], decision.u, decision.s
+            row = run_state.row(self.run, now.t, state.x, decision.target, signals, dt > 0.0, walk, wheels)
+        motion = PeriodMotion(parts, now.t, state.x, drive, walk)
+        seen = None if parts.sensors is None else computer.seen
+        flown = Flown(motion.at(now.t_next), motion.at, torques, dt / parts.substeps, seen)
+        state = run_state.advance(self.run, state, now, decision.target, flown)
+        applied = None if actuators.holds else assumed_torque(actuators, drive, nominal_dt)
+        computer = computer._replace(applied=applied)
+        actuator_state = actuators.end(hardware.actuators, drive, queue, dt)
+        star_x = star_state(parts, now, motion.at)
+        return (state, _Hardware(computer, actuator_state, walk, star_x, next_offset)), row
+
+    def last_row(self, state: RunState, hardware: _Hardware) -> Log:
+        """The state at t_end, with the torque held until then."""
+        parts, t = self.run.parts, self.run.criteria.t_end
+        target, hold = parts.reference(t), t >= parts.controller.hand_over
+        d_hat = parts.observer.estimate(hardware.computer.observer)
+        k2, sample = self.k2(t), Sample(t, hold, parts.period)
+        _, s, _ = parts.controller.command(hardware.computer.law, sample, state.x, target, d_hat, k2)
+        h, v = hardware.actuators.h, hardware.actuators.v
+        signals, wheels = (d_hat, state.u, state.u, s), None if h is None else (h, v)
+        return run_state.row(self.run, t, state.x, target, signals, jnp.asarray(True), hardware.walk, wheels)
+
+
+def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Result:
+    """A sampled run; see `rollout.simulate`."""
+    parts, actuators = run.parts, run.parts.effective_actuators
+    k2 = parts.observer.error_bound()
+    periods, period_of, first_period = schedule(parts, run.ticks)
+    loop = _Loop(run, software, actuators, k2, period_of, walk_stream(seed, trial), jitter_stream(seed, trial))
+    actuator_state = actuators.begin(parts.plant.inputs)
+    state = run_state.begin(run, actuator_state.h)
+    first = state.snapshot
+    carry = state, loop.begin(actuator_state, first_period, seed, trial)
+    (state, hardware), rows = jax.lax.scan(loop.fly, carry, periods)
+    log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
+    return run_state.finish(run, first, state, log, hardware.actuators.h)
