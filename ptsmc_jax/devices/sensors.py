@@ -49,7 +49,7 @@ class Sensor(ABC):
         """
 
     def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
-        """The state as it is read before any filter, and the memory; arguments as in `measure`."""
+        """The state as it is read before any filter, and the memory; arguments as in `measure`, dt in [s]."""
         return self.measure(memory, x, now, dt)
 
     @abstractmethod

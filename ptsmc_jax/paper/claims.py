@@ -45,22 +45,22 @@ def fly_cases() -> dict[str, Run]:
     return {name: runs.fly(study(from_tables(tables))) for name, (_, _, tables) in CASES.items()}
 
 
-def claims(flown: dict[str, Run]) -> list[Claim]:
-    """Each claim beside its measurement; flown: what `fly_cases` returns."""
+def claims(cases: dict[str, Run]) -> list[Claim]:
+    """Each claim beside its measurement; cases: of `fly_cases`."""
     return [
-        *(_stabilised(name, flown[name]) for name in _CHAINS),
-        _accuracy("4.2 A", "errors of 10E-4 at t_f = 30 and 40 s", 1e-4, flown, "case_1_30", "case_1_40"),
-        _accuracy("4.2 B", "error of 10E-4 at t_f for eta = 3", 1e-4, flown, "case_2_eta_3"),
-        _accuracy("4.2 B", "error of 10E-5 at t_f for eta = 5", 1e-5, flown, "case_2_eta_5"),
-        _larger_eta_is_more_accurate(flown),
-        _initial_torque("4.2 A", "a shorter t_f asks for a larger initial torque", flown, "case_1_30", "case_1_40"),
-        _initial_torque("4.2 B", "so does a larger eta", flown, "case_2_eta_5", "case_2_eta_3"),
-        _faster(flown),
-        _within_t_f(flown),
+        *(_stabilised(name, cases[name]) for name in _CHAINS),
+        _accuracy("4.2 A", "errors of 10E-4 at t_f = 30 and 40 s", 1e-4, cases, "case_1_30", "case_1_40"),
+        _accuracy("4.2 B", "error of 10E-4 at t_f for eta = 3", 1e-4, cases, "case_2_eta_3"),
+        _accuracy("4.2 B", "error of 10E-5 at t_f for eta = 5", 1e-5, cases, "case_2_eta_5"),
+        _larger_eta_is_more_accurate(cases),
+        _initial_torque("4.2 A", "a shorter t_f asks for a larger initial torque", cases, "case_1_30", "case_1_40"),
+        _initial_torque("4.2 B", "so does a larger eta", cases, "case_2_eta_5", "case_2_eta_3"),
+        _faster(cases),
+        _within_t_f(cases),
         _independent_of_the_start(),
-        _no_singularity(flown),
-        _bounded_when_sampled(flown),
-        _stays(flown),
+        _no_singularity(cases),
+        _bounded_when_sampled(cases),
+        _stays(cases),
     ]
 
 
@@ -72,8 +72,8 @@ def _size(run: Run) -> np.ndarray:
 
 def _at_and_after(run: Run) -> tuple[float, float]:
     """`_size` at t_f and its largest value from then on."""
-    size, t, t_f = _size(run), run.log.t, float(run.parts.controller.t_f)
-    k = int(np.flatnonzero(t <= t_f)[-1])  # t_f is a node of the grid
+    size = _size(run)
+    k = int(np.flatnonzero(run.log.t <= float(run.parts.controller.t_f))[-1])  # t_f is a node of the grid
     return float(size[k]), float(size[k:].max())
 
 
@@ -84,6 +84,7 @@ def _reached(run: Run, share: float) -> float:
 
 
 def _first_torque(run: Run) -> float:
+    """Largest component of the torque at t = 0 [N m]."""
     return float(np.abs(run.log.u[0]).max())
 
 
@@ -102,24 +103,24 @@ def _stabilised(name: str, run: Run) -> Claim:
     )
 
 
-def _accuracy(where: str, claim: str, said: float, flown: dict[str, Run], *names: str) -> Claim:
-    pairs = [_at_and_after(flown[name]) for name in names]
+def _accuracy(where: str, claim: str, stated: float, cases: dict[str, Run], *names: str) -> Claim:
+    pairs = [_at_and_after(cases[name]) for name in names]
     at, after = max(p[0] for p in pairs), max(p[1] for p in pairs)
-    verdict = "holds" if after <= said else "holds in part" if at <= said else "differs"
-    kept = "below" if after <= said else "above"
+    verdict = "holds" if after <= stated else "holds in part" if at <= stated else "differs"
+    side = "below" if after <= stated else "above"
     return Claim(
         where,
-        f"{claim} (read as {said:g})",
+        f"{claim} (read as {stated:g})",
         f"largest component {at:.1e} at t_f, {after:.1e} in the 10 s after it",
         verdict,
         "an accurate integration of the paper's own equations is far better at the instant t_f; what was estimated "
-        f"wrongly is then held, {kept} the paper's figure",
-        {"at_t_f": at, "largest_after": after, "paper": said},
+        f"wrongly is then held, {side} the paper's figure",
+        {"at_t_f": at, "largest_after": after, "paper": stated},
     )
 
 
-def _larger_eta_is_more_accurate(flown: dict[str, Run]) -> Claim:
-    low, high = (_at_and_after(flown[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
+def _larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
+    low, high = (_at_and_after(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
     better = high[1] < 0.5 * low[1] and high[0] < 0.5 * low[0]
     return Claim(
         "4.2 B, Remark 1",
@@ -132,10 +133,10 @@ def _larger_eta_is_more_accurate(flown: dict[str, Run]) -> Claim:
     )
 
 
-def _initial_torque(where: str, claim: str, flown: dict[str, Run], larger: str, smaller: str) -> Claim:
-    one, other = flown[larger], flown[smaller]
-    a, b = _first_torque(one), _first_torque(other)
-    rule = [float(c.parts.controller.eta / c.parts.controller.t_f) ** 2 for c in (one, other)]
+def _initial_torque(where: str, claim: str, cases: dict[str, Run], larger: str, smaller: str) -> Claim:
+    a, b = _first_torque(cases[larger]), _first_torque(cases[smaller])
+    laws = (cases[name].parts.controller for name in (larger, smaller))
+    rule = [float(law.eta / law.t_f) ** 2 for law in laws]
     return Claim(
         where,
         claim,
@@ -146,8 +147,8 @@ def _initial_torque(where: str, claim: str, flown: dict[str, Run], larger: str, 
     )
 
 
-def _faster(flown: dict[str, Run]) -> Claim:
-    slow, fast = (_reached(flown[name], 0.01) for name in ("case_2_eta_3", "case_2_eta_5"))
+def _faster(cases: dict[str, Run]) -> Claim:
+    slow, fast = (_reached(cases[name], 0.01) for name in ("case_2_eta_3", "case_2_eta_5"))
     return Claim(
         "4.2 B",
         "a larger eta converges faster",
@@ -158,8 +159,8 @@ def _faster(flown: dict[str, Run]) -> Claim:
     )
 
 
-def _within_t_f(flown: dict[str, Run]) -> Claim:
-    ratios = {name: _at_and_after(flown[name])[1] / float(_size(flown[name])[0]) for name in SPACECRAFT}
+def _within_t_f(cases: dict[str, Run]) -> Claim:
+    ratios = {name: _at_and_after(cases[name])[1] / float(_size(cases[name])[0]) for name in SPACECRAFT}
     worst = max(ratios.values())
     return Claim(
         "4.2",
@@ -180,12 +181,12 @@ def _independent_of_the_start() -> Claim:
             times[f"{kind}_{angle}"] = _reached(runs.fly(study(from_tables({**start, **tables}))), 0.01)
         reached = [value for name, value in times.items() if name.startswith(kind)]
         spread[f"spread_{kind}"] = max(reached) - min(reached)
-    shown = ", ".join(f"{times[f'disturbed_{angle}']:.2f} s" for angle in (20, 80, 140))
+    disturbed = ", ".join(f"{times[f'disturbed_{angle}']:.2f} s" for angle in (20, 80, 140))
     small, large = spread["spread_quiet"] < 0.01 * 35.0, spread["spread_disturbed"] > 0.01 * 35.0
     return Claim(
         "Definition 3",
         "the settling time does not depend on the initial state",
-        f"1 % of the initial error after {shown} from 20, 80, 140 degrees; {spread['spread_quiet']:.2f} s apart "
+        f"1 % of the initial error after {disturbed} from 20, 80, 140 degrees; {spread['spread_quiet']:.2f} s apart "
         "without a disturbance",
         "differs" if not small else "holds in part" if large else "holds",
         "the motion is the initial error times a function of t / t_f; what the observer misses adds to it, and weighs "
@@ -194,22 +195,23 @@ def _independent_of_the_start() -> Claim:
     )
 
 
-def _no_singularity(flown: dict[str, Run]) -> Claim:
-    late = {}
-    for name, run in flown.items():
-        near = np.abs(run.log.t - float(run.parts.controller.t_f)) < 0.02 * float(run.parts.controller.t_f)
-        late[name] = float(np.abs(run.log.u[near]).max()) / _first_torque(run)
+def _no_singularity(cases: dict[str, Run]) -> Claim:
+    ratios = {}
+    for name, run in cases.items():
+        t_f = float(run.parts.controller.t_f)
+        near = np.abs(run.log.t - t_f) < 0.02 * t_f
+        ratios[name] = float(np.abs(run.log.u[near]).max()) / _first_torque(run)
     return Claim(
         "Theorems 1 to 3",
         "no singularity: the control stays bounded as its gains grow without bound",
-        f"within 2 % of t_f the largest input is {max(late.values()):.2f} of the first one in all six cases",
-        "holds" if max(late.values()) < 1.0 else "differs",
+        f"within 2 % of t_f the largest input is {max(ratios.values()):.2f} of the first one in all six cases",
+        "holds" if max(ratios.values()) < 1.0 else "differs",
         "for exact state, continuous time, q4 away from 0 and eta > n: tau^(eta-n) ln(1/tau) then goes to 0",
-        late,
+        ratios,
     )
 
 
-def _bounded_when_sampled(flown: dict[str, Run]) -> Claim:
+def _bounded_when_sampled(cases: dict[str, Run]) -> Claim:
     values = {}
     for name in ("case_2_eta_3", "case_2_eta_5"):
         tables = {
@@ -218,7 +220,7 @@ def _bounded_when_sampled(flown: dict[str, Run]) -> Claim:
             "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
         }
         values[name] = runs.fly(study(from_tables(tables))).metrics["peak_torque"]
-        values[f"{name}_continuous"] = flown[name].metrics["peak_torque"]
+        values[f"{name}_continuous"] = cases[name].metrics["peak_torque"]
     three, five = values["case_2_eta_3"], values["case_2_eta_5"]
     more = max(three / values["case_2_eta_3_continuous"], five / values["case_2_eta_5_continuous"])
     return Claim(
@@ -232,8 +234,8 @@ def _bounded_when_sampled(flown: dict[str, Run]) -> Claim:
     )
 
 
-def _stays(flown: dict[str, Run]) -> Claim:
-    at, after = _at_and_after(flown["case_1_30"])
+def _stays(cases: dict[str, Run]) -> Claim:
+    at, after = _at_and_after(cases["case_1_30"])
     return Claim(
         "(23), (34), (51)",
         "the system stays at the origin after t_f",

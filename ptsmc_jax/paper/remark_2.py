@@ -10,7 +10,7 @@ from ptsmc_jax.scenario import from_tables, study
 
 OBSERVERS = ("none", "nonlinear", "finite_time", "prescribed_time")
 SIGNS = {"exact": 0.0, "smooth": 1e-3}
-FOUND = 0.2  # of the largest disturbance: an estimate that stays nearer than that has settled
+SETTLED = 0.2  # share of the largest disturbance: an estimate whose error stays below it has settled
 # Case II, eta = 3, as it would fly: 20 Hz, handed over half a second before t_f, and a disturbance that is there from
 # the start, which no estimate knows.
 _TABLES: dict[str, Any] = {
@@ -42,24 +42,21 @@ def measure() -> list[Measured]:
 
 
 def _measured(observer: str, sign: str) -> Measured:
-    tables = {**_TABLES, "observer": {"kind": observer, **({"t_o": 1.0} if observer == "prescribed_time" else {})}}
-    tables["controller"] = {**_TABLES["controller"], "sign_width": SIGNS[sign]}
-    run = runs.fly(study(from_tables(tables)))
-    off = np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
-    far = np.flatnonzero(off > FOUND * np.linalg.norm(run.log.disturbance, axis=1).max())
-    settled = float("nan") if far[-1] + 1 >= len(off) else float(run.log.t[far[-1] + 1])
-    late = run.log.t >= float(run.parts.controller.t_f)
-    kept = ("chattering", "settling_time", "window_error", "peak_torque")
-    return Measured(
-        observer, sign, estimate_settled=settled, estimate_error=float(off[late].max()), t=run.log.t, off=off,
-        **{name: run.metrics[name] for name in kept},
-    )  # fmt: skip
+    table = {"kind": observer, "t_o": 1.0} if observer == "prescribed_time" else {"kind": observer}
+    controller = {**_TABLES["controller"], "sign_width": SIGNS[sign]}
+    run = runs.fly(study(from_tables({**_TABLES, "observer": table, "controller": controller})))
+    t, off = run.log.t, np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
+    unsettled = np.flatnonzero(off > SETTLED * np.linalg.norm(run.log.disturbance, axis=1).max())
+    settled = float("nan") if unsettled[-1] + 1 >= len(off) else float(t[unsettled[-1] + 1])
+    error = float(off[t >= float(run.parts.controller.t_f)].max())
+    metrics = {name: run.metrics[name] for name in ("chattering", "settling_time", "window_error", "peak_torque")}
+    return Measured(observer, sign, estimate_settled=settled, estimate_error=error, t=t, off=off, **metrics)
 
 
-def rows(found: list[Measured]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """The table: a header, and a line for each."""
+def rows(measured: list[Measured]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """The table: a header, and a line for each measurement."""
     head = (
-        "observer", "sign", "chattering [N m/s]", f"estimate within {FOUND:.0%} from [s]",
+        "observer", "sign", "chattering [N m/s]", f"estimate within {SETTLED:.0%} from [s]",
         "estimation error after t_f [N m]", "attitude settled [s]", "RMS window error", "peak torque [N m]",
     )  # fmt: skip
     lines = [
@@ -68,7 +65,7 @@ def rows(found: list[Measured]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]
             f"{one.estimate_error:.1e}", _or_never(one.settling_time), f"{one.window_error:.1e}",
             f"{one.peak_torque:.3f}",
         )
-        for one in found
+        for one in measured
     ]  # fmt: skip
     return head, lines
 

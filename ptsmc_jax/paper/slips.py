@@ -32,13 +32,13 @@ class Slip:
     values: dict[str, float]
 
 
-def shown(flown: dict[str, Run]) -> list[Slip]:
-    """Each slip with what shows it; flown: what `claims.fly_cases` returns."""
+def slips(cases: dict[str, Run]) -> list[Slip]:
+    """Each slip with what shows it; cases: of `claims.fly_cases`."""
     return [
         _expansion(),
         _theorem_3(),
         _missing_term(),
-        _factor_of_the_bound([flown[name] for name in claims.SPACECRAFT]),
+        _factor_of_the_bound([cases[name] for name in claims.SPACECRAFT]),
         _decay_of_the_bound(),
         _initial_estimate(),
         _effective_gain(),
@@ -56,14 +56,14 @@ def _expansion() -> Slip:
 
     worst = 0.0
     for n in (2, 3, 4, 5):
-        derivative, states = (lambda time: x(time) / (t_f - time) ** eta), x
-        whole = [x(t)]
+        derivative, x_derivative = (lambda time: x(time) / (t_f - time) ** eta), x
+        states = [x(t)]
         for _ in range(n - 1):
-            derivative, states = jax.grad(derivative), jax.grad(states)
-            whole.append(states(t))
+            derivative, x_derivative = jax.grad(derivative), jax.grad(x_derivative)
+            states.append(x_derivative(t))
         c = closed_forms.expansion(jnp.asarray(eta), n)
         tau = t_f - t
-        s = sum(c[i] * tau**i * whole[i] for i in range(n))
+        s = sum(c[i] * tau**i * states[i] for i in range(n))
         worst = max(worst, abs(float(derivative(t) * tau ** (eta + n - 1) / s - 1.0)))
     return Slip(
         "(37), (38), (40)",
@@ -81,8 +81,8 @@ def _theorem_3() -> Slip:
     law, n = run.parts.controller, run.parts.controller.order
     before = run.log.t < float(law.hand_over)
     tau = float(law.t_f) - run.log.t[before]
-    bare = np.abs(run.log.s[before, 0]) / tau ** (float(law.eta) + n - 1)
-    growth = float(np.interp(-0.05, -tau, bare) / bare[0])
+    without_factor = np.abs(run.log.s[before, 0]) / tau ** (float(law.eta) + n - 1)
+    growth = float(np.interp(-0.05, -tau, without_factor) / without_factor[0])
     return Slip(
         "Theorem 3",
         "s = d^(n-1)/dt^(n-1) (x_1 / (t_f - t)^eta)",
@@ -99,16 +99,16 @@ def _missing_term() -> Slip:
         def rate(_: float, y: np.ndarray) -> list[float]:
             return [y[1], -(y[0] + y[1]) - factor * y[1]]
 
-        flown = solve_ivp(rate, (0.0, 10.0), [1.0, -1.0], rtol=1e-10, atol=1e-12)
-        return float(np.abs(flown.y.sum(axis=0)).max())
+        motion = solve_ivp(rate, (0.0, 10.0), [1.0, -1.0], rtol=1e-10, atol=1e-12)
+        return float(np.abs(motion.y.sum(axis=0)).max())
 
-    kept, left = largest(1.0), largest(0.0)
+    with_term, without = largest(1.0), largest(0.0)
     return Slip(
         "(29), second branch",
         "no term for the x_1' of s = x_1 + x_1'",
         "F(x) inside the bracket, as (10) has x_2 and (60) 2 eps_1'",
-        f"from x_1 = 1 on the surface s = 0: |s| stays {kept:.0e} with it and reaches {left:.2f} without",
-        {"with": kept, "without": left},
+        f"from x_1 = 1 on the surface s = 0: |s| stays {with_term:.0e} with it and reaches {without:.2f} without",
+        {"with": with_term, "without": without},
     )
 
 
@@ -140,23 +140,25 @@ def _decay_of_the_bound() -> Slip:
     bound = nonlinear.NonlinearObserver(
         rigid_body.spacecraft(inertia), jnp.asarray(gain), jnp.asarray(0.0), jnp.asarray(1.0)
     ).error_bound()
-    left = np.linalg.norm(expm(-10.0 * a), 2)
+    error = np.linalg.norm(expm(-10.0 * a), 2)  # after 10 s, from 1
     return Slip(
         "(55)",
         "l_m is the smallest diagonal element of l J^-1",
         "the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound times sqrt(cond(l))",
-        f"a body with products of inertia: after 10 s the error is {left / np.exp(-10 * printed):.1f} times the "
-        f"paper's bound, {left / float(bound(jnp.asarray(10.0))):.4f} of the corrected one",
+        f"a body with products of inertia: after 10 s the error is {error / np.exp(-10 * printed):.1f} times the "
+        f"paper's bound, {error / float(bound(jnp.asarray(10.0))):.4f} of the corrected one",
         {"printed": printed, "corrected": float(bound.rate)},
     )
 
 
 def _initial_estimate() -> Slip:
     bound = {"disturbance_rate_bound": 1e-3}  # the paper's, not that of a constant
-    tables = {"disturbance": {"kind": "constant"}, "controller": bound}
-    run = runs.fly(study(from_tables(tables)))
-    wide = runs.fly(study(from_tables({**tables, "controller": {**bound, "initial_estimate_error": 0.01 * 3**0.5}})))
-    ratios = [_over_bound(run, 1.0), _over_bound(wide, 1.0)]
+    tables = {"disturbance": {"kind": "constant"}}
+    true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
+    ratios = [
+        _over_bound(runs.fly(study(from_tables({**tables, "controller": controller}))), 1.0)
+        for controller in (bound, true_bound)
+    ]
     return Slip(
         "(57)",
         "K2 needs |e_d(0)|, which no controller knows",
@@ -206,19 +208,22 @@ def _sign_of_q4() -> Slip:
     ready = study(from_tables(tables))
     law = ready.parts.controller
     printed = _Unaligned(law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width, law.surface_rate)
-    found = []
-    for controller in (printed, law):
+
+    def at_t_f(controller: prescribed_time.PrescribedTime) -> tuple[float, float]:
+        """Size of eps_1 and angle to the reference [deg]."""
         run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))
         k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])
-        off = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))
-        found.append((float(np.linalg.norm(run.log.error[k])), float(np.rad2deg(off))))
+        angle = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))
+        return float(np.linalg.norm(run.log.error[k])), float(np.rad2deg(angle))
+
+    (error, angle), (_, aligned_angle) = at_t_f(printed), at_t_f(law)
     return Slip(
         "4",
         "any sign of q",
         "the sign of q4 at t = 0 must be that of q_f4: the law cannot cross q4 = 0",
-        f"a slew of 60 degrees from the other sign of q: eps_1 = {found[0][0]:.0e} at t_f, {found[0][1]:.0f} degrees "
-        f"away from the reference; from the right one {found[1][1]:.0e} degrees",
-        {"error": found[0][0], "angle_deg": found[0][1], "aligned_angle_deg": found[1][1]},
+        f"a slew of 60 degrees from the other sign of q: eps_1 = {error:.0e} at t_f, {angle:.0f} degrees "
+        f"away from the reference; from the right one {aligned_angle:.0e} degrees",
+        {"error": error, "angle_deg": angle, "aligned_angle_deg": aligned_angle},
     )
 
 

@@ -1,6 +1,6 @@
 """The metrics of a run by name, a row each for every kind of plant that has it: what `[requirements]` may ask for.
 
-How each comes about is in `metric_rows`; here is what can be said without JAX.
+How each is computed is in `metric_rows`; this file needs no JAX.
 """
 
 import math
@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """A metric's unit and meaning; table: of the scenario, without which a run lacks it."""
+    """A metric's unit and meaning."""
 
     unit: str
     meaning: str
-    table: str | None = None
+    table: str | None = None  # table of the scenario without which a run lacks the metric
 
 
-# pointing error indices (ECSS-E-ST-60-10C), see `pointing`: of each the largest in the observation is told
+# pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest in the observation
 INDICES = {
     "ape": "APE, the error",
     "mpe": "MPE, the error's mean over a window",
@@ -26,12 +26,12 @@ INDICES = {
     "rke": "RKE, the error of the attitude that the law is given less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # of which there are shares of time
+TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # those with a share of time
 RELATIVE = ("rpe", "rke")  # among them those that need the samples of a window
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
-WITHIN = "within_"  # how the metric begins that says for what share of the time a run keeps a limit
-# how metrics begin that a run without noise lacks
-KNOWLEDGE = tuple(f"{of}{index}" for of in ("", WITHIN) for index in ("ake", "mke", "rke"))
+WITHIN = "within_"  # prefix of the metric that is the share of the time in which a run keeps a limit
+# prefixes of metrics that a run without noise lacks
+KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
     "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),
@@ -78,7 +78,7 @@ STATE_CATALOGUE = {
     "peak_rate": Entry("x2", "largest |x_2|"),
 }
 MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
-# what a number in words may be in, by the unit of its metric or key: name of the unit -> how much that is
+# units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
             "arcsec": math.pi / 648_000},

@@ -24,6 +24,7 @@ def _not_below(t: Array, limit: Scalar | float) -> Array:
 
 
 def _not_above(t: Array, limit: Scalar) -> Array:
+    """min(t, limit), in the same way."""
     return jnp.where(t < limit, t, limit)
 
 
@@ -50,7 +51,7 @@ class Anchored:
         return self.before + self.after
 
     def long_enough_for(self, others: Sequence[Any]) -> "Anchored":
-        """The same with as many samples on either side of the hand-over as the longest of these."""
+        """The clock with as many samples on either side of the hand-over as the longest of these clocks."""
         return replace(self, before=max(one.before for one in others), after=max(one.after for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -76,7 +77,7 @@ class Flight:
     anchored: ClassVar[bool] = False
 
     def long_enough_for(self, others: Sequence[Any]) -> "Flight":
-        """The same with as many samples as the longest of these."""
+        """The clock with as many samples as the longest of these clocks."""
         return replace(self, count=max(one.count for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -110,7 +111,7 @@ class Graded:
         return self.before + self.after
 
     def long_enough_for(self, others: Sequence[Any]) -> "Graded":
-        """The same: its number of steps follows from its own accuracy."""
+        """The clock itself: its number of steps follows from its own accuracy."""
         return self
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -127,6 +128,7 @@ class Graded:
         return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t))
 
     def _graded(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
+        """Nodes from 0 to the hand-over [s]."""
         a = (self.before - (t_f - delta) / self.max_step) / jnp.log(t_f / delta)
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
         level = start + (end - start) * jnp.arange(self.before + 1) / self.before
@@ -162,18 +164,27 @@ def graded(
     saves: object = (),
     order: int = 1,
 ) -> Graded:
-    """Grid of the continuous loop for these times [s]; `saves` are further nodes.
+    """Grid of the continuous loop.
 
-    hold_rate: fastest decay after the hand-over [1/s]; frequency: fastest angular frequency [rad/s]; layer: fastest
-    rates of the smooth sign's boundary layer before and after the hand-over [1/s]; order: of a chain, 1 otherwise.
     200 graded steps and at most t_f/200 each leave 1e-8 in the states of the paper's cases, and the error falls with
     the fourth power. Chains take 3 n - 4 times as many, which leaves 1e-9 of the largest state up to order 5. Explicit
     steps must resolve the smooth sign.
+
+    Args:
+        t_f: prescribed time [s].
+        delta: the hand-over is so long before it [s].
+        t_end: end of the run [s].
+        window: after t_f, a node at its end [s].
+        hold_rate: fastest decay after the hand-over [1/s].
+        frequency: fastest angular frequency [rad/s].
+        layer: fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s].
+        saves: further nodes [s].
+        order: of a chain, 1 otherwise.
     """
-    pace = _Pace(t_f, hold_rate, frequency, layer, order)
     before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order))
     times = np.asarray(saves, dtype=float).reshape(-1)
-    end, width, largest = (jnp.asarray(float(v)) for v in (t_end, window, pace.before))
+    step, _ = _largest_steps(t_f, hold_rate, frequency, layer, order)
+    end, width, largest = (jnp.asarray(float(v)) for v in (t_end, window, step))
     return Graded(end, width, largest, jnp.asarray(times), before, after)
 
 
@@ -187,17 +198,21 @@ def graded_steps(
     order: int = 1,
 ) -> tuple[float, float]:
     """How many steps `graded` takes before and after the hand-over, before rounding up; may be infinite."""
-    pace = _Pace(t_f, hold_rate, frequency, layer, order)
+    before, after = _largest_steps(t_f, hold_rate, frequency, layer, order)
     with np.errstate(divide="ignore"):
-        uniform = float(np.divide(t_f - delta, pace.before))
-        return 200.0 * pace.finer + uniform, float(np.divide(t_end - t_f + delta, pace.after))
+        uniform = float(np.divide(t_f - delta, before))
+        return 200.0 * _refinement(order) + uniform, float(np.divide(t_end - t_f + delta, after))
 
 
-class _Pace:
-    """Largest steps before and after the hand-over [s], and how much finer than the usual ones they are."""
+def _refinement(order: int) -> int:
+    """How many times as many steps a chain takes as a second-order motion."""
+    return max(1, 3 * order - 4)
 
-    def __init__(self, t_f: float, hold_rate: float, frequency: float, layer: tuple[float, float], order: int):
-        rapid = 0.3 / max(frequency, 1e-12)
-        self.finer = max(1, 3 * order - 4)
-        self.before = min(t_f / 200.0 / self.finer, rapid, 1.5 / max(layer[0], 1e-12))
-        self.after = min(0.1 / max(1.0, hold_rate), rapid, 1.5 / max(layer[1], 1e-12))
+
+def _largest_steps(
+    t_f: float, hold_rate: float, frequency: float, layer: tuple[float, float], order: int
+) -> tuple[float, float]:
+    """Largest steps before and after the hand-over [s]."""
+    rapid = 0.3 / max(frequency, 1e-12)
+    before = min(t_f / 200.0 / _refinement(order), rapid, 1.5 / max(layer[0], 1e-12))
+    return before, min(0.1 / max(1.0, hold_rate), rapid, 1.5 / max(layer[1], 1e-12))

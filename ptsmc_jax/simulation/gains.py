@@ -15,7 +15,7 @@ from jaxtyping import Array
 from ptsmc_jax.simulation.assembly import Parts
 
 AXIS = "observer_gain_"
-SENSORS = "sensors_"  # how the names of gains begin that sensors of one's own have
+SENSORS = "sensors_"  # prefix of the gains that sensors of one's own have
 _OF_FILTERS = ("filter_bandwidth", "command_corner")
 
 
@@ -26,8 +26,11 @@ def base(name: str) -> str:
 
 def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
     """Gains of an observer of one's own, by its fields."""
-    found = {name.removeprefix("observer_"): v for name, v in gains.items() if name.startswith("observer_")}
-    return {name: v for name, v in found.items() if base(f"observer_{name}") != "observer_gain"}
+    return {
+        name.removeprefix("observer_"): value
+        for name, value in gains.items()
+        if name.startswith("observer_") and base(name) != "observer_gain"
+    }
 
 
 def of_sensors(gains: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,9 +57,9 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     parts = replace(parts, controller=replace(parts.controller, **law))
     if of_observer(gains):
         parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
-    each = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
-    if each is not None:
-        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(each)))
+    axes = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
+    if axes is not None:
+        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(axes)))
     if of_sensors(gains):
         own_sensors = replace(parts.sensors.own, **of_sensors(gains))
         parts = replace(parts, sensors=replace(parts.sensors, own=own_sensors))
@@ -71,10 +74,11 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
 
 def _check_names(parts: Parts, names: Iterable[str]) -> None:
-    each = len(getattr(parts.observer, "gain", ()))
+    """Raises ValueError where one of these is no gain of the parts."""
+    axes = len(getattr(parts.observer, "gain", ()))
     allowed = {"t_f", *parts.controller.tunable, *(f"observer_{name}" for name in parts.observer.tunable)}
-    if each:
-        allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(each))}
+    if axes:
+        allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(axes))}
     allowed |= {SENSORS + name for name in _tunable_of_sensors(parts)}
     if getattr(parts.sensors, "filter", None) is not None:
         allowed.add("filter_bandwidth")
@@ -86,11 +90,12 @@ def _check_names(parts: Parts, names: Iterable[str]) -> None:
 
 
 def _tunable_of_sensors(parts: Parts) -> tuple[str, ...]:
-    """Those of sensors of one's own, by their fields."""
+    """Gains of sensors of one's own, by their fields."""
     return getattr(getattr(parts.sensors, "own", None), "tunable", ())
 
 
 def _check_clock(parts: Parts) -> None:
+    """Raises ValueError where an anchored clock has too few samples for t_f and delta, as far as these are known."""
     clock: Any = parts.clock
     law = parts.controller
     if not clock.anchored:
@@ -114,9 +119,9 @@ def gains_of(parts: Parts) -> dict[str, float]:
     controller = parts.controller
     law = [name for name in controller.tunable if name not in ("k1", "sign_width", "surface_rate", "t_f")]
     gains = {name: float(getattr(controller, name)) for name in law}
-    each = [float(v) for v in getattr(parts.observer, "gain", ())]
-    if each:
-        gains["observer_gain"] = sum(each) / len(each)
+    axes = [float(v) for v in getattr(parts.observer, "gain", ())]
+    if axes:
+        gains["observer_gain"] = sum(axes) / len(axes)
     gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
     for name in _tunable_of_sensors(parts):
@@ -125,18 +130,18 @@ def gains_of(parts: Parts) -> dict[str, float]:
         gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.period))
     if parts.command_filter is not None:
         gains["command_corner"] = float(parts.command_filter.corner)
-    return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(each) if len(set(each)) > 1}}
+    return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(axes) if len(set(axes)) > 1}}
 
 
 def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
     """The parts' own values of these gains."""
-    gains, each = gains_of(parts), getattr(parts.observer, "gain", ())
-    return [float(each[int(name.removeprefix(AXIS)) - 1]) if name != base(name) else gains[name] for name in names]
+    gains = gains_of(parts)
+    axes = {f"{AXIS}{k + 1}": float(value) for k, value in enumerate(getattr(parts.observer, "gain", ()))}
+    return [(axes if base(name) != name else gains)[name] for name in names]
 
 
 def on_every_axis(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
-    """The observer's gain on every axis, where these gains name one."""
+    """The observer's gain on every axis, where these gains name one; own: its values without them."""
     if not any(base(name) == "observer_gain" for name in gains):
         return None
-    common = [gains.get("observer_gain", value) for value in own]
-    return [gains.get(f"{AXIS}{k + 1}", value) for k, value in enumerate(common)]
+    return [gains.get(f"{AXIS}{k + 1}", gains.get("observer_gain", value)) for k, value in enumerate(own)]

@@ -1,6 +1,6 @@
 """Requirements: "peak_torque at most 0.5 N m in 99 % of trials", one declaration for verdict and loss.
 
-On metrics of what is flown, and on margins of its loop, most of which are to be at least so large.
+They limit metrics of runs from above, and margins of the loop mostly from below.
 """
 
 import bisect
@@ -26,12 +26,12 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
         return max(1, math.ceil(quantile * trials - 1e-9))
     if trials < fewest_trials(quantile, confidence):
         return None
-    from ptsmc_jax.numerics.statistics import share_bound  # SciPy's take a while to import, which few runs wait for
+    from ptsmc_jax.numerics.statistics import share_bound  # imports SciPy's statistics, which takes a while
 
     def shown(within: int) -> bool:
         return share_bound(within, trials, confidence) >= quantile
 
-    # the bound rises with the count; all of them show it, whatever rounding says: there are as many as it takes
+    # the bound rises with the count, and `trials` are enough for all of them to show it, whatever rounding says
     return 1 + bisect.bisect_left(range(1, trials), True, key=shown)
 
 
@@ -50,13 +50,13 @@ def over(values: Any, limit: Any, *, at_least: bool) -> Any:
     Where values must be at least the limit, it is 2 - value / limit, and 0 for an infinite value. Of a limit of zero it
     is 0 where the limit is kept, and above 1 where it is not.
     """
-    none = limit == 0.0
+    zero = limit == 0.0
     with np.errstate(over="ignore"):
-        share = (values + none * (values > 0.0)) / (limit + none)
+        share = (values + zero * (values > 0.0)) / (limit + zero)
     return 2.0 - share.clip(max=2.0) if at_least else share
 
 
-# what a probability is of (ECSS-E-ST-60-10C)
+# interpretations of a probability (ECSS-E-ST-60-10C): that of ...
 INTERPRETATIONS = {
     "ensemble": "runs that keep the limit at all times",
     "temporal": "the time, in every run",
@@ -94,10 +94,10 @@ class Verdict:
         return least is not None and self.trials - self.failures >= least
 
     @classmethod
-    def read(cls, told: Mapping[str, Any]) -> "Verdict":
-        """A verdict as `summary.json` has it, where null stands for a number that is not finite."""
-        known = {field.name: told[field.name] for field in fields(cls) if told.get(field.name) is not None}
-        return cls(**{"worst": math.nan, "margin": math.nan, **known})
+    def read(cls, entry: Mapping[str, Any]) -> "Verdict":
+        """A verdict from its entry in `summary.json`, where null stands for a number that is not finite."""
+        present = {field.name: entry[field.name] for field in fields(cls) if entry.get(field.name) is not None}
+        return cls(**{"worst": math.nan, "margin": math.nan, **present})
 
     def __str__(self) -> str:
         """The verdict in one line."""
@@ -140,7 +140,7 @@ class Verdict:
 
 
 def _in_degrees(value: float, unit: str) -> str:
-    """What an angle is in the unit that engineers state it in, or a rate; nothing of what is neither."""
+    """An angle or a rate in degrees, in parentheses; nothing for other units."""
     return f" ({math.degrees(value):.4g} {unit.replace('rad', 'deg')})" if unit in ("rad", "rad/s") else ""
 
 
@@ -162,15 +162,20 @@ class Requirement:
     interpretation: str = "ensemble"
 
     @property
+    def stated_unit(self) -> str:
+        """The metric's unit, as the requirement states it or as a spacecraft's is."""
+        return CATALOGUE[self.metric].unit if self.unit is None else self.unit
+
+    @property
     def timed(self) -> str | None:
-        """The metric that says for what share of the time a run keeps the limit, where that is asked for."""
+        """The metric of the share of the time in which a run keeps the limit; None where no share is asked for."""
         return None if self.interpretation == "ensemble" else f"{WITHIN}{self.metric}"
 
     @property
     def implied_by(self) -> "Requirement":
-        """The ensemble requirement that implies this one: what is searched for, since shares of time have no slopes."""
-        kept = None if self.interpretation == "temporal" else self.quantile
-        return replace(self, interpretation="ensemble", quantile=kept)
+        """The ensemble requirement that implies this one, for a search: shares of time have no slopes."""
+        quantile = None if self.interpretation == "temporal" else self.quantile
+        return replace(self, interpretation="ensemble", quantile=quantile)
 
     def verdict(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray | None = None) -> Verdict:
         """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
@@ -178,29 +183,35 @@ class Requirement:
         A single run, numbers (), is judged by the limit alone, or by its share of the time. within: shares of the time
         in which each run keeps the limit, needed where these are asked for.
         """
-        if self.timed is not None and within is not None:
-            many, ended, share = (np.atleast_1d(np.asarray(v)) for v in (values, ok, within))
-            return self._of_time(many, ended, share, single=np.ndim(values) == 0)
         single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
-        within = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
+        if self.timed is not None and within is not None:
+            return self._of_time(values, ok, np.atleast_1d(np.asarray(within)), single=single)
+        keeps = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
         known = np.where(ok, values, np.nan)
         worst = float(np.min(known) if self.at_least else np.max(known))
-        share = (None, None) if single else (self.quantile, self.confidence)
-        least = must_keep(values.size, *share)
+        quantile, confidence = (None, None) if single else (self.quantile, self.confidence)
+        least = must_keep(values.size, quantile, confidence)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan
         margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)
-        unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
-        failures = int(np.sum(~within))
-        count = int(values.size)
-        return Verdict(self.metric, self.limit, unit, worst, float(margin), failures, count, *share, self.at_least)
+        return Verdict(
+            self.metric,
+            self.limit,
+            self.stated_unit,
+            worst=worst,
+            margin=float(margin),
+            failures=int(np.sum(~keeps)),
+            trials=int(values.size),
+            quantile=quantile,
+            confidence=confidence,
+            at_least=self.at_least,
+        )
 
     def _of_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
         """The verdict on a share of the time; a run that failed keeps the limit at no time."""
         assert self.quantile is not None
         beyond = np.where(ok & ~np.isnan(within), 1.0 - within, 1.0)
-        unit = CATALOGUE[self.metric][0] if self.unit is None else self.unit
         confidence = None if single else self.confidence
         if self.interpretation == "temporal":
             least = shown = 1.0 - float(beyond.max())
@@ -214,7 +225,7 @@ class Requirement:
         return Verdict(
             self.metric,
             self.limit,
-            unit,
+            self.stated_unit,
             worst=float(np.max(np.where(ok, values, np.nan))),
             margin=(1.0 - shown) / (1.0 - self.quantile),
             failures=failures,
@@ -228,5 +239,8 @@ class Requirement:
 
 
 def verdicts(asked: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:
-    """One for each requirement on what is flown; values: of a metric, by its name, of one run or of many."""
+    """A verdict for each requirement on metrics.
+
+    values: metric's name -> its values of one run, or of many (trials,); finished: which of these runs ended, likewise.
+    """
     return [r.verdict(values(r.metric), finished, None if r.timed is None else values(r.timed)) for r in asked]

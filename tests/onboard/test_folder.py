@@ -116,7 +116,10 @@ def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
 def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     text = (exported / "ptsmc_short.c").read_text()
     assert "(56), (57) before and (59), (60) after the hand-over." in text.replace("\n * ", " ")
-    for line in ("const real error_1 = attitude[0] - p->reference_q[0];", "const real wanted_3 = -switching_3"):
+    for line in (
+        "const real error_1 = attitude[0] - p->reference_q[0];",
+        "const real twice_acceleration_3 = -switching_3",
+    ):
         assert line in text
     assert "eta > 2" in (exported / "ptsmc_short.h").read_text()
 

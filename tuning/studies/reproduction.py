@@ -31,7 +31,7 @@ class Reproduction:
 def reproduce() -> Reproduction:
     """Fly every case of the paper and measure what it claims."""
     cases = claims.fly_cases()
-    return Reproduction(cases, claims.claims(cases), slips.shown(cases), remark_2.measure())
+    return Reproduction(cases, claims.claims(cases), slips.slips(cases), remark_2.measure())
 
 
 def summary(made: Reproduction) -> dict[str, Any]:
