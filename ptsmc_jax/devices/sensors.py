@@ -233,15 +233,8 @@ class Sensors(Sensor):
         """The sensors without noise and bias; the filter keeps its gains."""
         exact = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
         zero = jnp.zeros_like(jnp.asarray(self.attitude_noise))
-        return replace(
-            self,
-            attitude_noise=zero,
-            rate_noise=zero,
-            filter=exact,
-            rate_bias=None,
-            bias_rate=None,
-            given_bias=None,
-        )
+        quiet = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact)
+        return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Bias of the gyro at the first sample [rad/s]."""
@@ -274,16 +267,9 @@ class Sensors(Sensor):
         if self.filter is not None:
             root, star_every = np.asarray(self.filter.spread[-1]), self.every
             start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root @ root.T, one)
-        return Reading(
-            rows=np.block([[one, zero, zero], [zero, one, one]]),
-            noise=np.repeat([star, gyro], 3),
-            every=np.repeat([star_every if self.own_times is None else 0, 1], 3),
-            own=np.full(3, bias),
-            own_drift=np.full(3, drift),
-            start=start,
-            own_times=self.own_times,
-            slopes=np.block([[zero, one, zero], [zero, zero, zero]]),
-        )
+        rows, slopes = np.block([[one, zero, zero], [zero, one, one]]), np.block([[zero, one, zero], [zero] * 3])
+        noise, every = np.repeat([star, gyro], 3), np.repeat([star_every if self.own_times is None else 0, 1], 3)
+        return Reading(rows, noise, every, np.full(3, bias), np.full(3, drift), start, self.own_times, slopes)
 
     def in_step(self) -> "Sensors":
         """The sensors with a star tracker of weaker measurements at every control sample, where it has its own times.

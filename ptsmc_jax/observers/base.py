@@ -79,17 +79,17 @@ class Observer(ABC):
     def error_bound(self) -> Bound:
         """K2(t), the bound on the 2-norm of the estimation error."""
 
-    @abstractmethod
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """The mean of A [1/s] over a step from t to t_next [s]."""
+        """The mean of A [1/s] over a step from t to t_next [s] of the continuous loop."""
+        raise NotImplementedError
 
-    @abstractmethod
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """The forcing m' + A m at t in the step `span` [s], with A the `decay_matrix` of that step; d_eff [N m]."""
+        raise NotImplementedError
 
-    @abstractmethod
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """The matrix that `update` takes for a period dt [s], computed once, outside the loop."""
+        """The matrix that `update` takes for a period dt [s], computed once, outside the loop; empty: it needs none."""
+        return jnp.zeros((0, 0))
 
     @abstractmethod
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
@@ -136,18 +136,6 @@ class SampledObserver(Observer):
         """`step` over periods that have a length, of the mean impulse / dt [N m]."""
         length = jnp.where(dt > 0.0, dt, 1.0)
         return self.step(memory, impulse / length, t, length)
-
-    def update_matrix(self, dt: Scalar) -> Matrix:
-        """Not used."""
-        return jnp.zeros((0, 0))
-
-    def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """Not used: of the continuous loop."""
-        raise NotImplementedError
-
-    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Any, d_eff: Vector) -> Any:
-        """Not used: of the continuous loop."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

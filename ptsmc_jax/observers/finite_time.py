@@ -78,10 +78,6 @@ class FiniteTimeObserver(Observer):
         root = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(e0, self.sign_width)
         return jnp.concatenate([-1.1 * self.gain * guards.smooth_sign(e0, self.sign_width), d_hat - d_eff - root])
 
-    def update_matrix(self, dt: Scalar) -> Matrix:
-        """Empty: `update` needs no matrix."""
-        return jnp.zeros((0, 0))
-
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
         """Implicit Euler with the exact sign, in closed form: it cannot blow up, and it rests where e0 = 0.
 

@@ -124,11 +124,6 @@ def flexible(inertia: object, frequency: object, damping: object, coupling: obje
     """
     tensor = formulas.check_inertia(inertia)
     rest = formulas.rest_inertia(tensor, coupling)
-    return FlexibleSpacecraft(
-        inertia=vector(tensor),
-        inertia_inverse=vector(np.linalg.inv(tensor)),
-        frequency=vector(frequency),
-        damping=vector(damping),
-        coupling=vector(coupling),
-        rest_inverse=vector(np.linalg.inv(rest)),
-    )
+    inverse, rest_inverse = vector(np.linalg.inv(tensor)), vector(np.linalg.inv(rest))
+    modes = vector(frequency), vector(damping), vector(coupling)
+    return FlexibleSpacecraft(vector(tensor), inverse, *modes, rest_inverse)

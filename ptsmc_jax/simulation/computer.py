@@ -92,13 +92,6 @@ def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ti
     return Computer(sensors, x0, parts.observer.begin(), parts.controller.begin(), applied, command_filter)
 
 
-def measure(parts: Parts, period: Period, computer: Computer, x: Any) -> tuple[Any, Any]:
-    """The state as the sensors measure it at the start of a period, and their memory; x: as in `decide`."""
-    if parts.sensors is None:
-        return x, None
-    return parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, period.star_x)
-
-
 def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
     """What a star tracker with times of its own sees in a period, without noise; None: it samples with the computer.
 
@@ -133,14 +126,6 @@ def command(
     return u, s, guards.select(has_length, memory, computer.law)
 
 
-def filtered(parts: Parts, period: Period, computer: Computer, u: Array) -> tuple[Array, Any]:
-    """The law's torque (m,) [N m] behind the command's filter, and the filter's memory."""
-    if parts.command_filter is None:
-        return u, computer.command_filter
-    u, memory = parts.command_filter.step(computer.command_filter, u, period.dt_before, period.length)
-    return u, guards.select(period.length > 0.0, memory, computer.command_filter)
-
-
 def decide(
     parts: Parts, k2: Bound, period: Period, computer: Computer, x: Any, actuator_state: ActuatorState | None = None
 ) -> tuple[Decision, Computer]:
@@ -157,11 +142,15 @@ def decide(
     Returns:
         The decision, and the memory but for `applied`, which is still that of the last period.
     """
-    target = parts.reference(period.now.t)
-    seen, sensors = measure(parts, period, computer, x)
+    target, seen, sensors = parts.reference(period.now.t), x, None
+    if parts.sensors is not None:
+        seen, sensors = parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, period.star_x)
     d_hat, observer = estimate(parts, period, computer, seen)
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
-    u, command_filter = filtered(parts, period, computer, u)
+    command_filter = computer.command_filter
+    if parts.command_filter is not None:
+        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.length)
+        command_filter = guards.select(period.length > 0.0, command_filter, computer.command_filter)
     decision = Decision(target, d_hat, u, s, parts.observer.model.velocity(seen))
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)
 

@@ -196,17 +196,9 @@ class Requirement:
         deciding = float(ordered[least - 1]) if least is not None else np.nan
         margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)
         return Verdict(
-            self.metric,
-            self.limit,
-            self.stated_unit,
-            worst=worst,
-            margin=float(margin),
-            failures=int(np.sum(~keeps)),
-            trials=int(values.size),
-            quantile=quantile,
-            confidence=confidence,
-            at_least=self.at_least,
-        )
+            self.metric, self.limit, self.stated_unit, worst, float(margin), int(np.sum(~keeps)), int(values.size),
+            quantile, confidence, self.at_least,
+        )  # fmt: skip
 
     def _of_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
         """The verdict on a share of the time; a run that failed keeps the limit at no time."""
@@ -222,20 +214,11 @@ class Requirement:
             least = 1.0 - float(beyond.mean())
             shown = least if confidence is None else 1.0 - mean_bound(beyond, confidence)
             failures = int(np.sum(beyond > 0.0))
+        worst, margin = float(np.max(np.where(ok, values, np.nan))), (1.0 - shown) / (1.0 - self.quantile)
         return Verdict(
-            self.metric,
-            self.limit,
-            self.stated_unit,
-            worst=float(np.max(np.where(ok, values, np.nan))),
-            margin=(1.0 - shown) / (1.0 - self.quantile),
-            failures=failures,
-            trials=int(values.size),
-            quantile=self.quantile,
-            confidence=confidence,
-            interpretation=self.interpretation,
-            share_of_time=least,
-            shown=shown,
-        )
+            self.metric, self.limit, self.stated_unit, worst, margin, failures, int(values.size), self.quantile,
+            confidence, interpretation=self.interpretation, share_of_time=least, shown=shown,
+        )  # fmt: skip
 
 
 def verdicts(asked: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:

@@ -98,14 +98,8 @@ def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
     """The state at t = 0; wheel_momentum: (wheels,) [N m s]."""
     zero, no_torque = jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
     snapshot = _snapshot(run.parts, run.target_0, run.x0)
-    state = RunState(
-        x=run.x0,
-        u=no_torque,
-        snapshot=snapshot,
-        running=metrics.begin(_start(run.parts, snapshot, wheel_momentum), run.criteria),
-        status=jnp.int32(OK),
-        bad_time=jnp.full_like(zero, jnp.nan),
-    )
+    running = metrics.begin(_start(run.parts, snapshot, wheel_momentum), run.criteria)
+    state = RunState(run.x0, no_torque, snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
     return _judged(run, state, run.target_0, zero, zero, no_torque)
 
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
-from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import draws, integrators
 from ptsmc_jax.numerics.draws import WholeNumber
@@ -112,16 +111,6 @@ class _Loop(NamedTuple):
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
 
-    def begin(self, actuators: ActuatorState, first: Ticks, seed: WholeNumber, trial: WholeNumber) -> _Hardware:
-        """Before the first sample; first: the first period that has a length."""
-        parts, ticks, x0 = self.run.parts, self.run.ticks, self.run.x0
-        walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-        computer = self.software.boot(parts, seed, trial, parts.plant.visible(x0), first)
-        if self.actuators.holds:  # `RunState.u` is what they did
-            computer = computer._replace(applied=None)
-        offset = self.offset(ticks.t[0], ticks.sample[0])
-        return _Hardware(computer, actuators, walk, star_state(parts, first, lambda t: x0), offset)
-
     def fly(self, carry: tuple[RunState, _Hardware], tick: tuple) -> tuple[tuple[RunState, _Hardware], Log | None]:
         """A control period, and its row of the history where that is asked for."""
         (now, *_), (state, hardware) = tick, carry
@@ -179,7 +168,12 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     actuator_state = actuators.begin(parts.plant.inputs)
     state = run_state.begin(run, actuator_state.h)
     first = state.snapshot
-    carry = state, loop.begin(actuator_state, first_period, seed, trial)
-    (state, hardware), rows = jax.lax.scan(loop.fly, carry, periods)
+    walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
+    computer = software.boot(parts, seed, trial, parts.plant.visible(run.x0), first_period)
+    if actuators.holds:  # `RunState.u` is what they did
+        computer = computer._replace(applied=None)
+    offset = loop.offset(run.ticks.t[0], run.ticks.sample[0])
+    hardware = _Hardware(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
+    (state, hardware), rows = jax.lax.scan(loop.fly, (state, hardware), periods)
     log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
     return run_state.finish(run, first, state, log, hardware.actuators.h)
