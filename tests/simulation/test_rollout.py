@@ -9,7 +9,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.plants import rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
-from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation import clock, rollout, sampled
 from ptsmc_jax.theory import solutions
 from tests.helpers import FULL_INERTIA, REFERENCE, finer, fly, parts, short, vector, with_controller
 
@@ -270,13 +270,13 @@ def test_either_sign_of_the_quaternion_is_the_same_run():
 
 
 def test_another_number_is_the_same_program(monkeypatch):
-    traced, loop = [], rollout._sampled
+    traced, loop = [], sampled.fly
 
     def counted(*args):
         traced.append(args)
         return loop(*args)
 
-    monkeypatch.setattr(rollout, "_sampled", counted)
+    monkeypatch.setattr(sampled, "fly", counted)
     for k in range(3):
         run = parts(20.0 - k, 3.0 + k, 0.5 + k, 10.0 * (1 + k), k1=1.0 + k, period=0.25, noise=(1e-5 * k, 1e-6))
         run = replace(run, clock=replace(TIGHT, period=vector(0.25 + 0.01 * k), t_end=vector(30.0 - k)))
