@@ -1,1 +1,1 @@
-"""What stands between the flight computer and the body: star tracker, gyro, attitude filter, actuators, wheels."""
+"""Devices between the flight computer and the body: star tracker, gyro, attitude filter, actuators, wheels."""

@@ -22,7 +22,7 @@ def quantise(u: Array, step: Scalar) -> Array:
 
 
 class ActuatorState(NamedTuple):
-    """What actuators carry from period to period."""
+    """State of the actuators between control periods."""
 
     queue: Array | None  # (delay, m) commands on their way, the oldest first [N m]
     v: Array | None  # (channels,) torque at the end of the last period [N m]; None where nothing depends on it

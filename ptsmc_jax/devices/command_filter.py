@@ -87,7 +87,7 @@ class SecondOrder(_Second):
 @pytree
 @dataclass(frozen=True)
 class Notch(_Second):
-    """Notch (s^2 + W^2) / (s^2 + 2 z W s + W^2): nothing passes at its corner, z says how wide it is."""
+    """Notch (s^2 + W^2) / (s^2 + 2 z W s + W^2): nothing passes at its corner; its width grows with z."""
 
     def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """The command without the band, u - 2 z b."""

@@ -20,7 +20,7 @@ OWN_NOISE = "own_noise"
 
 @dataclass(frozen=True)
 class SampledSensor:
-    """What sensors of one's own are derived from; they fly in the sampled loop.
+    """The base of sensors of one's own; they fly in the sampled loop.
 
     `draws` standard normal numbers are drawn for each sample, [-]. Their memory is any pytree of arrays; `begin`'s
     default is none.

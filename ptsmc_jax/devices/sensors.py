@@ -27,7 +27,7 @@ RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_star
 
 
 class Sensor(ABC):
-    """What the rollout, linear theory and campaigns ask of a sensor.
+    """A sensor, as the rollout, linear theory and campaigns ask for it.
 
     A true state x is what sensors can see of it, `Plant.visible`.
     """

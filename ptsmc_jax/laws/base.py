@@ -1,4 +1,4 @@
-"""What the paper's prescribed-time laws share: gains, phases, and the law of every second-order error motion."""
+"""The base of the paper's prescribed-time laws: gains, phases, and the law of every second-order error motion."""
 
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
@@ -40,7 +40,7 @@ class Sample(NamedTuple):
 
 
 class Law(ErrorMotion):
-    """What the rollout asks of a law, besides the error that it drives to zero."""
+    """A control law: besides the error that it drives to zero, all that the rollout asks of it."""
 
     t_f: Leaf  # prescribed time, or when the error is judged [s]
     delta: Leaf  # hand-over this long before t_f [s]
@@ -68,7 +68,7 @@ class Law(ErrorMotion):
         raise NotImplementedError
 
     def begin(self) -> Any:
-        """What the law remembers before its first sample, a pytree of arrays; None: nothing, ever."""
+        """The law's memory before its first sample, a pytree of arrays; None: it never remembers anything."""
         return None
 
     def command(

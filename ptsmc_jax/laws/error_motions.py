@@ -19,7 +19,7 @@ State = Float[Array, " states"]
 
 
 class ErrorMotion:
-    """What an error eps of a plant is, and how its input moves it.
+    """The error eps of a plant that a law drives to zero, and how the input moves it.
 
     Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
     and inputs' own units. It is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
@@ -102,8 +102,8 @@ class ErrorVector(ErrorMotion):
         """Torque [N m] for 2 eps_1'' = `twice_acceleration`: w x J w - d_hat + J T^-1 (2 eps_1'' + 2 q_1f'' - T' w)."""
         _, reference_acceleration = target.vector_rates()
         t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
-        turned = attitude.t_inverse_times(x.q, twice_acceleration + 2.0 * reference_acceleration - t_dot_w)
-        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ turned
+        w_dot = attitude.t_inverse_times(x.q, twice_acceleration + 2.0 * reference_acceleration - t_dot_w)
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ w_dot
 
 
 class RelativeMotion(NamedTuple):
@@ -157,8 +157,8 @@ class ErrorQuaternion(ErrorMotion):
     def invert(self, x: AttitudeState, target: Target, twice_acceleration: Vector, d_hat: Vector) -> Vector:
         """Torque [N m] for 2 v'' = `twice_acceleration` [1/s^2]; see `PrescribedTimeMultiplicative`."""
         q_e, w_e, feedforward = self.relative(x, target)
-        turned = attitude.t_inverse_times(q_e, twice_acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
-        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + turned)
+        w_e_dot = attitude.t_inverse_times(q_e, twice_acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + w_e_dot)
 
     def straight_coordinates(self, error: Vector) -> Vector:
         """The rotation vector of q_e [rad]: a straight line is a rotation about the eigenaxis."""

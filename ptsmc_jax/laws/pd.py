@@ -40,8 +40,8 @@ class QuaternionPD(ErrorQuaternion, Law):
     ) -> tuple[Vector, Vector]:
         """Torque [N m], and v + (k_d/k_p) w_e, which it drives to zero, (3,) each."""
         q_e, w_e, feedforward = self.relative(x, target)
-        known = feedforward - self.k_p * q_e[:3] - self.k_d * w_e
-        u = self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ known
+        w_dot = feedforward - self.k_p * q_e[:3] - self.k_d * w_e
+        u = self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ w_dot
         return u, q_e[:3] + self.k_d / self.k_p * w_e
 
 

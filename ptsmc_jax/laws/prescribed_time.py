@@ -26,7 +26,7 @@ State = Float[Array, " twice"]
 
 @dataclass(frozen=True)
 class _Attitude(SecondOrderLaw):
-    """What both laws for a spacecraft share: K1 acts with an effective gain of K1/2 in (60)."""
+    """The base of both laws for a spacecraft: K1 acts with an effective gain of K1/2 in (60)."""
 
     model: Spacecraft  # the nominal plant
 

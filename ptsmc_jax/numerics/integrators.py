@@ -80,7 +80,7 @@ def _double(phi: list[Array]) -> list[Array]:
 
 
 class Decay(NamedTuple):
-    """What one step of `etdrk4` needs of the linear part -A over a step dt: matrices (n, n) [- or s]."""
+    """Coefficients of `etdrk4` for the linear part -A and a step dt: matrices (n, n) [- or s]."""
 
     half: Array  # e^(-A dt/2)
     full: Array  # e^(-A dt)

@@ -56,12 +56,12 @@ class Function:
     function: Callable = field(metadata={"static": True})
 
     def __call__(self, *args: Any) -> Any:
-        """What the function returns."""
+        """The value of the function."""
         return self.function(*args)
 
 
 class Gain(NamedTuple):
-    """What is known of a gain of one's own."""
+    """A gain of one's own, as its class declares it; see `gain`."""
 
     usual: tuple[float, float] | Callable | None
     above: float

@@ -13,7 +13,7 @@ SAME_INPUT = 0.9999  # rank correlation above which two inputs count as one
 
 
 def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Two-sided interval of a share: Clopper and Pearson, Biometrika 26 (1934); never less likely than it says.
+    """Two-sided interval of a share: Clopper and Pearson, Biometrika 26 (1934); at least as likely as `confidence`.
 
     >>> low, high = share_interval(successes=997, trials=1000, confidence=0.95)
     >>> f"{low:.4f} {high:.4f}"

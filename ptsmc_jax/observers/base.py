@@ -26,7 +26,7 @@ class Bound(Protocol):
 
     @property
     def largest(self) -> Scalar:
-        """What it never exceeds [N m]."""
+        """The largest value of K2 at any time [N m]."""
         ...
 
     def __call__(self, t: Scalar) -> Scalar:
@@ -60,7 +60,7 @@ def constant_bound(component_bound: Scalar, components: int) -> ErrorBound:
 
 @dataclass(frozen=True)
 class Observer(ABC):
-    """What the rollout asks of an observer."""
+    """A disturbance observer, as the rollout asks for it."""
 
     model: Plant  # the nominal plant
     tunable: ClassVar[tuple[str, ...]] = ()  # fields that tuning may move, besides `gain`
@@ -114,7 +114,7 @@ class Observer(ABC):
 
 @dataclass(frozen=True)
 class SampledObserver(Observer):
-    """What an observer of one's own is derived from; it flies in the sampled loop.
+    """The base of an observer of one's own; it flies in the sampled loop.
 
     Its memory is any pytree of arrays; `begin`'s default is an estimate of zero.
     """
@@ -129,7 +129,7 @@ class SampledObserver(Observer):
         raise NotImplementedError
 
     def error_bound(self) -> ErrorBound:
-        """K2, which the law switches against; if nothing else is said sqrt(m) K, as without an observer."""
+        """K2, which the law switches against; by default sqrt(m) K, as without an observer."""
         return constant_bound(self.disturbance_bound, self.model.inputs)
 
     def update(self, matrix: Matrix, memory: Any, impulse: Vector, t: Scalar, dt: Scalar) -> Any:

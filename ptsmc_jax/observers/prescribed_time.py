@@ -24,7 +24,7 @@ class PrescribedTimeBound(NamedTuple):
 
     @property
     def largest(self) -> Scalar:
-        """What it never exceeds [N m]."""
+        """The largest value of K2 at any time [N m]."""
         return self.base.largest
 
     def __call__(self, t: Scalar) -> Scalar:

@@ -189,7 +189,7 @@ def _effective_gain() -> Slip:
 @pytree
 @dataclass(frozen=True)
 class _Unaligned(prescribed_time.PrescribedTime):
-    """The law as printed: the sign of q is taken as it comes."""
+    """The law as printed, for any sign of q."""
 
     def align(self, x: rigid_body.AttitudeState, target: Any) -> rigid_body.AttitudeState:
         return x

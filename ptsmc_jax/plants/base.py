@@ -1,4 +1,4 @@
-"""What every plant has."""
+"""The base of every plant."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class Plant(ABC):
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
-    unknown_pace: ClassVar[bool] = False  # made of functions of one's own: how fast it is, is seen along a run only
+    unknown_pace: ClassVar[bool] = False  # made of functions of one's own: only a run shows how fast it is
     attitude: ClassVar[bool] = False  # its state holds a quaternion q and a body rate w
 
     @property
@@ -68,11 +68,11 @@ class Plant(ABC):
         return x
 
     def visible(self, x: Any) -> Any:
-        """What sensors can see of a state, that of the model that law and observer know; of most plants all."""
+        """The part of a state that sensors can see: the state of the nominal model, of most plants all of it."""
         return x
 
     def with_hidden_at_rest(self, visible: Any) -> Any:
-        """The state of which sensors see `visible`, with what they do not see at rest."""
+        """The state with this visible part, and the rest of it at rest."""
         return visible
 
     def retract(self, x: Any, by: Float[Array, " n"]) -> Any:
@@ -107,7 +107,7 @@ class Plant(ABC):
         """A history of states (time, ..) as columns of a table: name -> (time, components)."""
 
     def hidden_columns(self, x: Any) -> dict[str, Any]:
-        """The columns of what sensors do not see, such as flexible modes."""
+        """The columns of the part that sensors do not see, such as flexible modes."""
         return {}
 
 

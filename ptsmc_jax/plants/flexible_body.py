@@ -1,4 +1,4 @@
-"""A spacecraft with flexible appendages, or sloshing liquid: what flies where law and observer know a rigid body."""
+"""A spacecraft with flexible appendages, or sloshing liquid: a truth, of which law and observer know the rigid body."""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ class FlexibleSpacecraft(Spacecraft):
     rest_inverse: Leaf  # (3, 3) (J - D'D)^-1 [1/(kg m^2)]
 
     def force(self, modes: Modes) -> Float[Array, " n"]:
-        """What springs and dampers do to the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""
+        """Force of springs and dampers on the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""
         return self.frequency * (2.0 * self.damping * modes.rate + self.frequency * modes.e)
 
     @property
@@ -77,7 +77,7 @@ class FlexibleSpacecraft(Spacecraft):
         return near._replace(modes=Modes(x.modes.e + by[6 : 6 + n], x.modes.rate + by[6 + n :]))
 
     def local_coordinates(self, x: AttitudeState, other: AttitudeState) -> Float[Array, " n"]:
-        """What `retract` takes x to the other by, to first order."""
+        """Local coordinates of the other state: of the rigid body, then of e and e' [sqrt(kg) m, sqrt(kg) m/s]."""
         return jnp.concatenate(
             [super().local_coordinates(x, other), other.modes.e - x.modes.e, other.modes.rate - x.modes.rate]
         )

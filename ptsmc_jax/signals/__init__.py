@@ -1,1 +1,1 @@
-"""What the loop is given: reference attitudes and disturbance torques."""
+"""Signals from outside the loop: reference attitudes and disturbance torques."""

@@ -16,7 +16,7 @@ Time = Float[Array, ""]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What a disturbance of one's own is derived from: a function of time and of the true state."""
+    """The base of a disturbance of one's own: a function of time and of the true state."""
 
     def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
         """Disturbance at t [s] in the state x, (m,) [N m]."""

@@ -96,5 +96,5 @@ class Parts(Setup):
 
     def with_t_f(self, t_f: Leaf) -> "Parts":
         """The parts with another prescribed time [s]; the time after it is kept."""
-        moved = super().with_t_f(t_f)
-        return replace(moved, clock=replace(self.clock, t_end=moved.t_end))
+        parts = super().with_t_f(t_f)
+        return replace(parts, clock=replace(self.clock, t_end=parts.t_end))

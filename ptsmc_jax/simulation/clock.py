@@ -24,7 +24,7 @@ def _not_below(t: Array, limit: Scalar | float) -> Array:
 
 
 def _not_above(t: Array, limit: Scalar) -> Array:
-    """min(t, limit), in the same way."""
+    """min(t, limit), with the derivative of `limit` where they are equal."""
     return jnp.where(t < limit, t, limit)
 
 

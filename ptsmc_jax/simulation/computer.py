@@ -93,7 +93,7 @@ def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ti
 
 
 def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
-    """What a star tracker with times of its own sees in a period, without noise; None: it samples with the computer.
+    """The true state when a star tracker with times of its own samples in a period; None: it samples with the computer.
 
     x_at: time [s] in the period -> the plant's state then. The computer uses it at the next sample.
     """

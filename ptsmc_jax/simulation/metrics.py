@@ -36,13 +36,13 @@ def _shown(value: Any) -> str:
 
 
 def begin(start: Start, criteria: Criteria) -> Running:
-    """What is remembered at t = 0."""
+    """The metrics at t = 0."""
     arrival = Arrival(jnp.zeros(start.inputs), jnp.zeros_like(criteria.t_f))
     return Running(arrival, {name: metric.begin(start, criteria) for name, metric in METRICS.items()})
 
 
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """What is remembered after one interval; one of length zero changes nothing."""
+    """The metrics after one interval; one of length zero changes nothing."""
     has_length = interval.length > 0.0
     old = running.memories
     new = {
@@ -60,7 +60,7 @@ def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
 
 
 def _update_after_t_f(arrival: Arrival, memories: dict, interval: Interval, criteria: Criteria) -> tuple[Arrival, dict]:
-    """What is judged from t_f on, after an interval that reaches t_f."""
+    """The memories that begin at t_f, after an interval that reaches t_f."""
     errors = interval.errors()
     arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: arrival)
     updates = {name: METRICS[name].update_after_t_f for name in memories}
@@ -70,7 +70,7 @@ def _update_after_t_f(arrival: Arrival, memories: dict, interval: Interval, crit
 
 
 def finish(running: Running, criteria: Criteria) -> Metrics:
-    """Metrics of the run from what is remembered."""
+    """The metrics at t_end."""
     return Metrics(*(metric.value(running.memories[name], running, criteria) for name, metric in METRICS.items()))
 
 

@@ -32,7 +32,7 @@ END_TOLERANCE = 1e-9  # share of a window: one that ends by less after an interv
 @pytree
 @dataclass(frozen=True)
 class Pointing:
-    """What is observed of pointing errors, and when."""
+    """Which pointing errors are observed, and when."""
 
     frame: Leaf  # (3, 3) rows: the boresight, and two directions across it, in body axes
     after: Leaf  # of t_f, when the observation begins [s]

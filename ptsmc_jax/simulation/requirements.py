@@ -188,8 +188,8 @@ class Requirement:
         if self.timed is not None and within is not None:
             return self._of_time(values, ok, np.atleast_1d(np.asarray(within)), single=single)
         keeps = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
-        known = np.where(ok, values, np.nan)
-        worst = float(np.min(known) if self.at_least else np.max(known))
+        of_ended = np.where(ok, values, np.nan)
+        worst = float(np.min(of_ended) if self.at_least else np.max(of_ended))
         quantile, confidence = (None, None) if single else (self.quantile, self.confidence)
         least = must_keep(values.size, quantile, confidence)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
@@ -221,9 +221,9 @@ class Requirement:
         )  # fmt: skip
 
 
-def verdicts(asked: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:
+def verdicts(requirements: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:
     """A verdict for each requirement on metrics.
 
     values: metric's name -> its values of one run, or of many (trials,); finished: which of these runs ended, likewise.
     """
-    return [r.verdict(values(r.metric), finished, None if r.timed is None else values(r.timed)) for r in asked]
+    return [r.verdict(values(r.metric), finished, None if r.timed is None else values(r.timed)) for r in requirements]

@@ -60,7 +60,7 @@ class Result(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What stays the same from interval to interval."""
+    """The constants of a run."""
 
     parts: Parts
     ticks: Ticks
@@ -74,7 +74,7 @@ class Run(NamedTuple):
 
 
 class RunState(NamedTuple):
-    """What both loops carry from interval to interval."""
+    """The state of a run between two intervals, in either loop."""
 
     x: Any  # true state
     u: Array  # torque delivered at the end of the last interval, (m,) [N m]

@@ -82,8 +82,8 @@ def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> 
     return Torques((u,) * len(delivered), delivered, weights, drive.limited, momentum, torque)
 
 
-class _Hardware(NamedTuple):
-    """What the sampled loop carries from period to period, besides `RunState`."""
+class _Equipment(NamedTuple):
+    """The state of computer, devices and noise between two control periods."""
 
     computer: Computer
     actuators: ActuatorState
@@ -93,7 +93,7 @@ class _Hardware(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """What stays the same from period to period of a sampled run."""
+    """The constants of a sampled run, and what happens in a control period."""
 
     run: Run
     software: Software
@@ -111,7 +111,7 @@ class _Loop(NamedTuple):
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
 
-    def fly(self, carry: tuple[RunState, _Hardware], tick: tuple) -> tuple[tuple[RunState, _Hardware], Log | None]:
+    def fly(self, carry: tuple[RunState, _Equipment], tick: tuple) -> tuple[tuple[RunState, _Equipment], Log | None]:
         """A control period, and its row of the history where that is asked for."""
         (now, *_), (state, hardware) = tick, carry
         parts, actuators = self.run.parts, self.actuators
@@ -145,9 +145,9 @@ class _Loop(NamedTuple):
         computer = computer._replace(applied=applied)
         actuator_state = actuators.end(hardware.actuators, drive, queue, dt)
         star_x = star_state(parts, now, motion.at)
-        return (state, _Hardware(computer, actuator_state, walk, star_x, next_offset)), row
+        return (state, _Equipment(computer, actuator_state, walk, star_x, next_offset)), row
 
-    def last_row(self, state: RunState, hardware: _Hardware) -> Log:
+    def last_row(self, state: RunState, hardware: _Equipment) -> Log:
         """The state at t_end, with the torque held until then."""
         parts, t = self.run.parts, self.run.criteria.t_end
         target, hold = parts.reference(t), t >= parts.controller.hand_over
@@ -173,7 +173,7 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     if actuators.holds:  # `RunState.u` is what they did
         computer = computer._replace(applied=None)
     offset = loop.offset(run.ticks.t[0], run.ticks.sample[0])
-    hardware = _Hardware(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
+    hardware = _Equipment(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
     (state, hardware), rows = jax.lax.scan(loop.fly, (state, hardware), periods)
     log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
     return run_state.finish(run, first, state, log, hardware.actuators.h)
