@@ -21,6 +21,7 @@ SCREENED = 4096  # trials looked through
 CLIMBERS = 8  # of the hardest ones, from which is climbed
 STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # of the ascent by Adam
 HELD = 0.9999  # share of a normal dispersion that is searched
+TURNS = 3  # of what is normal towards its slopes, after the ascent
 NEAR = 1e-3  # how far a worst case may be beyond a limit
 
 
@@ -74,16 +75,25 @@ def hardest(
     moved = flights.movable(problem.dispersion)
     charted = [_charted(problem, name, fleet.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)
-    optimiser = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
-    state, best, best_y = optimiser.init(jnp.asarray(y)), np.full(len(y), -np.inf), y.copy()
-    for _ in range(STEPS + 1 if moved else 0):
+    best, best_y = np.full(len(y), -np.inf), y.copy()
+
+    def look(y: np.ndarray) -> np.ndarray:
         value, slope = climb(fleet, gains, y, watched(problem), dict(zip(names, limits, strict=True)))
         better = value > best
         best[better], best_y[better] = value[better], y[better]
+        return np.where(np.isfinite(slope), slope, 0.0)
+
+    optimiser = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
+    state = optimiser.init(jnp.asarray(y))
+    for _ in range(STEPS + 1 if moved else 0):
+        slope = look(y)
         size = np.linalg.norm(slope, axis=1, keepdims=True)
-        size = np.where(np.isfinite(size) & (size > 0.0), size, 1.0)
-        updates, state = optimiser.update(jnp.nan_to_num(-slope / size), state)
+        updates, state = optimiser.update(jnp.asarray(-slope / np.where(size > 0.0, size, 1.0)), state)
         y = np.asarray(optax.apply_updates(jnp.asarray(y), updates))
+    normal = _normal(problem, moved)
+    y = _within(best_y, normal)
+    for _ in range(TURNS + 1 if normal else 0):
+        y = _within(y, normal, look(y))
     first = int(np.argmax(best))
     reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
     fleet_of_one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
@@ -109,6 +119,40 @@ def _charted(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
     """Free reals of coordinates: of uniform ones u = (1 - cos pi y) / 2, which reaches both ends."""
     uniform = problem.dispersion.kinds[name].drawn == "uniform"
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
+
+
+def _normal(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
+    """Where among the free reals the normal numbers of each kind stand, and how far they are searched."""
+    blocks, used = [], 0
+    for name in moved:
+        count = problem.coordinates[name].shape[-1]
+        if problem.dispersion.kinds[name].drawn != "uniform":
+            blocks.append((slice(used, used + count), _farthest(count)))
+        used += count
+    return blocks
+
+
+def _farthest(count: int) -> float:
+    """Radius of the ball that holds `HELD` of so many normal numbers."""
+    return float(np.sqrt(chi2.ppf(HELD, count)))
+
+
+def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray | None = None) -> np.ndarray:
+    """Free reals with normal ones a hair inside their balls, where slopes are whole; with slopes, turned towards them.
+
+    The advanced mean value step (Wu, Millwater and Cruse, AIAA J. 28, 1990). Adam moves all numbers alike, and those
+    that hardly count are far out then, at the expense of those that do.
+    """
+    y = y.copy()
+    for place, farthest in normal:
+        part, edge = y[:, place], (1.0 - 1e-9) * farthest
+        size = np.linalg.norm(part, axis=1, keepdims=True)
+        part = part * np.minimum(1.0, edge / np.maximum(size, 1e-12))
+        if slope is not None:
+            steep = np.linalg.norm(slope[:, place], axis=1, keepdims=True)
+            part = np.where(steep > 0.0, edge * slope[:, place] / np.where(steep > 0.0, steep, 1.0), part)
+        y[:, place] = part
+    return y
 
 
 def climb(
@@ -160,8 +204,7 @@ def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str,
             if dispersion.kinds[name].drawn == "uniform":
                 found[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
             else:
-                farthest = float(np.sqrt(chi2.ppf(HELD, count)))
-                found[name] = part * jnp.minimum(1.0, farthest / jnp.maximum(jnp.linalg.norm(part), 1e-12))
+                found[name] = part * jnp.minimum(1.0, _farthest(count) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
         return found
 
     slopes = jax.vmap(jax.jacfwd(of))(y)
