@@ -19,10 +19,20 @@ from tuning.search.objective import FAILED, Problem, judged, watched
 
 SCREENED = 4096  # trials looked through
 CLIMBERS = 8  # of the hardest ones, from which is climbed
-STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # of the ascent by Adam
+STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # of the ascent
 HELD = 0.9999  # share of a normal dispersion that is searched
 TURNS = 3  # of what is normal towards its slopes, after the ascent
 NEAR = 1e-3  # how far a worst case may be beyond a limit
+
+_ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
+
+
+@programs.jit
+def _ascended(y: jax.Array, slope: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
+    """Free reals (cases, reals) a step of Adam's along their slopes, and what it remembers."""
+    size = jnp.linalg.norm(slope, axis=1, keepdims=True)
+    updates, state = _ADAM.update(-slope / jnp.where(size > 0.0, size, 1.0), state)
+    return jnp.asarray(optax.apply_updates(y, updates)), state
 
 
 @dataclass(frozen=True)
@@ -83,13 +93,10 @@ def hardest(
         best[better], best_y[better] = value[better], y[better]
         return np.where(np.isfinite(slope), slope, 0.0)
 
-    optimiser = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
-    state = optimiser.init(jnp.asarray(y))
+    state = _ADAM.init(y)
     for _ in range(STEPS + 1 if moved else 0):
-        slope = look(y)
-        size = np.linalg.norm(slope, axis=1, keepdims=True)
-        updates, state = optimiser.update(jnp.asarray(-slope / np.where(size > 0.0, size, 1.0)), state)
-        y = np.asarray(optax.apply_updates(jnp.asarray(y), updates))
+        ascended, state = _ascended(y, look(y), state)
+        y = np.asarray(ascended)
     normal = _normal(problem, moved)
     y = _within(best_y, normal)
     for _ in range(TURNS + 1 if normal else 0):
