@@ -1,7 +1,7 @@
 """`lanes.vmap` and `lanes.jvp` against JAX, over a table of functions: a row for each kind of them."""
 
 from contextlib import nullcontext
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -387,12 +387,27 @@ WITHOUT_RULE = {
 }  # fmt: skip
 
 
+@cache
+def mapped(group):
+    """What lanes and `jax.vmap` make of each row of a group, by name: one program is half of what one for each takes."""
+    rows = {name: row for name, row in CASES.items() if name.startswith(f"{group}: ")}
+
+    @jax.jit
+    def both(args):
+        found = {}
+        for name, (function, *_) in rows.items():
+            bare = name in WITHOUT_RULE
+            with pytest.warns(lanes.LanesWarning, match="no rule") if bare else nullcontext():
+                found[name] = [one(*args[name]) for one in (lanes.vmap(function, strict=not bare), jax.vmap(function))]
+        return found
+
+    return both({name: tuple(args) for name, (_, *args) in rows.items()})
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_lanes_compute_what_vmap_does(name):
     """Strictly, where they have a rule for all there is."""
-    function, *args = CASES[name]
-    with pytest.warns(lanes.LanesWarning, match="no rule") if name in WITHOUT_RULE else nullcontext():
-        check(function, *args, strict=name not in WITHOUT_RULE)
+    agree(*mapped(name.split(":")[0])[name])
 
 
 def smooth(tree):
@@ -414,10 +429,8 @@ KEPT = [
 ]
 
 
-@pytest.mark.parametrize(("name", "shared"), short(MOVED, KEPT))
-@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
-def test_slopes_by_lanes_are_those_that_jax_finds(name, shared):
-    """To 1e-12 of the largest: both differentiate the same operations, and add up in another order."""
+def with_slopes(name, shared):
+    """A function that gives slopes along two directions by lanes and by JAX, and its arguments."""
     function, *args = CASES[name]
     args = [jax.tree.map(lambda v: v[0], args[0]), *args[1:]] if shared else args
     axes = (None, *(0 for _ in args[1:])) if shared else tuple(0 for _ in args)
@@ -441,12 +454,28 @@ def test_slopes_by_lanes_are_those_that_jax_finds(name, shared):
     some = tuple(directions[k] for k in moves)
     over = (tuple(None if shared and k == 0 else 0 for k in moves), *axes)
 
-    @jax.jit
     def both(args, directions, some):
         wanted = jax.vmap(lambda along: jax.vmap(one, over)(along, *args), out_axes=(None, 0))(some)
         return lanes.jvp(numbers, axes)(args, directions), wanted
 
-    got, expected = both(tuple(args), directions, some)
+    return both, (tuple(args), directions, some)
+
+
+@cache
+def sloped(group, shared):
+    """What comes of each row of a group, by name and by one program."""
+    names = [name for name, once in MOVED if once == shared and name.startswith(f"{group}: ")]
+    made = {name: with_slopes(name, shared) for name in names}
+    return jax.jit(lambda args: {name: both(*args[name]) for name, (both, _) in made.items()})(
+        {name: args for name, (_, args) in made.items()}
+    )
+
+
+@pytest.mark.parametrize(("name", "shared"), short(MOVED, KEPT))
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
+def test_slopes_by_lanes_are_those_that_jax_finds(name, shared):
+    """To 1e-12 of the largest: both differentiate the same operations, and add up in another order."""
+    got, expected = sloped(name.split(":")[0], shared)[name]
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         unit = 1e-12 if b.dtype == np.float64 else 1e-5
