@@ -21,6 +21,7 @@ from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import solutions
 from tests.tree import QUICKLY as QUICKLY
 from tests.tree import ROOT as ROOT
 
@@ -94,8 +95,17 @@ def roomy(timing: Any) -> Any:
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
     """A run with its history, all of it NumPy's, so that one program flies all parts of a structure."""
     numbers = jax.tree.map(np.asarray, run)  # whose types are never weak, as Python's numbers are
-    flown = rollout.simulate_jit(numbers, np.uint32(seed), np.uint32(trial), record=True)
+    flown = rollout.simulate_jit(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
     return jax.tree.map(np.asarray, flown)
+
+
+@jax.jit
+def inputs_along(run: Parts, t: Any) -> Any:
+    """Inputs (time, m) of the exact motion at times t (time,), which mean something before the hand-over."""
+    return jax.vmap(lambda time: solutions.exact_input(run, time)[0])(t)
+
+
+errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, None)))
 
 
 def vector(*values: Any) -> Any:

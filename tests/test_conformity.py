@@ -193,10 +193,9 @@ ROWS: dict[str, dict] = {
 }  # fmt: skip
 
 
-# one of each kind of plant, loop, device and observer; the others are `long`
+# one of each kind of loop and device; the others are `long`
 KINDS = (
     "wheels, filter, every device, a law that remembers, prescribed-time observer, random walk",
-    "sampled system with noise",
     "chain, finite-time observer",
 )
 

@@ -36,7 +36,7 @@ def noise(parts: Parts) -> Noise:
         before, width = width, _mean_width(float(flown), sizes.s)
         if np.isclose(width, before, rtol=0.01):
             break
-        law = replace(parts.controller, sign_width=jnp.asarray(width))
+        law = replace(parts.controller, sign_width=jnp.full_like(parts.controller.sign_width, width))
         sizes = _covariance(replace(parts, controller=law), run)
     return sizes
 

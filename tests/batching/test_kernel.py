@@ -27,10 +27,10 @@ FLIGHT = {
     },
 }
 CHAIN = {
-    "plant": {"kind": "chain", "order": 3},
+    "plant": {"kind": "chain", "order": 2},
     "controller": {"t_f": 5.0, "delta": 0.5},
     "loop": {"mode": "sampled", "period": 0.25, "t_end": 6.5},
-    "hardware": {"state_noise": [1e-4, 1e-4, 1e-4]},
+    "hardware": {"state_noise": [1e-4, 1e-4]},
     "dispersion": {"x0": {"kind": "uniform"}},
 }
 CONTINUOUS = {
@@ -84,13 +84,13 @@ def agree(function, unit):
     assert checked > 10
 
 
-@pytest.mark.parametrize("name", short(["flight", "chain", "continuous"], ["chain", "continuous"]))
+@pytest.mark.parametrize("name", short(["flight", "chain", "continuous"], ["continuous"]))
 def test_interpreted_it_is_the_scan(name):
     tables = {"flight": FLIGHT, "chain": CHAIN, "continuous": CONTINUOUS}[name]
     agree(primal(tables), 1e-12)
 
 
-def test_slopes_taken_inside_are_those_of_the_scan():
+def test_values_and_slopes_taken_inside_are_those_of_the_scan():
     agree(derivative(CHAIN), 1e-12)
 
 

@@ -389,7 +389,7 @@ WITHOUT_RULE = {
 
 @cache
 def mapped(group):
-    """What lanes and `jax.vmap` make of each row of a group, by name: one program is half of what one for each takes."""
+    """What lanes and `jax.vmap` make of each row of a group, by name and by one program, which takes less than many."""
     rows = {name: row for name, row in CASES.items() if name.startswith(f"{group}: ")}
 
     @jax.jit

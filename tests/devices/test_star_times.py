@@ -14,9 +14,8 @@ from ptsmc_jax.devices import attitude_filter, sensors, star_times
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.onboard import vectors
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import error_floor
-from tests.helpers import vector
+from tests.helpers import fly, vector
 from tests.onboard.flights import FILTER, flight
 
 SIGMAS = 6.0
@@ -186,7 +185,7 @@ def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sampl
 
 def test_the_floor_lies_between_those_of_the_whole_ratios(run):
     parts, _ = run
-    log = rollout.simulate_jit(parts, jnp.uint32(3), jnp.uint32(0), record=True).log
+    log = fly(parts, 3).log
     floors = [error_floor.along(parts, log).window_error]
     bandwidth = parts.sensors.bandwidth(0.1)
     for every in (2, 3):
@@ -202,7 +201,7 @@ def test_a_run_does_not_jump_where_the_partial_first_period_vanishes():
     found = []
     for off in (1e-7, 0.0, -1e-7):
         law = dataclasses.replace(anchored.controller, delta=vector(0.5 + off))
-        result = rollout.simulate_jit(dataclasses.replace(anchored, controller=law), jnp.uint32(3), jnp.uint32(0))
+        result = fly(dataclasses.replace(anchored, controller=law), 3)
         found.append([float(v) for v in (result.metrics.window_error, result.metrics.peak_torque)])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
     np.testing.assert_allclose(found[2], found[1], rtol=1e-4)

@@ -17,9 +17,9 @@ from ptsmc_jax.laws.error_motions import ErrorQuaternion
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances, references
-from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation import clock
 from tests import helpers
-from tests.helpers import FULL_INERTIA, short, vector
+from tests.helpers import FULL_INERTIA, fly, short, vector
 
 BODY = rigid_body.spacecraft(FULL_INERTIA)
 COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
@@ -110,10 +110,8 @@ def flown(law, angle, rate, t_end, period=0.005):
     law = replace(law, model=body, t_f=vector(t_end - 1.0), delta=vector(period))
     run = helpers.parts(t_end - 1.0, 3.0, period, inertia=(10.0, 12.0, 14.0), q=q, rate=(0.0, 0.0, rate), period=period,
                         t_end=t_end, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
-    run = replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))
-    log = rollout.simulate_jit(run, record=True).log
-    kept = np.asarray(log.has_length)
-    return np.asarray(log.t)[kept], np.asarray(log.error)[kept, 2]
+    log = fly(replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))).log
+    return log.t[log.has_length], log.error[log.has_length, 2]
 
 
 def test_pd_flies_its_eigenaxis_equation():

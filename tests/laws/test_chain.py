@@ -1,6 +1,7 @@
 """The second-order system (6) and the integrator chain (35): laws (10), (24), (40), (52), surfaces (37), (39)."""
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +18,8 @@ from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, hold, solutions
-from tests.helpers import chain_parts, drawn, short, vector, with_controller
+from tests.helpers import chain_parts, drawn, fly, short, vector, with_controller
 
-fly = rollout.simulate_jit
 torque = jax.jit(lambda law, *at: law.torque(*at))
 HOLD, BEFORE = jnp.asarray(True), jnp.asarray(False)
 
@@ -50,7 +50,7 @@ def test_order_two_is_the_law_of_the_second_order_system(eta, t):
     np.testing.assert_allclose((u[0], found[0]), (expected, s), rtol=1e-13)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("n", short([2, 3, 4, 5, 6], [2, 5]))
 def test_surface_is_the_derivative_that_defines_it(n):
     """(37) with the c_i against (36) by nested automatic differentiation."""
     t_f, eta, t = 4.0, n + 0.7, 1.3
@@ -109,16 +109,15 @@ def test_motion_on_the_surface_is_stable_as_its_matrix_is(n):
 EXACT = [(2, 5.0), (3, 30.0), (5, 0.7), (3, 5.0), (4, 5.0), (5, 5.0)]
 
 
-@pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[:3]))
+@pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[1:3]))
 def test_chain_meets_the_exact_solution(n, t_f):
     """Exact solution 2 to 1e-9 of the largest state: what the default grid promises."""
     rng = np.random.default_rng(n)
     for eta in (n + 0.1, n + 1.0, n + 3.5):
         x0 = rng.normal(size=n)
         run = chain_parts(x0, t_f, eta, 0.01 * t_f)
-        log = fly(run, record=True).log
-        assert log is not None
-        before = np.asarray(log.t) < 0.99 * t_f * (1 - 1e-12)
+        log = fly(run).log
+        before = log.t < 0.99 * t_f * (1 - 1e-12)
         exact = motion(run, log.t[before])
         largest = np.abs(exact.x).max()
         np.testing.assert_allclose(log.x[before], exact.x, rtol=0, atol=1e-9 * largest)
@@ -131,23 +130,22 @@ def motion(run, t):
     return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4])
+@pytest.mark.parametrize("n", short([2, 3, 4], [2, 3]))
 def test_slopes_are_those_of_theory(n):
     """Noise-free: s falls with slope eta + n - 2 in the time to go, the error with eta, its logarithm taken out."""
     eta, t_f, delta = n + 1.2, 5.0, 5e-4
     run = chain_parts([2.0, -1.0, 0.5, 0.3][:n], t_f, eta, delta)
-    log = fly(run, record=True).log
-    assert log is not None
-    before = (np.asarray(log.t) > 0.0) & (np.asarray(log.t) < t_f - delta * 1.0001)
-    tau = t_f - np.asarray(log.t)[before]
+    log = fly(run).log
+    before = (log.t > 0.0) & (log.t < t_f - delta * 1.0001)
+    tau = t_f - log.t[before]
 
     def slope(values, some):
         return np.polyfit(np.log(tau[some]), np.log(np.abs(values[some])), 1)[0]
 
     everywhere, late = np.full(tau.size, True), tau < 0.02 * t_f
     # s is r^(n-2) of what it is summed from: below r = 0.02 that is what integration leaves
-    np.testing.assert_allclose(slope(np.asarray(log.s)[before, 0], ~late), eta + n - 2, rtol=1e-2)
-    x = np.asarray(log.x)[before, 0]
+    np.testing.assert_allclose(slope(log.s[before, 0], ~late), eta + n - 2, rtol=1e-2)
+    x = log.x[before, 0]
     if n == 2:  # x_1 = r^eta (x(0) + s(0) L): the factor in brackets is known
         s0 = t_f * -1.0 + eta * 2.0
         np.testing.assert_allclose(slope(x / (2.0 + s0 * np.log(t_f / tau)), everywhere), eta, rtol=1e-2)
@@ -188,9 +186,9 @@ def stays_inside_the_corrected_envelopes(n, case):
         case["x0"][:n], t_f, n + case["above"], case["delta"] * t_f, bound=bound, sign_width=width, disturbance=wave,
         k1=case["k1"], surface_rate=case["surface_rate"], a=SURFACES[n](case["damping"]), steps=(800, 1200),
     )  # fmt: skip
-    result = fly(run, record=True)
+    result = fly(run)
     assert int(result.status) in rollout.FINISHED  # pushed off the origin it started from: missed
-    log = jax.tree.map(np.asarray, result.log)
+    log = result.log
     before = np.flatnonzero(log.t < float(run.controller.hand_over))
     t = log.t[: before[-1] + 1]
     rounding = 1e-9 * max(1.0, np.abs(log.s).max())
@@ -204,7 +202,7 @@ def stays_inside_the_corrected_envelopes(n, case):
     assert np.all(np.abs(log.x[-t.size :, 0]) <= hold.error_bound(run, t) * (1 + 1e-6) + largest[0])
 
 
-test_chain_stays_inside = drawn(stays_inside_the_corrected_envelopes, 15, n=st.integers(2, 4), case=SCENARIO)
+test_chain_stays_inside = drawn(stays_inside_the_corrected_envelopes, 15, n=st.just(3), case=SCENARIO)
 test_many_stay_inside = pytest.mark.long(
     drawn(stays_inside_the_corrected_envelopes, 400, n=st.integers(2, 4), case=SCENARIO)
 )
@@ -219,14 +217,13 @@ def envelope(run, t, s0, floor):
 def test_envelopes_are_not_empty():
     """Without a residual |s| is its envelope, and x_1 comes near its own."""
     run = chain_parts([1.0, 0.5, 0.0], 5.0, 4.0, bound=0.0)
-    log = fly(run, record=True).log
-    assert log is not None
-    before = np.asarray(log.t) < 4.9
+    log = fly(run).log
+    before = log.t < 4.9
     t = log.t[before]
     np.testing.assert_allclose(np.abs(log.s[before, 0]), envelopes.sliding_bound(run, t), rtol=1e-5)
     flown = envelopes.error_bound(run, t)
     assert np.all(np.abs(log.x[before, 0]) <= flown * (1 + 1e-6))
-    assert np.max(np.abs(np.asarray(log.x)[before, 0]) / flown) > 0.99
+    assert np.max(np.abs(log.x[before, 0]) / flown) > 0.99
 
 
 def test_exact_chain_of_order_two_is_the_exact_error():
@@ -269,15 +266,15 @@ def test_exact_chain_of_order_three_against_an_adaptive_integrator():
         np.testing.assert_allclose(found.x, truth[:, k], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("x0", [[5.0, 3.0], [5.0, 3.0, 2.0]])
+@pytest.mark.parametrize("x0", short([[5.0, 3.0], [5.0, 3.0, 2.0]], [[5.0, 3.0, 2.0]]))
 def test_sampled_chain_converges_to_the_continuous_one(x0):
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
     changes = {"bound": 0.01, "disturbance": wave, "delta": 0.5, "sign_width": 0.05}
     truth = fly(chain_parts(x0, **changes, steps=(4000, 200))).metrics.window_error
-    gaps = [
-        abs(float(fly(chain_parts(x0, **changes, period=h)).metrics.window_error / truth) - 1.0)
-        for h in (0.01, 0.005, 0.0025)
-    ]
+    sampled = [chain_parts(x0, **changes, period=h) for h in (0.01, 0.005, 0.0025)]
+    longest = sampled[0].clock.long_enough_for([run.clock for run in sampled])
+    sampled = [replace(run, clock=replace(longest, period=run.clock.period)) for run in sampled]
+    gaps = [abs(float(fly(run).metrics.window_error / truth) - 1.0) for run in sampled]
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     assert np.all((ratios > 1.7) & (ratios < 2.3))  # zero-order hold: first order
 
@@ -288,7 +285,7 @@ def test_observer_on_a_chain_finds_the_disturbance_within_its_bound():
     observer = nonlinear.NonlinearObserver(model, vector([20.0]), vector(0.05), vector(0.02))
     for period in (None, 0.02):
         seen = chain_parts([1.0, 0.0, 0.0], disturbance=wave, observer=observer, period=period, delta=0.3)
-        log = jax.tree.map(np.asarray, fly(seen, record=True).log)
+        log = fly(seen).log
         off = np.abs(log.d_hat - log.disturbance)[:, 0]
         bound = np.asarray(jax.vmap(observer.error_bound())(log.t))
         # sampled: the estimate is that of the period before
@@ -304,10 +301,8 @@ def test_plant_with_drift_and_gain_is_linearised_exactly():
     def g(x):
         return 1.5 + 0.5 * jnp.cos(x[0])
 
-    bare = fly(chain_parts([0.5, -0.2, 0.1]), record=True).log
-    bent = fly(chain_parts([0.5, -0.2, 0.1], f=f, g=g), record=True).log
-    assert bare is not None
-    assert bent is not None
+    bare = fly(chain_parts([0.5, -0.2, 0.1])).log
+    bent = fly(chain_parts([0.5, -0.2, 0.1], f=f, g=g)).log
     np.testing.assert_allclose(bent.x, bare.x, rtol=0, atol=1e-10)
     assert np.abs(bent.u - bare.u).max() > 0.1
 
@@ -320,17 +315,19 @@ def test_batches_of_chains_and_their_gradients():
         return rollout.simulate(with_controller(run, **law), 3, trial).metrics.window_error
 
     trials = jnp.arange(6, dtype=jnp.uint32)
-    point = (vector(4.5), vector(0.53), vector(1.2), vector(1.7))
+    point = vector([4.5, 0.53, 1.2, 1.7])
     one = jax.jit(jax.vmap(lambda trial: error(*point, trial)))(trials)
     np.testing.assert_allclose(jax.jit(lanes.vmap(lambda trial: error(*point, trial)))(trials), one, rtol=1e-12)
     assert np.std(one) > 0.0
 
-    value = jax.jit(error)
-    forward = jax.jit(jax.jacfwd(error, (0, 1, 2, 3)))(*point, trials[0])
-    for k, slope in enumerate(forward):
+    @jax.jit
+    def sloped(gains, along):
+        return jax.jvp(lambda gains: error(*gains, trials[0]), (gains,), (along,))
+
+    for along in np.eye(4):
         h = 1e-6
-        up, down = (value(*(p + s * h * (j == k) for j, p in enumerate(point)), trials[0]) for s in (1, -1))
-        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-4)
+        up, down = (sloped(point + s * h * along, along)[0] for s in (1, -1))
+        np.testing.assert_allclose(sloped(point, along)[1], (up - down) / (2 * h), rtol=1e-4)
 
 
 def test_chain_is_built_with_an_order_and_functions():
@@ -345,8 +342,7 @@ def test_chain_is_built_with_an_order_and_functions():
 
 
 def test_what_a_chain_lacks_has_no_value():
-    result = fly(chain_parts([1.0, 0.0]), record=True)
-    assert result.log is not None
+    result = fly(chain_parts([1.0, 0.0]))
     assert np.isnan(float(result.metrics.peak_momentum))
     assert float(result.metrics.peak_rate) == pytest.approx(np.abs(result.log.x[:, 1]).max())
     assert float(result.metrics.terminal_angle) == float(result.metrics.terminal_error)

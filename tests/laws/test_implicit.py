@@ -17,8 +17,8 @@ from ptsmc_jax.plants import rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import borders, linear, margins, run_margins
-from tests.helpers import FULL_INERTIA, vector
+from ptsmc_jax.theory import borders, linear, margins
+from tests.helpers import FULL_INERTIA, fly, short, vector
 from tuning.search.gains import with_gains
 
 H, T_F = 0.1, 5.0
@@ -46,9 +46,8 @@ def study(order=2, bound=0.0, disturbance=0.0, x0=None, clock="anchored", **cont
 
 def flown(parts):
     """Times, states and s at the samples."""
-    log = rollout.simulate_jit(parts, record=True).log
-    kept = np.asarray(log.has_length)
-    return tuple(np.asarray(v)[kept][:-1] for v in (log.t, log.x, log.s[:, 0], log.u[:, 0]))
+    log = fly(parts).log
+    return tuple(v[log.has_length][:-1] for v in (log.t, log.x, log.s[:, 0], log.u[:, 0]))
 
 
 @pytest.mark.parametrize("order", [2, 3])
@@ -90,32 +89,35 @@ def test_noise_free_chattering_is_gone_where_the_exact_sign_has_it():
     """The exact sign switches by 2 K every period or two; the implicit one settles: 50 times less is asked for."""
     values = {}
     for sampling in ("explicit", "implicit"):
-        run = rollout.simulate_jit(study(bound=0.2, disturbance=0.15, sampling=sampling, sign_width=0.0))
+        run = fly(study(bound=0.2, disturbance=0.15, sampling=sampling, sign_width=0.0))
         values[sampling] = float(run.metrics.chattering), float(run.metrics.hold_error)
     assert values["implicit"][0] < values["explicit"][0] / 50.0
     assert values["implicit"][1] < values["explicit"][1]
 
 
 @pytest.mark.parametrize("order", [2, 3])
-@pytest.mark.parametrize("gain", ["eta", "delta", "k1", "t_f"])
-def test_slopes_agree_with_differences(order, gain):
+def test_slopes_agree_with_differences(order):
     """Central differences of step 1e-6 (1e-12 of curvature, 1e-10 of rounding of a metric near 1e-3)."""
-    parts = replace_noise(study(order, bound=0.01, disturbance=0.005))
-    at = {"eta": order + 0.7, "delta": 0.43, "k1": 1.3, "t_f": T_F}
-
-    def error(value):
-        return _window_error(with_gains(parts, {**at, gain: value}))
-
-    slope = float(jax.jvp(error, (vector(at[gain]),), (vector(1.0),))[1])
-    step = 1e-6
-    difference = float(error(vector(at[gain] + step)) - error(vector(at[gain] - step))) / (2 * step)
-    np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-9)
+    parts, step = with_room(study(order, bound=0.01, disturbance=0.005)), 1e-6
+    at, names = np.array([order + 0.7, 0.43, 1.3, T_F]), ("eta", "delta", "k1", "t_f")
+    for name, along in zip(names, np.eye(4), strict=True):
+        slope = _sloped(parts, at, along)[1]
+        up, down = (_sloped(parts, at + sign * step * along, along)[0] for sign in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-4, atol=1e-9, err_msg=name)
 
 
-_window_error = jax.jit(lambda parts: rollout.simulate(parts).metrics.window_error)
+@jax.jit
+def _sloped(parts, at, along):
+    """The window error, and its slope along a direction of eta, delta, k1 and t_f."""
+
+    def error(at):
+        moved = with_gains(parts, dict(zip(("eta", "delta", "k1", "t_f"), at, strict=True)))
+        return rollout.simulate(moved).metrics.window_error
+
+    return jax.jvp(error, (at,), (along,))
 
 
-def replace_noise(parts):
+def with_room(parts):
     """With room on its clock for other gains."""
     return replace(parts, clock=replace(parts.clock, before=parts.clock.before + 2, after=parts.clock.after + 4))
 
@@ -147,7 +149,7 @@ def test_a_delta_of_one_period_that_explicit_sampling_cannot_fly():
     """eta = 4: explicit sampling is unstable below (eta - 3/2) h = 2.5 periods, and takes what is left up again."""
     found = {}
     for sampling in ("explicit", "implicit"):
-        run = rollout.simulate_jit(study(eta=4.0, delta=H, sampling=sampling, sign_width=1e-3))
+        run = fly(study(eta=4.0, delta=H, sampling=sampling, sign_width=1e-3))
         found[sampling] = float(run.metrics.window_error), float(run.metrics.peak_torque)
     assert found["implicit"][0] < found["explicit"][0]
     assert found["implicit"][1] <= found["explicit"][1]
@@ -188,16 +190,17 @@ def test_a_second_order_systems_s_lands_exactly_where_its_input_is_an_accelerati
     np.testing.assert_allclose(after, share * s[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("clock", ["anchored", "flight"])
+@pytest.mark.parametrize("clock", short(["anchored", "flight"], ["flight"]))
 def test_the_stable_region_extends_past_the_border_of_explicit_sampling(clock):
     """eta = 4, delta a period, where explicit sampling asks for 2.5 or 3.5: poles of the loop that flies."""
     radius = {}
     for sampling in ("explicit", "implicit"):
         parts = study(eta=4.0, delta=H, sampling=sampling, clock=clock)
-        radius[sampling] = run_margins.at_ends(parts)["hand_over"][1]
-        law, run = parts.controller, linear.nominal(parts)
-        last = linear.full_periods(parts, run, hold=False)[-1]
-        tau = float(law.t_f - run.period.now.t[last]) / H
+        law, run = parts.controller, linear.nominal_jit(parts)
+        last = linear.full_periods(parts, run, hold=False)[-1:]
+        loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, run, last))
+        radius[sampling] = linear.radius(loop)
+        tau = float(law.t_f - run.period.now.t[last[0]]) / H
         kp, kd = borders.implicit_gains(4.0, tau) if law.implicit else (16.0 / tau**2, 7.0 / tau)
         # a memory that nothing changes, there is no observer, is a pole at 1
         np.testing.assert_allclose(radius[sampling], max(1.0, borders.radius(kp, kd, 1.0)), rtol=1e-6)

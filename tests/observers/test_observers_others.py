@@ -15,7 +15,7 @@ from ptsmc_jax.observers import finite_time, prescribed_time
 from ptsmc_jax.plants import base, integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FULL_INERTIA, chain_parts, parts, short, vector
+from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
 
 MASS: base.Plant = integrator_chain.chain(2)  # one input, M = 1
 GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
@@ -72,7 +72,7 @@ def continuous(observer, disturbance, t_f=6.0, steps=400):
     run = chain_parts([0.3, 0.0], t_f, 3.0, 0.1, observer=observer, disturbance=disturbance, bound=0.0)
     nodes = vector(observer.nodes())
     timing = replace(run.clock, saves=nodes, before=steps, after=steps, max_step=vector(3.0 * t_f / steps))
-    return jax.tree.map(np.asarray, rollout.simulate_jit(replace(run, clock=timing), record=True).log)
+    return fly(replace(run, clock=timing)).log
 
 
 def test_continuous_prescribed_time_observer_forgets_as_its_closed_form_says():
@@ -101,25 +101,22 @@ def test_prescribed_time_bound_holds_against_the_worst_disturbance_and_is_no_emp
     np.testing.assert_allclose(bare(vector(2.0)), exact, rtol=1e-6)
 
 
-def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time():
-    """For a spacecraft with a full inertia under a sinusoid, in the whole loop, continuous and sampled."""
+@pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["continuous"]))
+def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time(mode):
+    """For a spacecraft with a full inertia under a sinusoid, in the whole loop."""
     tables = {
         "spacecraft": {"inertia": FULL_INERTIA},
         "observer": {"kind": "prescribed_time", "t_o": 6.0, "mu": 3.0},
         "disturbance": {"phase": [1.0, 0.5, 2.0]},
         "controller": {"initial_estimate_error": 0.0175},
     }
-    for mode in ("continuous", "sampled"):
-        ready = scenario.study(scenario.from_tables({**tables, "loop": {"mode": mode}}))
-        result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
-        log, bound = result.log, ready.parts.observer.error_bound()
-        limit = np.asarray(jax.vmap(bound)(vector(log.t)))
-        size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
-        late = (
-            0.002 if mode == "sampled" else 1e-9
-        )  # a sampled estimate is half a period old: c sqrt(3) h / 2, and more
-        assert np.all(size <= limit + late), mode
-        assert size[np.searchsorted(log.t, 5.95)] < 0.15 * size[0]
+    ready = scenario.study(scenario.from_tables({**tables, "loop": {"mode": mode}}))
+    log, bound = fly(ready.parts).log, ready.parts.observer.error_bound()
+    limit = np.asarray(jax.vmap(bound)(vector(log.t)))
+    size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
+    late = 0.002 if mode == "sampled" else 1e-9  # a sampled estimate is half a period old: c sqrt(3) h / 2, and more
+    assert np.all(size <= limit + late)
+    assert size[np.searchsorted(log.t, 5.95)] < 0.15 * size[0]
 
 
 def super_twisting(gain, d, seconds, start=0.0):
@@ -198,9 +195,15 @@ def test_continuous_finite_time_observer_finds_a_constant_within_its_time():
 
 KINDS = ("none", "nonlinear", "finite_time", "prescribed_time")
 SERVED = list(itertools.product(("spacecraft", "chain", "system"), ("continuous", "sampled"), KINDS))
+# each plant and each kind
+KEPT = [
+    ("spacecraft", "sampled", "nonlinear"),
+    ("chain", "continuous", "finite_time"),
+    ("system", "sampled", "prescribed_time"),
+]
 
 
-@pytest.mark.parametrize(("plant", "mode", "kind"), short(SERVED, SERVED[::5]))
+@pytest.mark.parametrize(("plant", "mode", "kind"), short(SERVED, KEPT))
 def test_every_observer_serves_every_plant_and_keeps_its_bound(plant, mode, kind):
     """In the whole loop, where the disturbance keeps to its own bounds; the estimate is never further off."""
     controller = {"t_f": 8.0, "delta": 0.4, "disturbance_rate_bound": 0.011, "disturbance_bound": 0.0101}
@@ -222,7 +225,7 @@ def test_every_observer_serves_every_plant_and_keeps_its_bound(plant, mode, kind
         "loop": {"mode": mode, "period": 0.02},
     }
     ready = scenario.study(scenario.from_tables(tables))
-    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    result = fly(ready.parts)
     assert result.status == rollout.OK
     log, bound = result.log, ready.parts.observer.error_bound()
     limit = np.asarray(jax.vmap(bound)(vector(log.t)))
@@ -258,6 +261,6 @@ def test_parts_of_a_run_without_a_rate_bound_have_no_empty_gradient():
             watched = replace(run, observer=replace(found, gain=jnp.full(3, gain)))
             return rollout.simulate(watched).metrics.window_error
 
-        slope = jax.jit(jax.jacfwd(error))(found.gain[0])
+        _, slope = jax.jit(lambda gain: jax.jvp(error, (gain,), (jnp.ones_like(gain),)))(found.gain[0])
         assert np.isfinite(slope)
         assert slope != 0.0

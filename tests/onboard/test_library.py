@@ -1,5 +1,8 @@
 """The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
 
+import shutil
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -17,17 +20,28 @@ from tests.onboard.flights import FLIGHTS
 OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
 
 
-def exported(place, name):
-    """A flight's controller without vectors, and its study."""
-    made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
-    store.write(place, lambda making: folder.write_program(making, made))
-    return made, Library(place)
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Writes a flight's controller without vectors, once, and compiles it: its study, and the library."""
+
+    @cache
+    def written(name):
+        made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
+        place = tmp_path_factory.mktemp("exported") / "controller"
+        store.write(place, lambda making: folder.write_program(making, made))
+        return made, place
+
+    def compiled(name, real="double"):
+        made, place = written(name)
+        return made, Library(place, real)
+
+    return compiled
 
 
 @needs_compiler
 @pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels", "own law"]))
-def test_the_compiled_controller_flies_what_the_simulator_flies(name, tmp_path):
-    made, library = exported(tmp_path / "controller", name)
+def test_the_compiled_controller_flies_what_the_simulator_flies(name, exported):
+    made, library = exported(name)
     ours = runs.fly(made.ready, 3, 2)
     theirs = runs.fly(made.ready, 3, 2, InTheLoop(library, made.ready.parts).software)
     assert sum(library.statuses.values()) == len(ours.log.t) - 1
@@ -42,9 +56,9 @@ def test_the_compiled_controller_flies_what_the_simulator_flies(name, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def filtered(tmp_path_factory):
+def filtered(exported):
     """The compiled controller of a flight behind the attitude filter, and inputs of a trial (samples, columns)."""
-    made, library = exported(tmp_path_factory.mktemp("filtered") / "controller", "filter")
+    made, library = exported("filter")
     return library, given(made)
 
 
@@ -125,9 +139,9 @@ def test_a_star_tracker_without_an_attitude_is_not_missed(filtered):
 
 
 @needs_compiler
-def test_the_age_of_an_attitude_is_one_of_the_period_or_is_refused(tmp_path):
+def test_the_age_of_an_attitude_is_one_of_the_period_or_is_refused(exported):
     """Of a star tracker with times of its own: what is no age is bad input where there is an attitude."""
-    made, library = exported(tmp_path / "controller", "star tracker out of step")
+    made, library = exported("star tracker out of step")
     samples, at = given(made), names_of(made.board)["in"].index("attitude_age")
     valid = names_of(made.board)["in"].index("attitude_valid")
     other = samples.copy()
@@ -145,8 +159,8 @@ def test_the_age_of_an_attitude_is_one_of_the_period_or_is_refused(tmp_path):
 
 
 @needs_compiler
-def test_bad_telemetry_of_the_wheels_is_bad_input(tmp_path):
-    made, library = exported(tmp_path / "controller", "wheels")
+def test_bad_telemetry_of_the_wheels_is_bad_input(exported):
+    made, library = exported("wheels")
     samples, at = given(made), names_of(made.board)["in"].index("wheel_momentum[2]")
     for bad in (np.nan, np.inf, 1e9):
         other = samples.copy()
@@ -179,8 +193,8 @@ def test_minus_q_is_the_same_attitude(filtered):
 
 
 @needs_compiler
-def test_a_singular_attitude_gets_the_last_good_command(tmp_path):
-    made, library = exported(tmp_path / "controller", "raw")
+def test_a_singular_attitude_gets_the_last_good_command(exported):
+    made, library = exported("raw")
     names = names_of(made.board)["in"]
     angles = np.concatenate([np.linspace(2.9, np.pi, 11), np.linspace(np.pi, 2.9, 11)[1:]])
     samples = np.zeros((len(angles), len(names)))
@@ -194,34 +208,35 @@ def test_a_singular_attitude_gets_the_last_good_command(tmp_path):
 
 
 @needs_compiler
-def test_limits_are_told(tmp_path):
-    made, library = exported(tmp_path / "controller", "delay, limit, quantised")
+def test_limits_are_told(exported):
+    made, library = exported("delay, limit, quantised")
     run = runs.fly(made.ready, 0, 0, InTheLoop(library, made.ready.parts).software)
     assert library.statuses["saturated"] > 0
     assert np.max(np.abs(run.log.u)) <= 3.0
 
 
 @needs_compiler
-def test_single_precision_flies_as_well(tmp_path):
+def test_single_precision_flies_as_well(exported):
     """Statistics to three digits: see `benchmarks/exported_c.py`; one run's peak, and its error at t_f."""
-    made, _ = exported(tmp_path / "controller", "multiplicative")
-    single = InTheLoop(Library(tmp_path / "controller", "float"), made.ready.parts).software
-    ours, theirs = runs.fly(made.ready, 0, 0), runs.fly(made.ready, 0, 0, single)
+    made, library = exported("wheels", "float")
+    single = InTheLoop(library, made.ready.parts).software
+    ours, theirs = runs.fly(made.ready, 3, 2), runs.fly(made.ready, 3, 2, single)
     for name in ("peak_torque", "window_error", "effort"):
         np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-3, err_msg=name)
 
 
 @needs_compiler
-def test_what_is_no_controller_is_refused(tmp_path):
+def test_what_is_no_controller_is_refused(exported, tmp_path):
     with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
         Library(tmp_path / "nothing")
-    _, library = exported(tmp_path / "controller", "raw")
+    _, library = exported("raw")
     other = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
     with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
         InTheLoop(library, other.parts)
     slower = scenario.from_tables({**FLIGHTS["raw"], "loop": {**FLIGHTS["raw"]["loop"], "period": 0.2}})
     with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be .* s, that of the controller in "):
         InTheLoop(library, scenario.study(folder.flown(scenario.reading.complete(slower))).parts)
+    shutil.copytree(library.folder, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
     with pytest.raises(ScenarioError, match="does not compile: "):
         Library(tmp_path / "controller")

@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import flexible_body, rigid_body
 from ptsmc_jax.simulation import rollout
-from tests.helpers import vector
+from tests.helpers import fly, vector
 
 EPS = np.finfo(float).eps
 # Di Gennaro's satellite: four modes, full tensor
@@ -161,8 +161,8 @@ def test_without_coupling_it_flies_as_a_rigid_body():
     uncoupled = {**SATELLITE, "flexible": {**SATELLITE["flexible"], "coupling": [[0.0] * 3] * 4}}
     ready = scenario.study(scenario.from_tables(uncoupled))
     rigid = scenario.study(scenario.from_tables({k: v for k, v in SATELLITE.items() if k != "flexible"}))
-    one = rollout.simulate_jit(ready.parts, record=True)
-    other = rollout.simulate_jit(replace(rigid.parts, substeps=ready.parts.substeps), record=True)
+    one = fly(ready.parts)
+    other = fly(replace(rigid.parts, substeps=ready.parts.substeps))
     np.testing.assert_allclose(one.log.x.q, other.log.x.q, rtol=0, atol=1e-13)
     np.testing.assert_allclose(one.log.u, other.log.u, rtol=0, atol=1e-10)  # 1e3 N m / rad
     assert np.all(one.log.x.modes.e == 0.0)
@@ -176,7 +176,7 @@ def test_a_drawn_inertia_moves_what_is_left_and_one_that_leaves_nothing_is_marke
     np.testing.assert_allclose(plant.with_rest_inverse().rest_inverse, plant.rest_inverse, rtol=1e-12)
     light = plant.with_inertia(*(vector(v) for v in (0.1 * INERTIA, np.linalg.inv(0.1 * INERTIA))))
     ready = scenario.study(scenario.from_tables(SATELLITE))
-    result = rollout.simulate_jit(replace(ready.parts, plant=light))
+    result = fly(replace(ready.parts, plant=light))
     assert rollout.STATUS[int(result.status)][0] == "diverged"
 
 

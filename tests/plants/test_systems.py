@@ -23,7 +23,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
-from tests.helpers import FULL_INERTIA, ROOT, finer, parts, short, vector
+from tests.helpers import FULL_INERTIA, ROOT, errors_along, finer, fly, inputs_along, parts, short, vector
 from tuning.studies import posing
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
@@ -66,8 +66,11 @@ def as_system(run, reference):
     )
 
 
+torque = jax.jit(lambda law, *at: law.torque(*at))
+
+
 @pytest.mark.parametrize("hold", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", short(range(4), [0]))
 def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derived_by_hand(seed, hold):
     rng = np.random.default_rng(seed)
     run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1, surface_rate=1.3)
@@ -76,9 +79,9 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     q[3] = abs(q[3]) + 0.5
     x, t = AttitudeState(vector(q / np.linalg.norm(q)), vector(0.1 * rng.normal(size=3))), vector(4.0)
     d_hat, k2, phase = vector(0.1, 0.1, -0.2), vector(0.05), jnp.asarray(hold)
-    u, s = run.controller.torque(t, phase, x, SPIN(t), d_hat, k2)
+    u, s = torque(run.controller, t, phase, x, SPIN(t), d_hat, k2)
     state = jnp.concatenate([x.q[:3] - SPIN(t).q[:3], x.w])
-    found, surface = own.controller.torque(t, phase, state, t, d_hat, k2)
+    found, surface = torque(own.controller, t, phase, state, t, d_hat, k2)
     np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
     # by hand: dF/dx2 = T / 2, and what no acceleration makes of x_1'': -|w|^2 v / 4 - q_1f'' (58)
@@ -99,7 +102,7 @@ def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(peri
     run = parts(8.0, 3.0, period=period, **others)
     # x_1 and q are integrated as different equations: what differs is the error of the steps
     run = finer(run, 8) if period is None else replace(run, substeps=4)
-    one, other = (jax.tree.map(np.asarray, rollout.simulate_jit(r, record=True)) for r in (run, as_system(run, SPIN)))
+    one, other = (fly(r) for r in (run, as_system(run, SPIN)))
     assert one.status == other.status == rollout.OK
     np.testing.assert_allclose(other.log.x[:, :3], one.log.error, rtol=0, atol=1e-10)
     np.testing.assert_allclose(other.log.x[:, 3:], one.log.x.w, rtol=0, atol=1e-10)
@@ -124,22 +127,20 @@ def test_arm_follows_the_exact_solution_without_a_disturbance():
     """A mass matrix by the book: the error moves as solution 1 says whatever M, C and g are."""
     tables = arm_tables(controller={"disturbance_rate_bound": 0.0})
     ready = scenario.study(scenario.from_tables({**tables, "disturbance": {"kind": "none"}}))
-    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    result = fly(ready.parts)
     before = result.log.t < 2.949
     start = ready.parts.controller.errors(ready.parts.initial, vector(0.0))
-    exact = jax.jit(jax.vmap(lambda t: solutions.exact_error(t, vector(3.0), vector(3.0), *start)))(
-        vector(result.log.t[before])
-    )
-    np.testing.assert_allclose(result.log.error[before], exact.error, rtol=0, atol=1e-8)  # of the default grid
+    exact = errors_along(result.log.t, vector(3.0), vector(3.0), *start)
+    np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-8)  # of the default grid
     # and the torque of the exact motion is the one flown, down to the feedback gain times that
-    u = jax.jit(jax.vmap(lambda t: solutions.exact_input(ready.parts, t)[0]))(vector(result.log.t[before]))
+    u = inputs_along(ready.parts, result.log.t)[before]
     assert np.abs(u - result.log.u[before]).max() < 1e-8 * 9.0 / 0.05**2
 
 
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
 def test_arm_stays_inside_its_envelope(mode):
     ready = scenario.study(scenario.from_tables(arm_tables(loop={"mode": mode, "period": 0.002})))
-    result = jax.tree.map(np.asarray, rollout.simulate_jit(ready.parts, record=True))
+    result = fly(ready.parts)
     assert result.status == rollout.OK
     before = result.log.t < 2.949
     size = np.linalg.norm(result.log.error[before], axis=1)
@@ -193,24 +194,13 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time():
 
     one = second_order.system(1, F, H, G)
     two = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, swapped)
-    for mode in ("continuous", "sampled"):
-        for model, x0 in ((one, [0.5, 0.0]), (two, [0.5, 0.3, 0.0, 0.0])):
-            tables = {
-                "plant": {"kind": "system", "system": model, "x0": x0},
-                "controller": {"disturbance_bound": 0.0},  # no switching: solution 1
-                "loop": {"mode": mode, "period": 0.05},
-            }
-            run = scenario.study(scenario.from_tables(tables)).parts
-            result = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True))
-            assert result.status == rollout.SINGULAR
-            # solution 1 says when x_1 is 0.2
-            t = np.linspace(0.0, 4.9, 4000)
-            start = (vector([x0[0]]), vector([0.0]))
-            x = jax.jit(
-                jax.vmap(lambda t, start=start: solutions.exact_error(t, vector(5.0), vector(3.0), *start).error[0])
-            )(t)
-            crossing = t[np.argmax(np.asarray(x) < 0.2)]
-            assert result.bad_time == pytest.approx(crossing, abs=0.06)
+    t = np.linspace(0.0, 4.9, 4000)  # solution 1 says when x_1 is 0.2
+    x = errors_along(t, vector(5.0), vector(3.0), vector([0.5]), vector([0.0])).error[:, 0]
+    for mode, model, x0 in (("continuous", one, [0.5, 0.0]), ("sampled", two, [0.5, 0.3, 0.0, 0.0])):
+        run = study(model, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode, "period": 0.05}).parts
+        result = fly(run)
+        assert result.status == rollout.SINGULAR
+        assert result.bad_time == pytest.approx(t[np.argmax(x < 0.2)], abs=0.06)
 
 
 def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
@@ -222,9 +212,9 @@ def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
     ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
     quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
     run = replace(ready.parts, observer=quiet)
-    log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True)).log
+    log = fly(run).log
     before = log.t < 4.8
-    u = jax.jit(jax.vmap(lambda t: solutions.exact_input(run, t)[0]))(vector(log.t[before]))
+    u = inputs_along(run, log.t)[before]
     assert np.abs(u - log.u[before]).max() < 1e-6
 
 
@@ -290,16 +280,16 @@ def test_keys_of_a_system_are_checked_against_its_size(changes, said):
 
 
 def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_beside_its_scenario(tmp_path: Path):
-    made = spacecraft_as_system(SPIN)
-    tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
-    changed = scenario.replace(scenario.from_tables(tables), controller__eta=4.0)
-    assert scenario.study(changed).parts.plant is made
-    assert isinstance(scenario.study(changed).parts.observer, none.NoObserver)
+    made = one()
+    tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0]}}
+    changed = scenario.study(scenario.replace(scenario.from_tables(tables), controller__eta=4.0))
+    assert changed.parts.plant is made
+    assert isinstance(changed.parts.observer, none.NoObserver)
     (tmp_path / "my.py").write_text((ROOT / "scenarios" / "two_link_arm.py").read_text())
     (tmp_path / "my.toml").write_text('[plant]\nkind = "system"\nsystem = "my.py:arm"\nx0 = [1, 1, 0, 0]\n')
-    one, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
-    assert one.parts.plant is other.parts.plant  # one program for all its runs
-    assert one.parts.plant.inputs == 2
+    first, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
+    assert first.parts.plant is other.parts.plant  # one program for all its runs
+    assert first.parts.plant.inputs == 2
 
 
 def study(system, x0, **tables):
@@ -310,15 +300,11 @@ def one(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(
     return second_order.system(1, F, H, G, D)
 
 
-def final(run):
-    return jax.tree.map(np.asarray, rollout.simulate_jit(run))
-
-
 @pytest.mark.parametrize("system", [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)])
 def test_steps_follow_the_modes_of_a_fast_plant(system):
     loop = {"loop": {"mode": "sampled", "period": 0.05}, "controller": {"delta": 0.3, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **loop).parts
-    ours, finer_steps = final(run), final(replace(run, substeps=8 * run.substeps))
+    ours, finer_steps = fly(run), fly(replace(run, substeps=8 * run.substeps))
     for name in ("window_error", "peak_torque"):
         np.testing.assert_allclose(getattr(ours.metrics, name), getattr(finer_steps.metrics, name), rtol=1e-3)
     with pytest.raises(ScenarioError, match=r"^plant\.system is too fast.*would take more than 200 integration"):
@@ -330,7 +316,7 @@ def test_steps_follow_what_time_does_to_a_system(w):
     system = one(F=lambda t, a, b: b - jnp.cos(w * t))
     tables = {"controller": {"t_f": 30.0, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **tables).parts
-    np.testing.assert_allclose(final(run).metrics.window_error, final(finer(run, 4)).metrics.window_error, rtol=0.02)
+    np.testing.assert_allclose(fly(run).metrics.window_error, fly(finer(run, 4)).metrics.window_error, rtol=0.02)
 
 
 def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
@@ -340,22 +326,20 @@ def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
 
 
 @pytest.mark.parametrize(
-    ("system", "x0", "singular"),
+    ("system", "x0", "mode", "singular"),
     [
         (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5)),
-         [1.0, 0.2, 0.0, 0.0], True),
-        (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], True),
+         [1.0, 0.2, 0.0, 0.0], "sampled", True),
+        (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], "continuous", True),
         # the same plant, its first input in another unit
         (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a,
                              lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]])),
-         [1.0, 0.2, 0.0, 0.0], False),
+         [1.0, 0.2, 0.0, 0.0], "continuous", False),
     ],
 )  # fmt: skip
-def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, singular):
-    for mode in ("continuous", "sampled"):
-        run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
-        result = final(run)
-        assert (result.status == rollout.SINGULAR) == singular, mode
+def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, mode, singular):
+    run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
+    assert (fly(run).status == rollout.SINGULAR) == singular
 
 
 def test_a_singular_matrix_at_the_start_is_refused_by_name():
@@ -370,7 +354,7 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
     )
     with pytest.raises(ScenarioError, match=r'singular D .*observer\.kind = "nonlinear" must invert; .*"none"$'):
         study(half, [1.0, 0.0, 0.0, 0.0], observer={"kind": "nonlinear"})
-    assert final(study(half, [1.0, 0.0, 0.0, 0.0]).parts).status == rollout.OK
+    assert fly(study(half, [1.0, 0.0, 0.0, 0.0]).parts).status == rollout.OK
 
 
 FILES = {

@@ -89,9 +89,11 @@ def test_forgetting_configure_warns_and_calling_it_late_says_so_in_one_sentence(
 
 
 def test_other_compiler_options_are_set_before_anything_runs_or_refused():
-    begin = "from ptsmc_jax.configure import configure\nimport jax, os\nconfigure(cache=None)\n"
+    begin = "from ptsmc_jax.configure import configure\nimport jax, os\n"
     run = "jax.numpy.zeros(3).block_until_ready()\n"
-    last = "print(os.environ['XLA_FLAGS'], file=__import__('sys').stderr)"
-    assert "than fast=False asks for" in said(begin + run + "configure(cache=None, fast=False)").splitlines()[-1]
-    assert said(begin + run + "configure(cache=None)\n" + last).strip() == said(begin + last).strip() != ""
-    assert said(begin + "configure(cache=None, fast=False)\n" + run + last).strip() == ""
+    tell = "print(os.environ['XLA_FLAGS'], file=__import__('sys').stderr)\n"
+    fast, plain = "configure(cache=None)\n", "configure(cache=None, fast=False)\n"
+    first, again, *_, last = said(begin + fast + tell + run + fast + tell + plain).splitlines()
+    assert first == again != ""
+    assert "than fast=False asks for" in last
+    assert said(begin + fast + plain + run + tell).strip() == ""

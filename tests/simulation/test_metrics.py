@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from ptsmc_jax.simulation import catalogues, metrics, rollout
+from ptsmc_jax.simulation import catalogues, metrics
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
-from tests.helpers import parts, vector
+from tests.helpers import fly, parts, vector
 
 
 def flown(**changes):
     run = parts(20.0, 3.0, 0.5, **changes)
-    result = rollout.simulate_jit(run, np.uint32(1), np.uint32(4), record=True)
-    log = jax.tree.map(np.asarray, result.log)
+    result = fly(run, 1, 4)
+    log = result.log
     return run, result.metrics, jax.tree.map(lambda rows: rows[log.has_length], log)
 
 
@@ -153,6 +153,6 @@ def test_catalogue_names_every_metric():
 def test_the_last_row_holds_the_torque_of_the_last_period(flight):
     """Periods beyond t_end, of length zero, and the first one before t = 0 leave nothing behind."""
     run = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), flight=flight, reach=(25.0, 2.0))
-    log = rollout.simulate_jit(run, np.uint32(1), np.uint32(4), record=True).log
+    log = fly(run, 1, 4).log
     rows = np.flatnonzero(np.asarray(log.has_length))
     np.testing.assert_array_equal(log.u[rows[-1]], log.u[rows[-2]])

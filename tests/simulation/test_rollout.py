@@ -10,13 +10,10 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.plants import rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout, sampled
-from ptsmc_jax.theory import solutions
-from tests.helpers import FULL_INERTIA, REFERENCE, finer, fly, parts, short, vector, with_controller
+from tests.helpers import FULL_INERTIA, REFERENCE, errors_along, finer, fly, parts, short, vector, with_controller
 
 # 20 s before the hand-over and 11 s after it
 TIGHT = clock.anchored(0.25, 30.0, 20.0, 11.0)
-
-exact_error = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, None)))
 
 
 def perfect(run: rollout.Parts) -> rollout.Parts:
@@ -65,7 +62,7 @@ def test_perfect_estimate_gives_the_exact_solution(eta, rate):
     log = fly(run).log
     before = log.t < 29.949
     error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
-    exact = exact_error(log.t, vector(30.0), vector(eta), error, error_rate)
+    exact = errors_along(log.t, vector(30.0), vector(eta), error, error_rate)
     # the default grid leaves up to 1e-9, twice its steps a sixteenth; s is tau times a rate, tau up to 30 s
     np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
     np.testing.assert_allclose(log.s[before], exact.s[before], rtol=0, atol=3e-9)
@@ -86,7 +83,7 @@ def test_exact_solution_for_a_moving_reference(kind):
     log = fly(run).log
     before = log.t < 19.89
     error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
-    exact = exact_error(log.t, vector(20.0), vector(3.5), error, error_rate)
+    exact = errors_along(log.t, vector(20.0), vector(3.5), error, error_rate)
     np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
 
 

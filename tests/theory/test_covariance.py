@@ -31,7 +31,7 @@ CASES = {
 NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rate_bias_walk": 1e-16}
 
 
-SHORT = ("filter, slow star tracker, wheels, lag", "delay, random walk")
+SHORT = ("filter, slow star tracker, wheels, lag",)  # delay and random walk: tests/theory/test_spillover.py
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import hold, solutions
-from tests.helpers import FULL_INERTIA, chain_parts, parts, short, vector
+from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
 
 QUIET = disturbances.Constant(jnp.zeros(3))
 AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
@@ -55,7 +55,7 @@ def exact(run, t):
 def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
     """From t = 0 on in closed form. RK4 leaves below 1e-11: its steps are an eighth of the default grid's."""
     run = flown(law, c, k)
-    result = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True))
+    result = fly(run)
     after = result.log.t >= 8.0
     error = result.log.x[:, :1] if isinstance(law, int) else result.log.error
     wanted, s, acceleration = (np.asarray(v) for v in exact(run, vector(result.log.t[after])))
@@ -102,13 +102,13 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
         run = replace(run, controller=replace(run.controller, surface_rate=c))
         return rollout.simulate(run).metrics.window_error
 
-    value, slope = jax.jit(measured), jax.jit(jax.jacfwd(measured, 1))
+    sloped = jax.jit(lambda run, c: jax.jvp(lambda c: measured(run, c), (c,), (jnp.ones_like(c),)))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
         run, at, h = flown(prescribed_time.PrescribedTime, c, k), vector(c), 1e-3
-        forward = float(slope(run, at))
+        forward = float(sloped(run, at)[1])
         # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
-        two_back, back, ahead, two_ahead = (float(value(run, at + step * h)) for step in (-2, -1, 1, 2))
+        two_back, back, ahead, two_ahead = (float(sloped(run, at + step * h)[0]) for step in (-2, -1, 1, 2))
         difference = (two_back - 8 * back + 8 * ahead - two_ahead) / (12 * h)
         np.testing.assert_allclose(forward, difference, rtol=1e-8)  # h^4 and rounding 1e-15 / h beside a slope of 4e-4
 
@@ -116,7 +116,7 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
 def test_envelopes_after_the_hand_over_are_not_empty():
     """Where nothing pushes they fall as the run does, some times what is flown: the sign of s is not made use of."""
     run = flown(2, 2.5, 0.7)
-    log = jax.tree.map(np.asarray, rollout.simulate_jit(run, record=True).log)
+    log = fly(run).log
     t = log.t[log.t >= 8.0]
     for size, bound in (
         (np.abs(log.s[-t.size :, 0]), hold.sliding_bound(run, t)),
