@@ -392,6 +392,7 @@ def test_random_walk_grows_like_the_square_root_of_time():
 
     def found(trial):
         log = rollout.simulate(run, 4, trial, record=True).log
+        assert log is not None
         return log.t, log.disturbance
 
     t, d = (np.asarray(v) for v in jax.jit(jax.vmap(found))(jnp.arange(512, dtype=jnp.uint32)))

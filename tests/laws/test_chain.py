@@ -272,8 +272,8 @@ def test_sampled_chain_converges_to_the_continuous_one(x0):
     changes = {"bound": 0.01, "disturbance": wave, "delta": 0.5, "sign_width": 0.05}
     truth = fly(chain_parts(x0, **changes, steps=(4000, 200))).metrics.window_error
     sampled = [chain_parts(x0, **changes, period=h) for h in (0.01, 0.005, 0.0025)]
-    longest = sampled[0].clock.long_enough_for([run.clock for run in sampled])
-    sampled = [replace(run, clock=replace(longest, period=run.clock.period)) for run in sampled]
+    clocks = [run.clock for run in sampled]
+    sampled = [replace(run, clock=run.clock.long_enough_for(clocks)) for run in sampled]
     gaps = [abs(float(fly(run).metrics.window_error / truth) - 1.0) for run in sampled]
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     assert np.all((ratios > 1.7) & (ratios < 2.3))  # zero-order hold: first order
@@ -310,19 +310,19 @@ def test_plant_with_drift_and_gain_is_linearised_exactly():
 def test_batches_of_chains_and_their_gradients():
     run = chain_parts([5.0, 3.0, 2.0], delta=0.5, period=0.05, noise=[1e-4, 1e-4, 1e-4], bound=0.01)
 
-    def error(eta, delta, k1, surface_rate, trial):
-        law = {"eta": eta, "delta": delta, "k1": k1, "surface_rate": surface_rate}
+    def error(gains, trial):
+        law = dict(zip(("eta", "delta", "k1", "surface_rate"), gains, strict=True))
         return rollout.simulate(with_controller(run, **law), 3, trial).metrics.window_error
 
     trials = jnp.arange(6, dtype=jnp.uint32)
     point = vector([4.5, 0.53, 1.2, 1.7])
-    one = jax.jit(jax.vmap(lambda trial: error(*point, trial)))(trials)
-    np.testing.assert_allclose(jax.jit(lanes.vmap(lambda trial: error(*point, trial)))(trials), one, rtol=1e-12)
+    one = jax.jit(jax.vmap(lambda trial: error(point, trial)))(trials)
+    np.testing.assert_allclose(jax.jit(lanes.vmap(lambda trial: error(point, trial)))(trials), one, rtol=1e-12)
     assert np.std(one) > 0.0
 
     @jax.jit
     def sloped(gains, along):
-        return jax.jvp(lambda gains: error(*gains, trials[0]), (gains,), (along,))
+        return jax.jvp(lambda gains: error(gains, trials[0]), (gains,), (along,))
 
     for along in np.eye(4):
         h = 1e-6

@@ -94,6 +94,7 @@ def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution():
 
     def at_hand_over(eta, delta):
         log = rollout.simulate(with_controller(run, eta=eta, delta=delta), record=True).log
+        assert log is not None
         held = run.clock.ticks(run.controller.t_f, delta).hold
         return log.error[jnp.argmax(held)]  # the first row of the hold phase is the hand-over
 
@@ -109,16 +110,17 @@ def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution():
 
 def test_order_of_convergence_is_four():
     run = parts(30.0, 3.0, 0.5, sign_width=1e-2)
-    assert isinstance(run.clock, clock.Graded)
+    fine = run.clock
+    assert isinstance(fine, clock.Graded)
 
     def final(grid: clock.Graded) -> np.ndarray:
         log = fly(replace(run, clock=grid)).log
         return np.concatenate([log.x.q[-1], log.x.w[-1]])
 
     def coarse(scale: int) -> clock.Graded:
-        return replace(run.clock, before=20 * scale, after=10 * scale, max_step=vector(3.0 / scale))
+        return replace(fine, before=20 * scale, after=10 * scale, max_step=vector(3.0 / scale))
 
-    truth = final(run.clock)
+    truth = final(fine)
     sizes = np.array([4, 8])
     errors = np.array([np.abs(final(coarse(int(n))) - truth).max() for n in sizes])
     assert errors[-1] > 1e-13  # still truncation, not rounding
