@@ -59,8 +59,8 @@ def main() -> None:
     ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
-        one = optimise.search(evaluate, problem, ready.requirements, own, table.starts, table.steps, seed,
-                              sloped=posed.sloped, robust=table.worst_case, judged=False)  # fmt: skip
+        settings = optimise.Settings(table.starts, table.steps, seed, posed.sloped, table.worst_case, judged=False)
+        one = optimise.search(evaluate, problem, ready.requirements, own, settings)
         took = time.monotonic() - started
         flown, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
         found.append(one)

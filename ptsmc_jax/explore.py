@@ -40,11 +40,13 @@ class Quantities(Mapping[str, float]):
         return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name].unit}" for name, value in self.items())
 
     def _repr_html_(self) -> str:
-        rows = [
-            (name, _number(value), self._catalogue[name].unit, self._catalogue[name].meaning)
-            for name, value in self.items()
-        ]
-        return _table(("metric", "value", "unit", "meaning"), rows)
+        head = "".join(f"<th>{heading}</th>" for heading in ("metric", "value", "unit", "meaning"))
+        body = ""
+        for name, value in self.items():
+            entry = self._catalogue[name]
+            cells = (name, "-" if value != value else f"{value:.5g}", entry.unit, entry.meaning)
+            body += "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
@@ -88,11 +90,11 @@ class Flight:
 
     def plot(self, *names: str) -> "Figures":
         """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
-        made = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
-        unknown = [name for name in names if name not in made]
+        figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
+        unknown = [name for name in names if name not in figures]
         if unknown:
-            raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(made)}")
-        return Figures({name: made[name] for name in names or made})
+            raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(figures)}")
+        return Figures({name: figures[name] for name in names or figures})
 
     def animate(self, frames: int = 40) -> "animation.Animation":
         """The body turning toward its reference, in three dimensions; spacecraft only, else raises ValueError."""
@@ -103,13 +105,13 @@ class Flight:
         return pl.DataFrame({**self.run.columns(), **runs.numbered("error", self.run.log.error)})
 
     def __repr__(self) -> str:
-        return "\n".join([self._said(), repr(self.metrics), *map(str, self.verdicts)])
+        return "\n".join([self._ending(), repr(self.metrics), *map(str, self.verdicts)])
 
     def _repr_html_(self) -> str:
         verdicts = "".join(f"<li>{html.escape(str(v))}</li>" for v in self.verdicts)
-        return f"<p>{html.escape(self._said())}</p>{self.metrics._repr_html_()}<ul>{verdicts}</ul>"
+        return f"<p>{html.escape(self._ending())}</p>{self.metrics._repr_html_()}<ul>{verdicts}</ul>"
 
-    def _said(self) -> str:
+    def _ending(self) -> str:
         why = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
         return f"status: {self.status}{why}"
 
@@ -121,12 +123,12 @@ class Figures(dict[str, Figure]):
         import base64
         import io
 
-        shown = []
+        images = []
         for figure in self.values():
             buffer = io.BytesIO()
             figure.savefig(buffer, dpi=90)
-            shown.append(f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">')
-        return "".join(shown)
+            images.append(f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">')
+        return "".join(images)
 
 
 def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = None) -> Flight:
@@ -136,8 +138,8 @@ def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = 
     """
     _check_whole_number("seed", seed)
     _check_whole_number("trial", 0 if trial is None else trial)
-    known = _read(what)
-    return Flight(known, runs.fly(scenario.study(known, drawn=trial is not None), seed, trial))
+    loaded = _read(what)
+    return Flight(loaded, runs.fly(scenario.study(loaded, drawn=trial is not None), seed, trial))
 
 
 def trials(
@@ -150,15 +152,22 @@ def trials(
     """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
 
     Number, status, reason, bad_time [s], the metrics in the units of `catalogues.CATALOGUE`, what each trial flew with,
-    and metrics of one's own (see `montecarlo.one`). count: how many trials, or a plan, a table with a row for each, see
-    `plans`; raises RefusedError, with one sentence, where it cannot be flown.
+    and metrics of one's own.
+
+    Args:
+        what: a scenario, its file, or one made ready to fly.
+        count: how many trials, or a plan: a table with a row for each, see `plans`.
+        seed: of the draws and the noise.
+        own: metrics of one's own, see `montecarlo.one`.
+
+    Raises RefusedError, with one sentence, where a plan cannot be flown.
     """
     _check_whole_number("seed", seed)
     ready = _ready(what)
     if isinstance(count, pl.DataFrame):
         names = campaign.Campaign(ready, seed, own).own_names()
-        asked = plans.checked(count, ready.parts, own=names)
-        return campaign.of_plan(ready, seed, asked, own).fly(range(asked.count))
+        plan = plans.checked(count, ready.parts, own=names)
+        return campaign.of_plan(ready, seed, plan, own).fly(range(plan.count))
     _check_whole_number("count", count, 1)
     return campaign.Campaign(ready, seed, own).fly(range(count))
 
@@ -186,9 +195,10 @@ def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdi
     Margins are those of its loop, see `margin_verdicts`; where loops differ, of those of this seed's trials.
     """
     _check_whole_number("seed", seed)
-    asked = scenario.margin_requirements(what)
-    judged = margin_verdicts.over_trials(scenario.study(what), seed) if asked else []
-    return [*campaign.verdicts(scenario.requirements(what), rows), *judged]
+    of_margins = []
+    if scenario.margin_requirements(what):
+        of_margins = margin_verdicts.over_trials(scenario.study(what), seed)
+    return [*campaign.verdicts(scenario.requirements(what), rows), *of_margins]
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
@@ -200,13 +210,3 @@ def _check_whole_number(name: str, value: object, least: int = 0) -> None:
     """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards."""
     if not isinstance(value, int | np.integer) or not least <= value < 2**32:
         raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
-
-
-def _number(value: float) -> str:
-    return "-" if value != value else f"{value:.5g}"
-
-
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    cells = "".join(f"<th>{html.escape(name)}</th>" for name in header)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table>"

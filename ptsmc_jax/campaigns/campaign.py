@@ -59,16 +59,17 @@ class Campaign:
         # never so few that another program flies them: rows are then the same to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, self.rows(wanted), own=self.own)
-        named = [rollout.STATUS[int(code)] for code in flown.status]
-        heading = {"status": [status for status, _ in named], "reason": [reason for _, reason in named]}
-        numbers = {
+        statuses = [rollout.STATUS[int(code)] for code in flown.status]
+        frame = pl.DataFrame({
+            "trial": wanted,
+            "status": [status for status, _ in statuses],
+            "reason": [reason for _, reason in statuses],
             "bad_time": flown.bad_time,
-            **({} if self.plan is None else self.plan.origin(wanted)),
+            **self._origin(wanted),
             **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
             **flown.drawn,
             **flown.own,
-        }
-        frame = pl.DataFrame({"trial": wanted, **heading, **numbers})
+        })  # fmt: skip
         return frame.head(len(trials)).with_columns(pl.col(pl.Float64).fill_nan(None))
 
     def draw(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
@@ -76,53 +77,64 @@ class Campaign:
         wanted = np.asarray(trials, dtype=np.uint32)
         padded = np.resize(wanted, -(-wanted.size // PART) * PART)
         drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), self.rows(padded))
-        whose = {} if self.plan is None else self.plan.origin(wanted)
         numbers = {name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}
-        return pl.DataFrame({"trial": wanted, **whose, **numbers})
+        return pl.DataFrame({"trial": wanted, **self._origin(wanted), **numbers})
+
+    def _origin(self, trials: np.ndarray) -> dict[str, np.ndarray]:
+        return {} if self.plan is None else self.plan.origin(trials)
 
     def own_names(self) -> list[str]:
         """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
         if self.own is None:
             return []
-        found = jax.eval_shape(
+        flown = jax.eval_shape(
             lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=self.own)
         )
-        if not isinstance(found.own, dict) or not found.own or not all(isinstance(name, str) for name in found.own):
-            raise ValueError(f"it returns {type(found.own).__name__}, but must return named numbers, a dict")
-        for name, value in found.own.items():
+        own: Any = flown.own
+        if not isinstance(own, dict) or not own or not all(isinstance(name, str) for name in own):
+            raise ValueError(f"it returns {type(own).__name__}, but must return named numbers, a dict")
+        for name, value in own.items():
             if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
                 raise ValueError(f"its {name} is no single number")
-            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *found.drawn}:
+            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *flown.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
-        return list(found.own)
+        return list(own)
 
 
 def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, where: str = "the plan") -> Campaign:
     """The campaign that flies a plan.
 
     What it says of a quantity in every row as it is drawn anyway, as `--dry-run` writes it, is left to be drawn: the
-    very program of the campaign that was planned then flies it, to the last digit. Raises RefusedError where initial
-    angles that it says do not follow from the rest; where: what errors call it.
+    very program of the campaign that was planned then flies it, to the last digit.
+
+    Args:
+        ready: the scenario, ready to fly.
+        seed: of rows that do not say theirs.
+        plan: its rows.
+        own: metrics of one's own.
+        where: what errors call the plan.
+
+    Raises RefusedError where initial angles that the plan says do not follow from the rest.
     """
-    drawn = {*ready.dispersion.kinds, RATE_BIAS}
-    same = []
-    found = None
+    kinds = {*ready.dispersion.kinds, RATE_BIAS}
+    same = []  # quantities that the plan gives as they would be without it
+    drawn = None  # what its trials would fly with then
     for name, values in plan.given.items():
         quantity = QUANTITIES[name]
-        if name in drawn:
-            if found is None:
-                found = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
+        if name in kinds:
+            if drawn is None:
+                drawn = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
             columns = quantity.columns(ready.parts)
-            usual = found.select(columns).to_numpy() if set(columns) <= set(found.columns) else np.zeros_like(values)
+            usual = drawn.select(columns).to_numpy() if set(columns) <= set(drawn.columns) else np.zeros_like(values)
         else:
             usual = np.asarray(quantity.read(ready.parts))[None]
         if np.array_equal(np.broadcast_to(usual, values.shape), values):
             same.append(name)
-    made = Campaign(ready, seed, own, plan.without(same))
+    campaign = Campaign(ready, seed, own, plan.without(same))
     if plan.angle is not None:
-        flown = found if found is not None and not made.plan_given else made.draw(range(plan.count))
-        plans.check_angle(plan, flown[plans.ANGLE].to_numpy(), where)
-    return made
+        rows = drawn if drawn is not None and not campaign.plan_given else campaign.draw(range(plan.count))
+        plans.check_angle(plan, rows[plans.ANGLE].to_numpy(), where)
+    return campaign
 
 
 @programs.jit
@@ -132,9 +144,10 @@ def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Arr
 
 def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
     """Parts that are not there yet, of a campaign of so many trials; shard (i, n): of every n-th part from the i-th."""
-    there = {part.first: part.count for part in parts}
+    flown = {part.first: part.count for part in parts}
     every = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
-    return [part for part in every[shard[0] - 1 :: shard[1]] if there.get(part[0], 0) < part[1]]
+    number, shards = shard
+    return [(first, count) for first, count in every[number - 1 :: shards] if flown.get(first, 0) < count]
 
 
 @dataclass
@@ -159,7 +172,7 @@ def failures(frame: pl.DataFrame) -> int:
 
 def finished(frame: pl.DataFrame) -> np.ndarray:
     """Which of these rows were flown to the end, (trials,) bool: their metrics are those of the run."""
-    return frame["status"].is_in([rollout.STATUS[code][0] for code in rollout.FINISHED]).to_numpy()
+    return frame["status"].is_in(montecarlo.FINISHED).to_numpy()
 
 
 def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
@@ -174,22 +187,23 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
     Accelerators, which fly more than a part at a time, make several in one go.
     """
     together = max(1, montecarlo.block_size() * len(jax.local_devices()) // PART)
-    writing: deque[tuple[Any, int]] = deque()
+    writing: deque[tuple[Future[Part], int]] = deque()
     with ThreadPoolExecutor(1) as writer:
-        for group, made in _made(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
+        for group, frame in _frames(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
             begin = 0
             for first, count in group:
-                frame, begin = made.slice(begin, count), begin + count
-                bad = failures(frame) if "status" in frame.columns else 0
-                writing.append((writer.submit(rows.write, first, frame), bad))
+                part = frame.slice(begin, count)
+                begin += count
+                bad = failures(part) if "status" in part.columns else 0
+                writing.append((writer.submit(rows.write, first, part), bad))
             while writing and (len(writing) > WAITING or writing[0][0].done()):
-                done, bad = writing.popleft()
-                yield done.result(), bad
-        for done, bad in writing:
-            yield done.result(), bad
+                part_on_disk, bad = writing.popleft()
+                yield part_on_disk.result(), bad
+        for part_on_disk, bad in writing:
+            yield part_on_disk.result(), bad
 
 
-def _made(
+def _frames(
     make: Callable[[np.ndarray], pl.DataFrame], groups: Sequence[list[Wanted]]
 ) -> Iterator[tuple[list[Wanted], pl.DataFrame]]:
     """The rows of each group of parts, in order; two at a time, so that one is flown while rows are made of another."""
@@ -197,18 +211,17 @@ def _made(
     def of(group: list[Wanted]) -> pl.DataFrame:
         return make(np.concatenate([np.arange(first, first + count) for first, count in group]))
 
-    flying: deque[tuple[list[Wanted], Future]] = deque()
+    for group in groups[:1]:
+        yield group, of(group)  # alone: it compiles
+    flying: deque[tuple[list[Wanted], Future[pl.DataFrame]]] = deque()
     with ThreadPoolExecutor(2) as makers:
-        for k, group in enumerate(groups):
-            if k == 0:
-                yield group, of(group)  # alone: it compiles
-                continue
+        for group in groups[1:]:
             flying.append((group, makers.submit(of, group)))
             if len(flying) == 2:
-                first, made = flying.popleft()
-                yield first, made.result()
-        for group, made in flying:
-            yield group, made.result()
+                first, frame = flying.popleft()
+                yield first, frame.result()
+        for group, frame in flying:
+            yield group, frame.result()
 
 
 def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
@@ -224,9 +237,8 @@ def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
-    t, error, has_length = _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows)
-    kept = np.asarray(has_length)[0]
-    return np.asarray(t)[0][kept], np.asarray(error)[:, kept]
+    t, error, has_length = map(np.asarray, _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows))
+    return t[0][has_length[0]], error[:, has_length[0]]
 
 
 @programs.jit

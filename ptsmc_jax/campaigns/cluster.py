@@ -5,7 +5,7 @@ A worker that is lost has its parts flown again by another; a part is the same w
 
 import contextlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,7 @@ def connected(address: str, tls: Mapping[str, str]) -> Cluster:
         local = LocalCluster(
             n_workers=int(count), threads_per_worker=1, host="127.0.0.1", dashboard_address=":0", processes=True
         )
-    where: dict[str, Any] = {"address": local if local is not None else address}
+    where: dict[str, Any] = {"address": address if local is None else local}
     if address.endswith(".json"):
         if not Path(address).is_file():
             raise RefusedError(f"--cluster is {address}, which is not there")
@@ -95,19 +95,18 @@ def _sentence(error: BaseException) -> str:
 
 
 @lru_cache(maxsize=4)
-def _campaign(make: Any, told: tuple) -> tuple[Campaign, Rows]:
+def _campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> tuple[Campaign, Rows]:
     from ptsmc_jax.configure import configure
 
     with contextlib.suppress(RuntimeError):  # the worker's process has used JAX already
         configure(keep_programs=True)
-    return make(*told)
+    return make(*arguments)
 
 
-def _fly(recipe: tuple[Any, tuple], first: int, count: int) -> tuple:
-    """On a worker: fly a part and write it. Returns its receipt."""
-    make, told = recipe
+def _fly(recipe: tuple[Callable, tuple], first: int, count: int) -> tuple:
+    """On a worker: fly a part and write it. Returns its receipt: first trial, count, file, failures, versions."""
     with _one_at_a_time:
-        campaign, rows = _campaign(make, told)
+        campaign, rows = _campaign(*recipe)
         frame = campaign.fly(range(first, first + count))
     part = rows.write(first, frame)
     return first, count, part.path.name, failures(frame), store.packages()

@@ -38,10 +38,10 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """
     if not asked:
         return []
-    found, hold, history = run_margins.judged_jit(parts)
+    left, hold, history = run_margins.judged_jit(parts)
     if rest.swing(parts, history) is not None:
-        found = rest.none_left(found, hold)
-    return _verdicts(asked, found.worst())
+        left = rest.none_left(left, hold)
+    return _verdicts(asked, left.worst())
 
 
 def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
@@ -50,19 +50,19 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
     rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one, which
     is none of those that the trials' loops are linearised about.
     """
-    given = isinstance(rows, Row) and bool({*OF_LOOPS, *OF_MISFITS} & set(rows.given))
-    drawn = given or differ(ready.dispersion)
-    if not (ready.margins and drawn) or rest.swing(ready.parts) is not None:
+    planned_loops = isinstance(rows, Row) and not rows.given.keys().isdisjoint({*OF_LOOPS, *OF_MISFITS})
+    loops_differ = planned_loops or differ(ready.dispersion)
+    if not (ready.margins and loops_differ) or rest.swing(ready.parts) is not None:
         return of_loop(ready.parts, ready.margins)
-    limits = {one.metric: one.limit for one in ready.margins}
+    limits = {requirement.metric: requirement.limit for requirement in ready.margins}
     trials = np.arange(TRIALS) if rows is None else rows
     return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, trials, limits))
 
 
-def _verdicts(asked: Sequence[Requirement], found: Mapping[str, Any]) -> list[Verdict]:
+def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, Any]) -> list[Verdict]:
     """A verdict for each margin that is asked for, from its values by name, of one loop or of many."""
-    values = [np.asarray(found[one.metric]) for one in asked]
-    return [one.verdict(value, np.asarray(~np.isnan(value))) for one, value in zip(asked, values, strict=True)]
+    values = [np.asarray(by_name[requirement.metric]) for requirement in asked]
+    return [r.verdict(value, np.asarray(~np.isnan(value))) for r, value in zip(asked, values, strict=True)]
 
 
 def differ(dispersion: Dispersion) -> bool:
@@ -88,6 +88,14 @@ def worst(
     Exact are the worst of each margin, and the margins of the `places` trials that come nearest to a limit. All others
     are rough: it is known that they are farther from their limits than these, and on which side of a limit they lie.
 
+    Args:
+        parts: the nominal ones.
+        dispersion: what is drawn about them.
+        seed: of the draws.
+        trials: their numbers, or rows of a plan.
+        limits: of each margin that is wanted, by its name.
+        places: how many trials nearest to a limit are to be exact.
+
     First the margins of every loop are read roughly, by straight lines between the frequencies that exact margins are
     found by: the error is below half of `OFF`, as the tests show. Then loops are judged exactly, the nearest first, as
     long as an error of `OFF` could make one of the others count, or could move it across a limit. Each exact margin
@@ -98,8 +106,8 @@ def worst(
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     whole = -(-count // CALL) * CALL
     padded = jax.tree.map(lambda v: jnp.asarray(np.resize(v, (whole, *v.shape[1:]))), trials)
-    seen = _look(parts, dispersion, jnp.uint32(seed), padded)
-    loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), seen)
+    looks = _look(parts, dispersion, jnp.uint32(seed), padded)
+    loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
     values = np.stack([rough[name] for name in names])  # (names, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
     off = np.asarray([[OFF[name] * (loops.period[0] if name == "delay_margin" else 1.0)] for name in names]) / limit
@@ -115,8 +123,9 @@ def worst(
         if not chosen.size:
             return {name: _over(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
         chosen = np.resize(chosen, JUDGED)  # one shape, one program
-        full = _of_some(loops, chosen, with_delay="delay_margin" in names)
-        exact = np.stack([_over(name, full[name]) for name in names])
+        some = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
+        full = margins.of_each(some, with_delay="delay_margin" in names).each()
+        exact = np.stack([_over(name, np.asarray(full[name])) for name in names])
         apart = np.abs(_nearness(exact, limit, names) - near[:, chosen])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
         off = np.where(apart > off / 2.0, 2.0 * apart, off)
@@ -127,12 +136,6 @@ def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np
     """`nearness` of each margin, arrays over them first; a loop without a value counts as behind all others."""
     near = np.stack([nearness(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
     return np.where(np.isnan(near), -np.inf, near)
-
-
-def _of_some(loops: linear.Loop, some: np.ndarray, *, with_delay: bool) -> dict[str, np.ndarray]:
-    """Margins of some of the loops in full, (loops, m)."""
-    found = margins.of_each(jax.tree.map(lambda v: v[some], loops), with_delay=with_delay)
-    return {name: np.asarray(v) for name, v in found.each().items()}
 
 
 def _over(name: str, values: Any) -> Any:
@@ -154,9 +157,9 @@ def _look(
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = jax.vmap(one)(trials)
-        found = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
-        return loops, {name: v.reshape(CALL, -1) for name, v in found.items()}
+        values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
+        return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
 
     # not shared over devices: what LAPACK does on two of a processor's at once never ends
-    found = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), found)
+    calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)

@@ -24,6 +24,7 @@ FEW = 64  # fewer trials are flown at once, by a program for this many: a step o
 CAPACITY = 4096  # trials in one call
 BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
 BLOCK_ON_GPU = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
+FINISHED = tuple(rollout.STATUS[code][0] for code in rollout.FINISHED)  # statuses of runs that were flown to the end
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,10 @@ class Trials:
 
     def counts(self) -> dict[str, int]:
         """How many trials ended with each status."""
-        names = dict.fromkeys(status for status, _ in rollout.STATUS.values())
-        return {name: sum(int(np.sum(self.status == c)) for c, (s, _) in rollout.STATUS.items() if s == name)
-                for name in names}  # fmt: skip
+        counts = dict.fromkeys((status for status, _ in rollout.STATUS.values()), 0)
+        for code, (status, _) in rollout.STATUS.items():
+            counts[status] += int(np.sum(self.status == code))
+        return counts
 
 
 # a metric of one's own: the run with its history, and the parts that flew it -> named numbers
@@ -83,17 +85,28 @@ def one(
 ) -> Flown:
     """Fly one trial: pure, for any transformation.
 
-    trial: its number, or a `Row` of a plan, which brings its own seed. coordinates: of what is drawn, where they are
-    not those of the trial, which then names its noise alone. own: metrics besides the usual ones, for which the run's
-    history is recorded.
+    Args:
+        parts: the nominal ones.
+        dispersion: what is drawn about them.
+        seed: of the draws and the noise, a whole number.
+        trial: its number, or a `Row` of a plan, which brings its own seed.
+        coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
+        own: metrics besides the usual ones, for which the run's history is recorded.
     """
     about = planned.about(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = about.dispersion.coordinates(about.seed, about.trial)
     drawn = about.dispersion.at(about.parts, coordinates)
     result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None)
-    more = {} if own is None else own(result, drawn)
-    return Flown(result.metrics, result.status, result.bad_time, _values(dispersion, drawn, about, coordinates), more)
+    own_metrics = {} if own is None else own(result, drawn)
+    flown_with = _values(dispersion, drawn, about, coordinates)
+    return Flown(result.metrics, result.status, result.bad_time, flown_with, own_metrics)
+
+
+@programs.jit
+def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
+    """Coordinates [-] of what is drawn for these trials (trials,), arrays over the trials first."""
+    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
 def values(parts: Parts, dispersion: Dispersion, seed, trial) -> dict[str, jax.Array]:
@@ -107,10 +120,10 @@ def _values(
     dispersion: Dispersion, drawn: Parts, about: planned.About, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
     """Read from the parts of a trial, the gyro's bias from its sensors, and what draws of one's own say of theirs."""
-    found = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
+    by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
     if dispersion.own is not None:
-        found |= dispersion.own.values(coordinates[OWN])
-    return found if drawn.sensors is None else found | drawn.sensors.drawn(about.seed, about.trial)
+        by_column |= dispersion.own.values(coordinates[OWN])
+    return by_column if drawn.sensors is None else by_column | drawn.sensors.drawn(about.seed, about.trial)
 
 
 def run(
@@ -122,11 +135,19 @@ def run(
     own: OwnMetrics | None = None,
     kernel: bool = False,
 ) -> Trials:
-    """Fly these trials (whole numbers below 2^32), or rows of a plan, whatever the blocks, the devices and the order.
+    """Fly these trials, or rows of a plan: the same whatever the blocks, the devices and the order.
 
-    block: trials that a device flies at a time. A trial that fails is marked by its status and kept. One program flies
-    any number of trials below `FEW`, another any number from there on. own: see `one`. kernel: whole runs in one
-    kernel, see `kernel`; on a processor it is interpreted, slowly.
+    A trial that fails is marked by its status and kept. One program flies any number of trials below `FEW`, another any
+    number from there on.
+
+    Args:
+        parts: the nominal ones.
+        dispersion: what is drawn about them.
+        seed: of the draws and the noise.
+        trials: their numbers, whole ones below 2^32, or rows of a plan.
+        block: trials that a device flies at a time; None: `block_size()`.
+        own: see `one`.
+        kernel: whole runs in one kernel, see `kernel`; on a processor it is interpreted, slowly.
     """
     trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
@@ -136,19 +157,31 @@ def run(
     size = devices * rows * block
     calls = []
     for k in range(0, count, size):
-        few = min(size, count - k)
-        share = -(-few // devices)  # of each device
-
-        def spaced(v: np.ndarray, k: int = k, few: int = few, share: int = share) -> jax.Array:
-            padded = np.zeros((devices, rows * block, *v.shape[1:]), v.dtype)
-            padded[:, :share] = np.resize(v[k : k + few], (devices, share, *v.shape[1:]))
-            return jnp.asarray(padded.reshape(devices, rows, block, *v.shape[1:]))
-
+        places, share = shared_out(min(size, count - k), devices, rows * block)
+        chosen = k + places.reshape(devices, rows, block)
+        numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
         needed = jnp.int32(-(-share // block))
-        numbers = jax.tree.map(spaced, trials)
-        found = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel)
-        calls.append(jax.tree.map(lambda v, share=share, n=few: _joined(np.asarray(v), share)[:n], found))
+        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel)
+        flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
+        calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
+
+
+def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
+    """Which of so many items the slots of each device hold, (devices, slots), and how many each device has in all.
+
+    Beyond these, and where they do not come out even, items stand twice; `gathered` leaves these out at its end.
+    """
+    share = -(-count // devices)
+    places = np.zeros((devices, slots), int)
+    places[:, :share] = np.resize(np.arange(count), (devices, share))
+    return places, share
+
+
+def gathered(results: np.ndarray, share: int) -> np.ndarray:
+    """Results of items that were `shared_out`, (devices, slots, ..) -> (devices * share, ..), in the items' order."""
+    own = np.asarray(results)[:, :share]
+    return own.reshape(-1, *own.shape[2:])
 
 
 def prepare(parts: Parts, dispersion: Dispersion) -> None:
@@ -156,12 +189,6 @@ def prepare(parts: Parts, dispersion: Dispersion) -> None:
     devices, block = len(jax.local_devices()), block_size()
     numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, kernel=False)
-
-
-def _joined(v: np.ndarray, share: int) -> np.ndarray:
-    """The trials that count of (devices, rows, block, ...)."""
-    flat = v.reshape(v.shape[0], -1, *v.shape[3:])[:, :share]
-    return flat.reshape(-1, *flat.shape[2:])
 
 
 @programs.jit(static_argnames=("devices", "own", "kernel"))
@@ -176,31 +203,48 @@ def _fly(
     kernel: bool,
 ) -> Flown:
     """Results of (devices, rows, block) trials; rows from `needed` on are left zero, a kernel flies them too."""
+    shape = jax.tree.leaves(trials)[0].shape[:3]
 
     def fly(trial: jax.Array | Row) -> Flown:
         return one(parts, dispersion, seed, trial, own=own)
 
-    def in_blocks(trials: jax.Array | Row) -> Flown:
-        flown, row = lanes.vmap(fly), jax.tree.map(lambda v: v[0], trials)
-        shape = jax.tree.leaves(row)[0].shape[:2]
-        # of one trial: to trace the lanes a second time takes longer
-        first = jax.tree.map(lambda v: v[0, 0], row)
-        empty = jax.tree.map(lambda v: jnp.zeros((*shape, *v.shape), v.dtype), jax.eval_shape(fly, first))
-
-        def step(k: jax.Array, found: Flown) -> Flown:
-            each = flown(jax.tree.map(lambda v: v[k], row))
-            return jax.tree.map(lambda into, v: into.at[k].set(v), found, each)
-
-        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
-
     def in_one_kernel(trials: jax.Array | Row) -> Flown:
         from ptsmc_jax.batching.kernel import vmap  # which nothing else needs
 
-        flown, shape = vmap(fly, interpret=jax.default_backend() == "cpu"), jax.tree.leaves(trials)[0].shape[:3]
-        found = flown(jax.tree.map(lambda v: v.reshape(-1, *v.shape[3:]), trials))
-        return jax.tree.map(lambda v: v.reshape(shape), found)
+        flown = vmap(fly, interpret=jax.default_backend() == "cpu")
+        results = flown(jax.tree.map(lambda v: v.reshape(-1, *v.shape[3:]), trials))
+        return jax.tree.map(lambda v: v.reshape(1, *shape[1:]), results)
 
-    return spread(in_one_kernel if kernel else in_blocks, trials, devices)
+    if kernel:
+        return spread(in_one_kernel, trials, devices)
+    result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
+    return row_by_row(lanes.vmap(fly), result, shape[2], trials, needed, devices)
+
+
+def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.Array, devices: int) -> Any:
+    """`flown` of one row after the other, on each of the devices.
+
+    Args:
+        flown: what is done with a row of trials.
+        result: shapes and types of what comes out for one trial: to trace a whole row for them takes long.
+        width: trials in a row.
+        rows: arrays (devices, rows, ..).
+        needed: how many rows each device has to do; what those beyond them leave is zero.
+        devices: how many there are.
+    """
+
+    def on_device(rows: Any) -> Any:
+        own = jax.tree.map(lambda v: v[0], rows)
+        count = jax.tree.leaves(own)[0].shape[0]
+        empty = jax.tree.map(lambda v: jnp.zeros((count, width, *v.shape), v.dtype), result)
+
+        def step(k: jax.Array, done: Any) -> Any:
+            row = flown(jax.tree.map(lambda v: v[k], own))
+            return jax.tree.map(lambda into, v: into.at[k].set(v), done, row)
+
+        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
+
+    return spread(on_device, rows, devices)
 
 
 def block_size() -> int:

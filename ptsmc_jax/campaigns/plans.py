@@ -43,12 +43,16 @@ class Plan:
     @property
     def digest(self) -> str:
         """SHA-256 of what it says: two tables that fly the same trials have the same one."""
-        found = hashlib.sha256(str(self.count).encode())
-        for name, values in [*sorted(self.given.items()), (TRIAL, self.trial), (SEED, self.seed)]:
-            if values is not None:
-                plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-                found.update(name.encode() + plain.tobytes())
-        return found.hexdigest()
+        digest = hashlib.sha256(str(self.count).encode())
+        for name, values in [*sorted(self.given.items()), *self._whose_draws.items()]:
+            plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+            digest.update(name.encode() + plain.tobytes())
+        return digest.hexdigest()
+
+    @property
+    def _whose_draws(self) -> dict[str, np.ndarray]:
+        """The columns that say whose draws and noise a row has, as far as there are such."""
+        return {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
 
     def rows(self, numbers: np.ndarray, seed: int) -> np.ndarray | Row:
         """These rows, (rows,) numbers from 0 on; trials' numbers where nothing else is said. seed: the campaign's."""
@@ -70,12 +74,11 @@ class Plan:
 
     def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
         """Whose draws these rows have, as rows tell it."""
-        known = {TRIAL: self.trial, SEED: self.seed}
-        return {OF_ROWS[name]: values[numbers] for name, values in known.items() if values is not None}
+        return {OF_ROWS[name]: values[numbers] for name, values in self._whose_draws.items()}
 
     def frame(self, parts: Parts) -> pl.DataFrame:
         """The plan as a table, in one form for all that say the same."""
-        columns = {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
+        columns = self._whose_draws
         for name, values in self.given.items():
             columns |= dict(zip(QUANTITIES[name].columns(parts), values.T, strict=True))
         return pl.DataFrame(columns or {TRIAL: np.arange(self.count, dtype=np.uint32)})
@@ -94,12 +97,18 @@ def read(path: Path) -> pl.DataFrame:
             return pl.read_csv(path, infer_schema_length=None)
         return pl.concat([pl.read_parquet(file) for file in files])
     except (OSError, pl.exceptions.PolarsError) as error:
-        said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RefusedError(f"--plan is {path}, which cannot be read: {said}") from None
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RefusedError(f"--plan is {path}, which cannot be read: {first_line}") from None
 
 
 def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = ()) -> Plan:
-    """The plan that a table says for these nominal parts; where: what errors call it; own: metrics of one's own.
+    """The plan that a table says.
+
+    Args:
+        table: a row for each trial.
+        parts: the nominal ones, that say which quantities there are.
+        where: what errors call the plan.
+        own: names of metrics of one's own, which may stand beside.
 
     Raises RefusedError, in one sentence with column and row (counted from 0, as trials are), where a column is not
     known or comes without the others of its vector, a cell is empty or no finite number, or a value is none that can be
@@ -154,31 +163,33 @@ def _all(columns: list[str]) -> str:
 
 
 def _refused(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
-    said = "empty" if value is None else value
-    return RefusedError(f"{where} has {column} {said} in row {row}, but must have {allowed}")
+    shown = "empty" if value is None else value
+    return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")
+
+
+def _refuse(bad: np.ndarray, table: pl.DataFrame, column: str, where: str, allowed: str) -> None:
+    """Raise RefusedError of the first bad row of a column, if there is one; bad: (rows,) bool."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise _refused(where, column, row, table[column][row], allowed)
 
 
 def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """A column of finite numbers."""
     values = table[column]
     if values.dtype.is_numeric() or values.dtype == pl.String:
-        found = values.cast(pl.Float64, strict=False).to_numpy().astype(float)  # what is none, or empty, is NaN
+        numbers = values.cast(pl.Float64, strict=False).to_numpy().astype(float)  # what is none, or empty, is NaN
     else:
-        found = np.full(values.len(), np.nan)
-    bad = ~np.isfinite(found)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise _refused(where, column, row, values[row], "a finite number")
-    return found
+        numbers = np.full(values.len(), np.nan)
+    _refuse(~np.isfinite(numbers), table, column, where, "a finite number")
+    return numbers
 
 
 def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """A column of whole numbers below 2^32."""
     values = _numbers(table, column, where)
     bad = (values != np.floor(values)) | (values < 0) | (values >= MOST)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise _refused(where, column, row, table[column][row], f"a whole number from 0 to {MOST - 1}")
+    _refuse(bad, table, column, where, f"a whole number from 0 to {MOST - 1}")
     return values.astype(np.uint32)
 
 
@@ -187,6 +198,6 @@ def _checked(values: np.ndarray, name: str, columns: list[str], where: str) -> n
     try:
         return QUANTITIES[name].checked(values)
     except UnfitError as error:
-        said = ", ".join(f"{v:.9g}" for v in values[error.row])
-        called = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
-        raise _refused(where, called, error.row, said, str(error)) from None
+        row = ", ".join(f"{v:.9g}" for v in values[error.row])
+        heading = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
+        raise _refused(where, heading, error.row, row, str(error)) from None

@@ -68,31 +68,31 @@ class Rows:
         """Whole parts in order, none of them inside another; and files that are damaged or of another campaign."""
         whole, broken = [], []
         for path in sorted(self.folder.glob("*.parquet")):
-            named = _NAME.fullmatch(path.name)
-            first, count = (int(named[1]), int(named[2]) - int(named[1]) + 1) if named else (0, 0)
-            if named is None or self._digest(first, count, path.read_bytes()) != named[3]:
+            name = _NAME.fullmatch(path.name)
+            first, count = (int(name[1]), int(name[2]) - int(name[1]) + 1) if name else (0, 0)
+            if name is not None and self._digest(first, count, path.read_bytes()) == name[3]:
+                whole.append(Part(first, count, path))
+            else:
                 broken.append(path)
-                continue
-            whole.append(Part(first, count, path))
-        kept: list[Part] = []
+        parts: list[Part] = []
         for part in sorted(whole, key=lambda p: (p.first, -p.count)):
-            if not kept or part.first >= kept[-1].end:
-                kept.append(part)
-        return kept, broken
+            if not parts or part.first >= parts[-1].end:
+                parts.append(part)
+        return parts, broken
 
     def tidy(self, parts: Iterable[Part]) -> None:
         """Remove what a killed process left unfinished, and all parts but these, which `parts` found whole."""
         for path in self.folder.glob(f"{_MAKING}*"):
             path.unlink(missing_ok=True)
-        kept = {part.path for part in parts}
+        whole = {part.path for part in parts}
         for path in self.folder.glob("*.parquet"):
-            if path not in kept and _NAME.fullmatch(path.name):
+            if path not in whole and _NAME.fullmatch(path.name):
                 path.unlink(missing_ok=True)
 
     def _digest(self, first: int, count: int, content: bytes) -> str:
-        found = hashlib.blake2b(content, digest_size=16, key=self.key)
-        found.update(f"{first}+{count}".encode())
-        return found.hexdigest()
+        digest = hashlib.blake2b(content, digest_size=16, key=self.key)
+        digest.update(f"{first}+{count}".encode())
+        return digest.hexdigest()
 
 
 def key_of(scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bytes:

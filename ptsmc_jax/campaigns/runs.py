@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
-from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.campaigns import margin_verdicts, montecarlo
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -55,9 +55,10 @@ class Run:
 
         None: it was not flown to the end, or with sensors of one's own, of which it is not known what they say.
         """
-        finished = self.status in [rollout.STATUS[code][0] for code in rollout.FINISHED]
+        if self.status not in montecarlo.FINISHED:
+            return None
         known = self.parts.sensors is None or hasattr(self.parts.sensors, "reading")
-        return error_floor.along(self.parts, self.log) if finished and known else None
+        return error_floor.along(self.parts, self.log) if known else None
 
     def columns(self) -> dict[str, np.ndarray]:
         """The history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, flexible modes."""

@@ -43,7 +43,7 @@ def packages() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
-def made(folder: Path) -> dict[str, Any]:
+def read_versions(folder: Path) -> dict[str, Any]:
     """What `versions` said when the results in a folder were made; empty where it cannot be read."""
     try:
         made_by = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
@@ -90,7 +90,7 @@ def _same(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any])
 
 def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> str | None:
     """What tells the run in the folder from this one, in words; None: nothing does."""
-    versions = made(folder)
+    versions = read_versions(folder)
     try:
         old_tables = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):

@@ -4,10 +4,11 @@ Coordinates are numbers uniform on (0, 1) or standard normal: a trial's are draw
 moves them: value = at(coordinates).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -24,6 +25,7 @@ INERTIA, REFERENCE, OWN = "inertia", "reference", "own"
 DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
 DISTURBANCE_BIAS = "disturbance_bias"
 FARTHEST = 3.0  # standard deviations of what is truncated, at most
+NEAR = 1e-6  # of 1, the norm of a unit vector, or quaternion, that a plan gives
 
 
 class UnfitError(ValueError):
@@ -34,11 +36,14 @@ class UnfitError(ValueError):
         self.row = row
 
     @staticmethod
-    def check(fit: Any, allowed: Callable[[int], str]) -> None:
+    def check(fit: np.ndarray, allowed: Callable[[int], str]) -> None:
         """Raise it of the first row that is not fit, (rows,) bool; allowed: what that row must have, in words."""
         if not fit.all():
             row = int(np.argmin(fit))
             raise UnfitError(row, allowed(row))
+
+
+Checked = Callable[[np.ndarray], np.ndarray]
 
 
 class Quantity(NamedTuple):
@@ -47,8 +52,48 @@ class Quantity(NamedTuple):
     columns: Callable[[Parts], list[str]]  # their names; empty where these parts have no such quantity
     read: Callable[[Parts], Numbers]
     write: Callable[[Parts, Numbers], Parts]
-    # numbers (rows, n) as a plan gives them -> as they are flown; raises UnfitError
-    checked: Callable[[np.ndarray], np.ndarray] = lambda given: given
+    checked: Checked = lambda rows: rows  # numbers (rows, n) of a plan -> as they are flown; raises UnfitError
+
+
+def of_field(
+    part: str, key: str, columns: list[str], nominal: Sequence[float] = (), checked: Checked = lambda rows: rows
+) -> Quantity:
+    """The quantity that one field of a part holds, such as `rate_scale` of `sensors`.
+
+    Args:
+        part: field of `Parts`.
+        key: field of that part; where the part has none, there is no such quantity.
+        columns: names of its numbers (n,) [SI units].
+        nominal: the numbers where the field is None.
+        checked: see `Quantity`.
+    """
+
+    def read(parts: Parts) -> Numbers:
+        value = getattr(getattr(parts, part), key)
+        return jnp.asarray(nominal) if value is None else value
+
+    def write(parts: Parts, numbers: Numbers) -> Parts:
+        return replace(parts, **{part: replace(getattr(parts, part), **{key: numbers})})
+
+    return Quantity(lambda parts: columns if hasattr(getattr(parts, part), key) else [], read, write, checked)
+
+
+def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
+    """Checks rows (rows, n) of numbers, in any unit [-], and leaves them as they are.
+
+    fits: (rows, n) -> (rows, ..) bool, all of them where a row is fit; allowed: what a row must have, in words.
+    """
+
+    def checked(rows: np.ndarray) -> np.ndarray:
+        """The rows (rows, n) as they are, in any unit [-]; raises UnfitError where one is not fit."""
+        UnfitError.check(np.asarray(fits(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
+        return rows
+
+    return checked
+
+
+not_negative = fitting(lambda numbers: numbers >= 0.0, "numbers of at least 0")
+positive = fitting(lambda numbers: numbers > 0.0, "a number greater than 0")
 
 
 def numbered(name: str, count: int) -> list[str]:
@@ -56,16 +101,9 @@ def numbered(name: str, count: int) -> list[str]:
     return [f"{name}{k + 1}" for k in range(count)]
 
 
-def not_negative(given: np.ndarray) -> np.ndarray:
-    """The numbers (rows, n), of which none is negative, as `Quantity.checked` takes them in any unit [-]."""
-    UnfitError.check((given >= 0.0).all(axis=1), lambda k: "numbers of at least 0")
-    return given
-
-
-def positive(given: np.ndarray) -> np.ndarray:
-    """The numbers (rows, n), which must all be positive, as `Quantity.checked` takes them in any unit [-]."""
-    UnfitError.check((given > 0.0).all(axis=1), lambda k: "a number greater than 0")
-    return given
+def plant_of(parts: Parts) -> Any:
+    """The true plant, which has the fields of its own kind besides those of every plant [SI units]."""
+    return parts.plant
 
 
 @dataclass(frozen=True)

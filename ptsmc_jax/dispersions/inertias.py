@@ -35,23 +35,24 @@ class RelativeInertia:
 
     def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Inertia [kg m^2] and its inverse, (3, 3) each."""
-        first, turn, rest = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
-        first = first.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)
+        plain, turn, slender = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
+        candidates = plain.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)
         # loops over the draws: the same work, but a fraction of the code to compile
-        later = jax.lax.map(self._slender, rest.reshape(SLENDER, 4))
-        listed = jax.tree.map(lambda *both: jnp.concatenate(both), first, later)
+        more = jax.lax.map(self._slender, slender.reshape(SLENDER, 4))
+        shares, counts = jax.tree.map(lambda *both: jnp.concatenate(both), candidates, more)
 
-        def look(known: tuple[Array, Array], draw: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
-            (found, moments), (share, counts) = known, draw
+        def look(first: tuple[Array, Array], candidate: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+            """Whether there is a body so far, and the moments of the first one."""
+            (is_there, moments), (share, counts) = first, candidate
             tried = self.moments * (1.0 + self.std * share)
             physical = (2.0 * jnp.max(tried) <= jnp.sum(tried)) & (jnp.min(tried) > 0.0)
             fits = counts & physical & (jnp.max(jnp.abs(share)) <= FARTHEST)
-            return (found | fits, jnp.where(fits & ~found, tried, moments)), None
+            return (is_there | fits, jnp.where(fits & ~is_there, tried, moments)), None
 
-        (_, found), _ = jax.lax.scan(look, (jnp.asarray(False), self.moments), listed)
+        (_, moments), _ = jax.lax.scan(look, (jnp.asarray(False), self.moments), (shares, counts))
         q = attitude.from_rotation_vector(self.turn * turn)
         axes = self.axes @ jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
-        return (axes @ jnp.diag(found)) @ axes.T, (axes @ jnp.diag(1.0 / found)) @ axes.T
+        return (axes @ jnp.diag(moments)) @ axes.T, (axes @ jnp.diag(1.0 / moments)) @ axes.T
 
     def _slender(self, n: Float[Array, "4"]) -> tuple[Float[Array, "3"], Array]:
         """Shares whose two larger moments differ by at most the smallest, and whether they count, from normals [-].

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.dispersions.base import Drawn, Numbers, Quantity, UnfitError, numbered, positive
+from ptsmc_jax.dispersions.base import NEAR, Drawn, Numbers, Quantity, fitting, numbered, of_field, plant_of, positive
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation.assembly import Parts
@@ -33,125 +33,90 @@ def _paired(name: str, count: int) -> list[str]:
     return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
 
 
-# --- what parts may have ---
-
-
-def _of_actuators(name: str, key: str, columns: Callable, nominal: Callable, write: Callable, checked: Any) -> Quantity:
-    def read(parts: Parts) -> Numbers:
-        found = getattr(parts.effective_actuators, key)
-        return jnp.ravel((nominal(parts) if found is None else found).T)
-
-    def written(parts: Parts, given: Numbers) -> Parts:
-        return replace(parts, actuators=replace(parts.effective_actuators, **{key: write(given)}))
-
-    return Quantity(lambda parts: columns(name, _size(parts)), read, written, checked)
-
-
-def _unit_vectors(given: np.ndarray) -> np.ndarray:
-    """Directions (rows, 3 channels), unit vectors but for rounding."""
-    norms = np.linalg.norm(given.reshape(len(given), -1, 3), axis=2)
-    UnfitError.check(
-        (np.abs(norms - 1.0) <= 1e-6).all(axis=1), lambda k: "unit vectors, three numbers for each channel"
-    )
-    return given
-
-
-def _failure() -> Quantity:
-    def read(parts: Parts) -> Numbers:
-        fails = parts.effective_actuators.failure_times
-        if fails is None:
-            return jnp.array([jnp.inf, 0.0])
-        return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
-
-    def write(parts: Parts, given: Numbers) -> Parts:
-        wheel = jnp.arange(channels(parts).shape[1]) + 1.0
-        failure_times = jnp.where(wheel == given[1], given[0], jnp.inf)
-        return replace(parts, actuators=replace(parts.effective_actuators, failure_times=failure_times))
-
-    def with_whole_wheel(given: np.ndarray) -> np.ndarray:
-        UnfitError.check(given[:, 1] == np.round(given[:, 1]), lambda k: "a time and the number of a wheel, from 1 on")
-        return given
-
-    def columns(parts: Parts) -> list[str]:
-        wheels = None if parts.actuators is None else parts.actuators.wheels
-        return [] if wheels is None else ["wheel_failure_time", "wheel_failure_wheel"]
-
-    return Quantity(columns, read, write, with_whole_wheel)
-
-
-def _of_sensors(key: str, columns: list[str], nominal: list[float], checked: Any = lambda given: given) -> Quantity:
-    def read(parts: Parts) -> Numbers:
-        found = getattr(parts.sensors, key)
-        return jnp.asarray(nominal) if found is None else found
-
-    return Quantity(
-        lambda parts: columns if hasattr(parts.sensors, key) else [],
-        read,
-        lambda parts, given: replace(parts, sensors=replace(parts.sensors, **{key: given})),
-        checked,
-    )
-
-
 def _modes(parts: Parts) -> int:
     """How many flexible modes the true plant has."""
     return getattr(parts.plant, "frequency", np.zeros(0)).shape[-1]
 
 
-def _frequency() -> Quantity:
-    def write(parts: Parts, given: Numbers) -> Parts:
-        plant: Any = parts.plant
-        return replace(parts, plant=replace(plant, frequency=given))
-
-    def read(parts: Parts) -> Numbers:
-        plant: Any = parts.plant
-        return plant.frequency
-
-    return Quantity(lambda parts: numbered("mode_frequency_", _modes(parts)), read, write, positive)
+# --- what parts may have ---
 
 
-def _coupling() -> Quantity:
-    def write(parts: Parts, given: Numbers) -> Parts:
-        plant: Any = parts.plant
-        return replace(parts, plant=replace(plant, coupling=given.reshape(-1, 3)).with_rest_inverse())
-
-    def read(parts: Parts) -> Numbers:
-        plant: Any = parts.plant
-        return jnp.ravel(plant.coupling)
-
-    return Quantity(lambda parts: _paired("mode_coupling", _modes(parts)), read, write)
+def _with_actuators(parts: Parts, **changes: Any) -> Parts:
+    return replace(parts, actuators=replace(parts.effective_actuators, **changes))
 
 
-def _jitter() -> Quantity:
-    def below_a_half(given: np.ndarray) -> np.ndarray:
-        fit = (given >= 0.0) & (given < 0.5)
-        UnfitError.check(fit.all(axis=1), lambda k: "a share of the control period from 0 to below 0.5")
-        return given
+def _scale(parts: Parts) -> Numbers:
+    scale = parts.effective_actuators.scale
+    return jnp.ones(_size(parts)) if scale is None else scale
 
-    return Quantity(
-        lambda parts: ["timing_jitter"] if parts.clock.sampled else [],
-        lambda parts: jnp.zeros(1) if parts.jitter is None else jnp.reshape(parts.jitter, 1),
-        lambda parts, given: replace(parts, jitter=given[0]),
-        below_a_half,
-    )
+
+def _directions(parts: Parts) -> Numbers:
+    """True directions of the channels, one after the other, (3 channels,) [-]."""
+    directions = parts.effective_actuators.directions
+    return jnp.ravel((channels(parts) if directions is None else directions).T)
+
+
+def _failure(parts: Parts) -> Numbers:
+    """When a wheel fails [s], and its number from 1 on, (2,); infinite and 0: none does."""
+    fails = parts.effective_actuators.failure_times
+    if fails is None:
+        return jnp.array([jnp.inf, 0.0])
+    return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
+
+
+def _with_failure(parts: Parts, failure: Numbers) -> Parts:
+    wheel = jnp.arange(channels(parts).shape[1]) + 1.0
+    return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 
 _OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
+_FAILURE = ["wheel_failure_time", "wheel_failure_wheel"]
 OF_MISFITS: dict[str, Quantity] = {
-    "actuator_scale": _of_actuators(
-        "actuator_scale", "scale", lambda name, n: numbered(f"{name}_", n), lambda parts: jnp.ones(_size(parts)),
-        lambda given: given, lambda given: given,
+    "actuator_scale": Quantity(
+        lambda parts: numbered("actuator_scale_", _size(parts)),
+        _scale,
+        lambda parts, scale: _with_actuators(parts, scale=scale),
     ),
-    "actuator_misalignment": _of_actuators(
-        "actuator_misalignment", "directions", _paired, channels, lambda given: given.reshape(-1, 3).T, _unit_vectors
+    "actuator_misalignment": Quantity(
+        lambda parts: _paired("actuator_misalignment", _size(parts)),
+        _directions,
+        lambda parts, listed: _with_actuators(parts, directions=listed.reshape(-1, 3).T),
+        fitting(
+            lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NEAR,
+            "unit vectors, three numbers for each channel",
+        ),
     ),
-    "star_tracker_misalignment": _of_sensors("misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3),
-    "gyro_scale": _of_sensors("rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
-    "star_tracker_outage": _of_sensors("outage", _OUTAGE, [np.inf, np.inf]),
-    "wheel_failure": _failure(),
-    "timing_jitter": _jitter(),
-    "mode_frequency": _frequency(),
-    "mode_coupling": _coupling(),
-}  # fmt: skip
+    "star_tracker_misalignment": of_field(
+        "sensors", "misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3
+    ),
+    "gyro_scale": of_field("sensors", "rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
+    "star_tracker_outage": of_field("sensors", "outage", _OUTAGE, [np.inf, np.inf]),
+    "wheel_failure": Quantity(
+        lambda parts: [] if parts.effective_actuators.wheels is None else _FAILURE,
+        _failure,
+        _with_failure,
+        fitting(lambda rows: rows[:, 1] == np.round(rows[:, 1]), "a time and the number of a wheel, from 1 on"),
+    ),
+    "timing_jitter": Quantity(
+        lambda parts: ["timing_jitter"] if parts.clock.sampled else [],
+        lambda parts: jnp.zeros(1) if parts.jitter is None else jnp.reshape(parts.jitter, 1),
+        lambda parts, share: replace(parts, jitter=share[0]),
+        fitting(lambda rows: (rows >= 0.0) & (rows < 0.5), "a share of the control period from 0 to below 0.5"),
+    ),
+    "mode_frequency": Quantity(
+        lambda parts: numbered("mode_frequency_", _modes(parts)),
+        lambda parts: plant_of(parts).frequency,
+        lambda parts, frequency: replace(parts, plant=replace(plant_of(parts), frequency=frequency)),
+        positive,
+    ),
+    "mode_coupling": Quantity(
+        lambda parts: _paired("mode_coupling", _modes(parts)),
+        lambda parts: jnp.ravel(plant_of(parts).coupling),
+        lambda parts, rows: replace(
+            parts, plant=replace(plant_of(parts), coupling=rows.reshape(-1, 3)).with_rest_inverse()
+        ),
+    ),
+}
 
 
 # --- how they are drawn ---
@@ -232,8 +197,7 @@ class FrequencyFactors(_Drawn):
 
     def at(self, c: Float[Array, " n"], parts: Parts) -> Float[Array, " n"]:
         """The frequencies (n,) [rad/s] of coordinates c [-]."""
-        plant: Any = parts.plant
-        return plant.frequency * self.numbers.at(c, jnp.ones(self.count))
+        return plant_of(parts).frequency * self.numbers.at(c, jnp.ones(self.count))
 
 
 @pytree
@@ -243,8 +207,7 @@ class CouplingFactors(_Drawn):
 
     def at(self, c: Float[Array, " modes"], parts: Parts) -> Float[Array, " n"]:
         """The rows (3 modes,) [sqrt(kg) m] of coordinates c [-]."""
-        plant: Any = parts.plant
-        return jnp.ravel(plant.coupling * self.numbers.at(c, jnp.ones(self.count))[:, None])
+        return jnp.ravel(plant_of(parts).coupling * self.numbers.at(c, jnp.ones(self.count))[:, None])
 
 
 @pytree

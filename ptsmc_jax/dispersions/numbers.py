@@ -12,59 +12,53 @@ from ptsmc_jax.dispersions.base import FARTHEST, Drawn
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 
+@dataclass(frozen=True)
+class _Spread:
+    """What numbers about nominal ones have: how far each of them spreads."""
+
+    spread: Leaf  # (n,)
+
+    @property
+    def count(self) -> int:
+        """How many numbers there are."""
+        return self.spread.shape[-1]
+
+
 @pytree
 @dataclass(frozen=True)
-class Uniform:
-    """Numbers uniform about nominal ones."""
+class Uniform(_Spread):
+    """Numbers uniform about nominal ones; they spread by their half widths."""
 
-    half_width: Leaf  # (n,)
     drawn: ClassVar[Drawn] = "uniform"
 
-    @property
-    def count(self) -> int:
-        """How many numbers there are."""
-        return self.half_width.shape[-1]
-
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
         """The numbers, (n,), in the units of the nominal ones, from coordinates c [-]."""
-        return nominal + self.half_width * (2.0 * c - 1.0)
+        return nominal + self.spread * (2.0 * c - 1.0)
 
 
 @pytree
 @dataclass(frozen=True)
-class Normal:
-    """Numbers normal about nominal ones."""
+class Normal(_Spread):
+    """Numbers normal about nominal ones; they spread by their standard deviations."""
 
-    std: Leaf  # (n,)
     drawn: ClassVar[Drawn] = "normal"
 
-    @property
-    def count(self) -> int:
-        """How many numbers there are."""
-        return self.std.shape[-1]
-
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
         """The numbers, (n,), in the units of the nominal ones, from coordinates c [-]."""
-        return nominal + self.std * c
+        return nominal + self.spread * c
 
 
 @pytree
 @dataclass(frozen=True)
-class TruncatedNormal:
-    """Numbers normal about nominal ones, truncated (not clipped) at `FARTHEST` standard deviations."""
+class TruncatedNormal(_Spread):
+    """Numbers normal about nominal ones, truncated (not clipped) at `FARTHEST` standard deviations, their spread."""
 
-    std: Leaf  # (n,)
     drawn: ClassVar[Drawn] = "uniform"  # through the inverse of the truncated law
-
-    @property
-    def count(self) -> int:
-        """How many numbers there are."""
-        return self.std.shape[-1]
 
     def at(self, c: Float[Array, " n"], nominal: Float[Array, " n"]) -> Float[Array, " n"]:
         """The numbers, (n,), in the units of the nominal ones: erf_inv of a c [-] between its values at both ends."""
         within = math.erf(FARTHEST / math.sqrt(2.0))
-        return nominal + self.std * math.sqrt(2.0) * jax.lax.erf_inv((2.0 * c - 1.0) * within)
+        return nominal + self.spread * math.sqrt(2.0) * jax.lax.erf_inv((2.0 * c - 1.0) * within)
 
 
 @pytree

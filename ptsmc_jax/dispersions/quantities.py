@@ -6,11 +6,11 @@ these columns, and a plan may give it there.
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax import formulas
 from ptsmc_jax.devices.sensors import RATE_BIAS
@@ -22,11 +22,15 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_ATTITUDE,
     INITIAL_RATE,
     INITIAL_STATE,
+    NEAR,
     REFERENCE,
+    Numbers,
     Quantity,
     UnfitError,
     not_negative,
     numbered,
+    of_field,
+    plant_of,
     positive,
 )
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
@@ -34,9 +38,6 @@ from ptsmc_jax.numerics import matrices
 from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
-
-Numbers = Float[Array, " n"]
-NEAR = 1e-6  # of 1, the norm of a unit quaternion
 
 # of what a trial may have more or less, by one factor: name -> where in the parts it stands
 LEVELS = {
@@ -53,45 +54,11 @@ def level(name: str) -> str:
 
 
 def _unit(q: np.ndarray) -> np.ndarray:
-    """Unit quaternions; those that are unit ones but for rounding stay to the last digit."""
+    """Unit quaternions (rows, 4); those that are unit ones but for rounding stay to the last digit."""
     norm = np.linalg.norm(q, axis=1)
     UnfitError.check(np.abs(norm - 1.0) <= NEAR, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
     rounding = np.abs(norm - 1.0) < 1e-14
     return np.where(rounding[:, None], q, q / norm[:, None])
-
-
-def _attitude() -> Quantity:
-    return Quantity(
-        lambda parts: numbered("initial_q", 4) if parts.plant.attitude else [],
-        lambda parts: parts.initial.q,
-        lambda parts, q: replace(parts, initial=parts.initial._replace(q=q)),
-        _unit,
-    )
-
-
-def _rate() -> Quantity:
-    return Quantity(
-        lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
-        lambda parts: parts.initial.w,
-        lambda parts, w: replace(parts, initial=parts.initial._replace(w=w)),
-    )
-
-
-def _state() -> Quantity:
-    return Quantity(
-        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
-        lambda parts: parts.plant.visible(parts.initial),
-        lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
-    )
-
-
-def _reference() -> Quantity:
-    return Quantity(
-        lambda parts: numbered("reference_q", 4) if hasattr(parts.reference, "q") else [],
-        lambda parts: parts.reference.q,
-        lambda parts, q: replace(parts, reference=replace(parts.reference, q=q)),
-        _unit,
-    )
 
 
 PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle
@@ -102,19 +69,18 @@ def with_body(parts: Parts, body: Spacecraft) -> Parts:
     return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
 
 
-def _with_inertia(parts: Parts, given: Numbers) -> Parts:
-    entries = {pair: given[k] for k, pair in enumerate(PAIRS)}
-    inertia = jnp.stack([jnp.stack([entries[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
-    plant: Any = parts.plant
-    return with_body(parts, plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
+def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
+    named = {pair: entries[k] for k, pair in enumerate(PAIRS)}
+    inertia = jnp.stack([jnp.stack([named[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
+    return with_body(parts, plant_of(parts).with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
 
 
-def _inertia_checked(given: np.ndarray) -> np.ndarray:
-    tensors = np.zeros((len(given), 3, 3))
+def _inertia_checked(rows: np.ndarray) -> np.ndarray:
+    tensors = np.zeros((len(rows), 3, 3))
     for k, (i, j) in enumerate(PAIRS):
-        tensors[:, i, j] = tensors[:, j, i] = given[:, k]
+        tensors[:, i, j] = tensors[:, j, i] = rows[:, k]
     UnfitError.check(formulas.bodies(tensors), lambda k: f"a rigid body's inertia ({_why_no_body(tensors[k])})")
-    return given
+    return rows
 
 
 def _why_no_body(tensor: np.ndarray) -> str:
@@ -125,90 +91,82 @@ def _why_no_body(tensor: np.ndarray) -> str:
     return ""
 
 
-def _inertia() -> Quantity:
-    return Quantity(
-        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
-        lambda parts: jnp.stack([parts.plant.inertia[i, j] for i, j in PAIRS]),
-        _with_inertia,
-        _inertia_checked,
-    )
-
-
-def _of_disturbance(name: str, what: Any) -> Quantity:
-    def there(parts: Parts) -> Numbers:
+def _of_disturbance(name: str, what: Literal["phase", "amplitude"]) -> Quantity:
+    def read(parts: Parts) -> Numbers:
         return disturbances.values(parts.disturbance, what)
 
     return Quantity(
-        lambda parts: numbered(f"{name}_", there(parts).size),
-        there,
-        lambda parts, given: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, given)),
-    )
-
-
-def _bias() -> Quantity:
-    return Quantity(
-        lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
-        lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
-        lambda parts, given: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, given)),
+        lambda parts: numbered(f"{name}_", read(parts).size),
+        read,
+        lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, new)),
     )
 
 
 def _level(name: str) -> Quantity:
     part, key = LEVELS[name]
 
-    def there(parts: Parts) -> Any:
+    def value_in(parts: Parts) -> Any:
         return getattr(getattr(parts, part), key, None)
 
     def columns(parts: Parts) -> list[str]:
-        value = there(parts)
+        value = value_in(parts)
         if value is None:
             return []
         return [name] if value.ndim == 0 else numbered(f"{name}_", value.shape[0])
 
-    def write(parts: Parts, given: Numbers) -> Parts:
+    def write(parts: Parts, new: Numbers) -> Parts:
         device = getattr(parts, part)
-        return replace(parts, **{part: replace(device, **{key: given.reshape(there(parts).shape)})})
+        return replace(parts, **{part: replace(device, **{key: new.reshape(value_in(parts).shape)})})
 
-    return Quantity(
-        columns, lambda parts: jnp.ravel(there(parts)), write, positive if name == "torque_limit" else not_negative
-    )
-
-
-def _rate_bias() -> Quantity:
-    """The gyro's at the first sample, which a sensor draws for itself: it is read there."""
-
-    def read(parts: Parts) -> Numbers:
-        return jnp.zeros(3) if parts.sensors.given_bias is None else parts.sensors.given_bias
-
-    return Quantity(
-        lambda parts: numbered(f"{RATE_BIAS}_", 3) if hasattr(parts.sensors, "given_bias") else [],
-        read,
-        lambda parts, given: replace(parts, sensors=replace(parts.sensors, given_bias=given)),
-    )
+    checked = positive if name == "torque_limit" else not_negative
+    return Quantity(columns, lambda parts: jnp.ravel(value_in(parts)), write, checked)
 
 
 # in the order of their columns
 QUANTITIES: dict[str, Quantity] = {
-    INITIAL_ATTITUDE: _attitude(),
-    INITIAL_RATE: _rate(),
-    INITIAL_STATE: _state(),
-    REFERENCE: _reference(),
-    INERTIA: _inertia(),
+    INITIAL_ATTITUDE: Quantity(
+        lambda parts: numbered("initial_q", 4) if parts.plant.attitude else [],
+        lambda parts: parts.initial.q,
+        lambda parts, q: replace(parts, initial=parts.initial._replace(q=q)),
+        _unit,
+    ),
+    INITIAL_RATE: Quantity(
+        lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
+        lambda parts: parts.initial.w,
+        lambda parts, w: replace(parts, initial=parts.initial._replace(w=w)),
+    ),
+    INITIAL_STATE: Quantity(
+        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
+        lambda parts: parts.plant.visible(parts.initial),
+        lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
+    ),
+    REFERENCE: of_field("reference", "q", numbered("reference_q", 4), checked=_unit),
+    INERTIA: Quantity(
+        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
+        lambda parts: jnp.stack([plant_of(parts).inertia[i, j] for i, j in PAIRS]),
+        _with_inertia,
+        _inertia_checked,
+    ),
     DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase"),
     DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude"),
-    DISTURBANCE_BIAS: _bias(),
+    DISTURBANCE_BIAS: Quantity(
+        lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
+        lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
+        lambda parts, bias: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, bias)),
+    ),
     **{level(name): _level(name) for name in LEVELS},
-    RATE_BIAS: _rate_bias(),
+    # the gyro's at the first sample, which a sensor draws for itself where none is given: it is read there
+    RATE_BIAS: of_field("sensors", "given_bias", numbered(f"{RATE_BIAS}_", 3), [0.0] * 3),
     **OF_MISFITS,
 }
 
 
 def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
     """The numbers of these quantities by their columns, [rad], [rad/s], [kg m^2] or [N m]: `write` of them = parts."""
-    found = {}
+    by_column = {}
     for name, quantity in QUANTITIES.items():
         columns = quantity.columns(parts) if name in names else []
         if columns:
             numbers = quantity.read(parts)
-            found |= {column: numbers[k] for k, column in enumerate(columns)}
-    return found
+            by_column |= {column: numbers[k] for k, column in enumerate(columns)}
+    return by_column

@@ -21,11 +21,12 @@ from ptsmc_jax.dispersions.base import (
     REFERENCE,
     Coordinates,
     Draw,
+    plant_of,
 )
 from ptsmc_jax.dispersions.inertias import RelativeInertia
 from ptsmc_jax.dispersions.misfits import Misfit
 from ptsmc_jax.dispersions.numbers import Factor, Normal, Uniform, UniformPhase
-from ptsmc_jax.dispersions.quantities import LEVELS, QUANTITIES
+from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import pytree
@@ -81,56 +82,49 @@ class Dispersion:
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
         """Coordinates of a trial; each name has a stream of its own, so one more of them changes no other."""
-        kinds, found = self.kinds, {}
-        for law in draws.DISTRIBUTIONS:
-            counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == law}
-            found |= draws.several(seed, trial, law, counts) if counts else {}
-        return {name: found[name] for name in kinds}
+        kinds, coordinates = self.kinds, {}
+        for distribution in draws.DISTRIBUTIONS:
+            counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == distribution}
+            coordinates |= draws.several(seed, trial, distribution, counts) if counts else {}
+        return {name: coordinates[name] for name in kinds}
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
         """The parts of the trial that has these coordinates."""
         if not self.varies:
             return parts
-        if self.reference is not None:
-            q = parts.reference.q
-            turned = self.reference.at(coordinates[REFERENCE], q, q)
-            parts = replace(parts, reference=replace(parts.reference, q=turned))
-        if self.state is not None:
-            seen = self.state.at(coordinates[INITIAL_STATE], parts.plant.visible(parts.initial))
-            parts = replace(parts, initial=parts.plant.with_hidden_at_rest(seen))
-        if self.attitude is not None:
-            reference = parts.reference(jnp.zeros_like(parts.t_end))
-            q = self.attitude.at(coordinates[INITIAL_ATTITUDE], parts.initial.q, reference.q)
-            parts = replace(parts, initial=parts.initial._replace(q=q))
-        if self.rate is not None:
-            w = self.rate.at(coordinates[INITIAL_RATE], parts.initial.w)
-            parts = replace(parts, initial=parts.initial._replace(w=w))
-        if self.inertia is not None:
-            plant: Any = parts.plant
-            parts = quantities.with_body(parts, plant.with_inertia(*self.inertia.at(coordinates[INERTIA])))
-        for name, level in self.levels.items():
-            part, key = LEVELS[name]
-            device = getattr(parts, part)
-            nominal = getattr(device, key)
-            factor = level.at(coordinates[quantities.level(name)], jnp.ones(level.count))
-            parts = replace(parts, **{part: replace(device, **{key: nominal * factor[0]})})
-        for name, misfit in self.misfits.items():
-            parts = QUANTITIES[name].write(parts, misfit.at(coordinates[name], parts))
-        parts = replace(parts, disturbance=self._disturbance(parts.disturbance, coordinates))
-        return parts if self.own is None else self.own.at(coordinates[OWN], parts)
 
-    def _disturbance(self, nominal: Any, coordinates: Coordinates) -> Any:
-        found = nominal
+        def drawn(name: str, kind: Any, *about: Any) -> Parts:
+            """The parts with the quantity of this name drawn about these nominal values."""
+            return QUANTITIES[name].write(parts, kind.at(coordinates[name], *about))
+
+        def scaled(name: str, factor: Factor) -> Parts:
+            """The parts with the quantity of this name times what is drawn about 1."""
+            quantity = QUANTITIES[name]
+            return quantity.write(parts, quantity.read(parts) * factor.at(coordinates[name], jnp.ones(factor.count)))
+
+        if self.reference is not None:
+            parts = drawn(REFERENCE, self.reference, parts.reference.q, parts.reference.q)
+        if self.state is not None:
+            parts = drawn(INITIAL_STATE, self.state, parts.plant.visible(parts.initial))
+        if self.attitude is not None:
+            at_start = parts.reference(jnp.zeros_like(parts.t_end))
+            parts = drawn(INITIAL_ATTITUDE, self.attitude, parts.initial.q, at_start.q)
+        if self.rate is not None:
+            parts = drawn(INITIAL_RATE, self.rate, parts.initial.w)
+        if self.inertia is not None:  # with its inverse, which `write` would have to solve for
+            body = plant_of(parts).with_inertia(*self.inertia.at(coordinates[INERTIA]))
+            parts = quantities.with_body(parts, body)
+        for name, factor in self.levels.items():
+            parts = scaled(quantities.level(name), factor)
+        for name, misfit in self.misfits.items():
+            parts = drawn(name, misfit, parts)
         if self.phase is not None:
-            angles = self.phase.at(coordinates[DISTURBANCE_PHASE], disturbances.values(found, "phase"))
-            found = disturbances.with_values(found, "phase", angles)
+            parts = drawn(DISTURBANCE_PHASE, self.phase, disturbances.values(parts.disturbance, "phase"))
         if self.amplitude is not None:
-            factor = self.amplitude.at(coordinates[DISTURBANCE_AMPLITUDE], jnp.ones(self.amplitude.count))
-            found = disturbances.with_values(found, "amplitude", disturbances.values(found, "amplitude") * factor)
+            parts = scaled(DISTURBANCE_AMPLITUDE, self.amplitude)
         if self.bias is not None:
-            bias = self.bias.at(coordinates[DISTURBANCE_BIAS], jnp.zeros(self.bias.count))
-            found = disturbances.with_bias(found, bias)
-        return found
+            parts = drawn(DISTURBANCE_BIAS, self.bias, jnp.zeros(self.bias.count))
+        return parts if self.own is None else self.own.at(coordinates[OWN], parts)
 
     def apply(self, parts: Parts, seed: WholeNumber, trial: WholeNumber) -> Parts:
         """The parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
@@ -149,6 +143,6 @@ class Dispersion:
     def without(self, names: Iterable[str]) -> "Dispersion":
         """The dispersion without these streams; every other stream draws what it drew before."""
         none = {field: None for name, field in FIELDS.items() if name in names}
-        kept = {name: level for name, level in self.levels.items() if quantities.level(name) not in names}
+        levels = {name: level for name, level in self.levels.items() if quantities.level(name) not in names}
         misfits = {name: misfit for name, misfit in self.misfits.items() if name not in names}
-        return replace(self, **none, levels=kept, misfits=misfits)
+        return replace(self, **none, levels=levels, misfits=misfits)

@@ -1,14 +1,14 @@
 """Campaigns as matplotlib figures: the fan of the error, distributions, points by status; each returns a Figure."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import RC, STYLES, figure_of, plain_ticks
+from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
@@ -24,12 +24,29 @@ MARKS = {
 }
 
 
+class Column(NamedTuple):
+    """A metric of many trials."""
+
+    unit: str  # empty: it has none
+    values: np.ndarray  # (trials,), NaN where a trial has none
+    limit: float | None = None  # that is asked for
+
+    def label(self, name: str) -> str:
+        """The metric of this name with its unit."""
+        return f"{name} [{self.unit}]" if self.unit else name
+
+
 def fan(
     t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str = "spacecraft"
 ) -> Figure:
     """Error over time of many trials: central bands, the median, the worst run.
 
-    t (time,) [s]; errors (trials, time); worst: trial of the largest window error, and its errors (time,).
+    Args:
+        t: (time,) [s].
+        errors: (trials, time) in the unit of this kind of plant.
+        worst: the trial of the largest window error, and its errors (time,).
+        t_f: the prescribed time [s].
+        kind: of the plant.
     """
     unit = CATALOGUES[kind]["terminal_error"][0]
     figure, axes = figure_of(f"Error of {len(errors)} trials, median in white", f"2-norm of the error [{unit}]")
@@ -47,38 +64,36 @@ def fan(
     return figure
 
 
-def distributions(found: Mapping[str, tuple[str, np.ndarray, float | None]]) -> Figure:
-    """Share of the trials up to each value, with the limits: metric -> (unit, values, limit).
+@styled
+def distributions(metrics: Mapping[str, Column]) -> Figure:
+    """Share of the trials up to each value of each metric, with the limits.
 
     A trial without a value (NaN) counts as beyond all. The scale of the shares is that of their odds, so that 99.9 %
     is as far from 99 % as 1 % from 10 %.
     """
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(8.0, 3.0 * len(found)), layout="constrained")
-        rows = figure.subplots(len(found), 1, squeeze=False)[:, 0]
-        for axes, (name, (unit, values, limit)) in zip(rows, found.items(), strict=True):
-            ordered = np.sort(values)  # NaN last
-            n, known = ordered.size, int(np.isfinite(ordered).sum())
-            # every rank near both ends, and as many between as can be seen
-            ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
-            ranks = ranks[ranks <= known]
-            share = (ranks - 0.5) / n
-            axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0], marker="." if known < 50 else None)
-            axes.set_yscale("logit")
-            edge = 0.3 / n
-            axes.set_ylim(edge, 1.0 - edge)
-            ticks = [q for k in range(1, 8) for q in (10.0**-k, 1.0 - 10.0**-k) if edge < q < 1.0 - edge]
-            axes.set_yticks([0.5, *ticks], [f"{100 * q:.8g} %" for q in (0.5, *ticks)])
-            axes.minorticks_off()
-            if known and ordered[0] > 0.0 and ordered[known - 1] > 3.0 * ordered[0]:
-                axes.set_xscale("log")
-                plain_ticks(axes.xaxis)
-            if limit is not None:
-                within = np.mean(values <= limit)
-                said = f"limit {limit:g} {unit}".rstrip(" -") + f": {100 * within:.6g} % within"
-                axes.axvline(limit, color=STYLES[1][0], ls="--", label=said)
-                axes.legend(fontsize=9, loc="lower right")
-            axes.set(xlabel=f"{name} [{unit}]" if unit else name, ylabel="share of the trials")
+    figure = Figure(figsize=(8.0, 3.0 * len(metrics)), layout="constrained")
+    rows = figure.subplots(len(metrics), 1, squeeze=False)[:, 0]
+    for axes, (name, column) in zip(rows, metrics.items(), strict=True):
+        ordered = np.sort(column.values)  # NaN last
+        n, known = ordered.size, int(np.isfinite(ordered).sum())
+        # every rank near both ends, and as many between as can be seen
+        ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
+        ranks = ranks[ranks <= known]
+        share = (ranks - 0.5) / n
+        axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0], marker="." if known < 50 else None)
+        axes.set_yscale("logit")
+        edge = 0.3 / n
+        axes.set_ylim(edge, 1.0 - edge)
+        ticks = [q for k in range(1, 8) for q in (10.0**-k, 1.0 - 10.0**-k) if edge < q < 1.0 - edge]
+        axes.set_yticks([0.5, *ticks], [f"{100 * q:.8g} %" for q in (0.5, *ticks)])
+        axes.minorticks_off()
+        if known and ordered[0] > 0.0 and ordered[known - 1] > 3.0 * ordered[0]:
+            logarithmic(axes, "x")
+        if column.limit is not None:
+            limit, within = f"limit {column.limit:g} {column.unit}".rstrip(" -"), np.mean(column.values <= column.limit)
+            axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=f"{limit}: {100 * within:.6g} % within")
+            axes.legend(fontsize=9, loc="lower right")
+        axes.set(xlabel=column.label(name), ylabel="share of the trials")
     return figure
 
 
@@ -90,54 +105,56 @@ def torque_by_angle(
     limit: float | None,
     kind: str = "spacecraft",
 ) -> Figure:
-    """Peak torque against the initial error, a point a trial; angle [rad], outcome one of `MARKS`, (trials,) each.
+    """Peak torque against the initial error, a point a trial.
 
-    totals: how many trials of the campaign have each outcome; those given may be some of them.
+    Args:
+        angle: initial error of each trial, (trials,) [rad].
+        torque: its peak torque, (trials,) [N m].
+        outcome: one of `MARKS` for each, (trials,).
+        totals: how many trials of the whole campaign have each outcome.
+        limit: of the torque [N m], if one is asked for.
+        kind: of the plant, whose units are those of its metrics.
     """
     unit, attitude = CATALOGUES[kind]["peak_torque"][0], kind == "spacecraft"
     figure, axes = figure_of("Peak torque by how far the trial starts", f"peak torque [{unit}]")
     _points(axes, np.degrees(angle) if attitude else angle, torque, outcome, totals)
     axes.set_xlabel("initial angle [deg]" if attitude else "initial |x_1| [x1]")
     if limit is not None:
-        axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g} {unit}")
+        axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     finished = torque[np.isin(outcome, ("ok", BEYOND, "missed")) & np.isfinite(torque)]
     if finished.size and finished.min() > 0.0:
         top = max(finished.max(), limit or 0.0)
-        axes.set_yscale("log")
-        plain_ticks(axes.yaxis)
+        logarithmic(axes, "y")
         axes.set_ylim(finished.min() / 1.3, top * 1.5)
     axes.legend(fontsize=9)
     return figure
 
 
+@styled
 def inputs(
     drawn: Mapping[str, np.ndarray],
-    found: Mapping[str, tuple[str, np.ndarray, float | None]],
+    metrics: Mapping[str, Column],
     outcome: np.ndarray,
     totals: Mapping[str, int],
 ) -> Figure:
-    """What was drawn, a column each, against what came of it, a row each; a point a trial, see `torque_by_angle`.
-
-    found: metric -> (unit, values, limit), as in `distributions`.
-    """
-    with matplotlib.rc_context(RC):
-        rows, columns = len(found), len(drawn)
-        figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
-        grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
-        for line, (metric, (unit, values, limit)) in zip(grid, found.items(), strict=True):
-            known = values[np.isfinite(values)]
-            for axes, x in zip(line, drawn.values(), strict=True):
-                _points(axes, x, values, outcome, totals)
-                if limit is not None:
-                    axes.axhline(limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
-                if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
-                    axes.set_yscale("log")
-            line[0].set_ylabel(f"{metric} [{unit}]" if unit else metric)
-        for axes, name in zip(grid[-1], drawn, strict=True):
-            axes.set_xlabel(name)
-            axes.xaxis.set_major_locator(MaxNLocator(4))
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
+    """What was drawn, a column each, against metrics, a row each; a point a trial, see `torque_by_angle`."""
+    rows, columns = len(metrics), len(drawn)
+    figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
+    for line, (metric, column) in zip(grid, metrics.items(), strict=True):
+        known = column.values[np.isfinite(column.values)]
+        for axes, x in zip(line, drawn.values(), strict=True):
+            _points(axes, x, column.values, outcome, totals)
+            if column.limit is not None:
+                axes.axhline(column.limit, **LIMIT)
+            if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
+                axes.set_yscale("log")
+        line[0].set_ylabel(column.label(metric))
+    for axes, name in zip(grid[-1], drawn, strict=True):
+        axes.set_xlabel(name)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=len(handles))
     return figure
 
 

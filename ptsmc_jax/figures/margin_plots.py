@@ -2,75 +2,74 @@
 
 from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from ptsmc_jax.figures.style import RC, STYLES
+from ptsmc_jax.figures.style import STYLES, styled
 from ptsmc_jax.theory.margins import Margins
 
 MODULUS = 6.0  # dB, of the contour that is drawn
 DEEPEST = 40.0  # dB of |L| that are shown, either way
 
 
+@styled
 def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     """|L| over its phase, (points, axes), around the point -1 and what keeps `MODULUS` from it."""
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(8.0, 5.5), layout="constrained")
-        axes = figure.subplots()
-        for k, name in enumerate(names):
-            size, phase = 20.0 * np.log10(np.abs(L[:, k])), np.rad2deg(np.unwrap(np.angle(L[:, k])))
-            near = np.argmin(np.abs(size))  # the branch on which it crosses 0 dB nearest to -180 degrees
-            phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
-            colour, style = STYLES[k % len(STYLES)]
-            axes.plot(phase, size, color=colour, ls=style, label=name)
-        around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-MODULUS / 20.0) - 1.0
-        angle = np.rad2deg(np.angle(around)) % 360.0 - 360.0
-        axes.plot(angle, 20.0 * np.log10(np.abs(around)), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
-        axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
-        axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
-        axes.set_title("Loop opened at the plant's input, in hold", loc="left")
-        axes.legend()
+    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for k, name in enumerate(names):
+        size, phase = 20.0 * np.log10(np.abs(L[:, k])), np.rad2deg(np.unwrap(np.angle(L[:, k])))
+        near = np.argmin(np.abs(size))  # the branch on which it crosses 0 dB nearest to -180 degrees
+        phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
+        colour, style = STYLES[k % len(STYLES)]
+        axes.plot(phase, size, color=colour, ls=style, label=name)
+    around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-MODULUS / 20.0) - 1.0
+    angle = np.rad2deg(np.angle(around)) % 360.0 - 360.0
+    axes.plot(angle, 20.0 * np.log10(np.abs(around)), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
+    axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
+    axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
+    axes.set_title("Loop opened at the plant's input, in hold", loc="left")
+    axes.legend()
     return figure
 
 
+@styled
 def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
     """|S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency; L (points, axes)."""
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-        axes = figure.subplots()
-        shown = w > w[-1] * 1e-4
-        for k, name in enumerate(names):
-            colour, _ = STYLES[k % len(STYLES)]
-            for letter, seen, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
-                size = 20.0 * np.log10(np.abs(seen))
-                axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
-        axes.axhline(MODULUS, color="0.35", lw=1.0, ls=":")
-        axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))
-        axes.set_title("Sensitivity S and complementary sensitivity T, in hold", loc="left")
-        axes.legend(ncols=len(names))
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    shown = w > w[-1] * 1e-4
+    for k, name in enumerate(names):
+        colour, _ = STYLES[k % len(STYLES)]
+        for letter, seen, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
+            size = 20.0 * np.log10(np.abs(seen))
+            axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
+    axes.axhline(MODULUS, color="0.35", lw=1.0, ls=":")
+    axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))
+    axes.set_title("Sensitivity S and complementary sensitivity T, in hold", loc="left")
+    axes.legend(ncols=len(names))
     return figure
 
 
+@styled
 def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
     """The worst axis's margins against the time to go (times,) [s] before the hand-over, and in hold (lines)."""
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(8.0, 6.5), layout="constrained")
-        rows = figure.subplots(3, 1, sharex=True)
-        panels = (("gain [dB]", "gain_up", "gain_down"), ("phase [deg]", "phase"), ("delay [s]", "delay"))
-        for axes, (label, *names) in zip(rows, panels, strict=True):
-            for name, (colour, style) in zip(names, STYLES, strict=False):
-                values = np.where(before.stable[:, 0], getattr(before, name).min(axis=1), np.nan)
-                axes.semilogx(left, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
-                worst = float(getattr(hold, name).min())
-                if np.isfinite(worst):
-                    axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"in hold: {worst:.3g}")
-            lost = left[~before.stable[:, 0]]
-            if lost.size:
-                axes.plot(lost, np.zeros_like(lost), "x", color="0.3", label="frozen loop unstable")
-            axes.set(ylabel=label, ylim=(0.0, None))
-            axes.legend(fontsize=9, ncols=2)
-        rows[-1].set_xlabel("time to t_f, before the hand-over [s]")
-        rows[0].set_title("Margins of the frozen loop, its worst axis", loc="left")
-        rows[0].invert_xaxis()
+    figure = Figure(figsize=(8.0, 6.5), layout="constrained")
+    rows = figure.subplots(3, 1, sharex=True)
+    panels = (("gain [dB]", "gain_up", "gain_down"), ("phase [deg]", "phase"), ("delay [s]", "delay"))
+    for axes, (label, *names) in zip(rows, panels, strict=True):
+        for name, (colour, style) in zip(names, STYLES, strict=False):
+            values = np.where(before.stable[:, 0], getattr(before, name).min(axis=1), np.nan)
+            axes.semilogx(left, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
+            worst = float(getattr(hold, name).min())
+            if np.isfinite(worst):
+                axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"in hold: {worst:.3g}")
+        lost = left[~before.stable[:, 0]]
+        if lost.size:
+            axes.plot(lost, np.zeros_like(lost), "x", color="0.3", label="frozen loop unstable")
+        axes.set(ylabel=label, ylim=(0.0, None))
+        axes.legend(fontsize=9, ncols=2)
+    rows[-1].set_xlabel("time to t_f, before the hand-over [s]")
+    rows[0].set_title("Margins of the frozen loop, its worst axis", loc="left")
+    rows[0].invert_xaxis()
     return figure

@@ -3,22 +3,20 @@
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib
-import matplotlib.colors
-import matplotlib.lines
-import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import RC, STYLES, TIME, figure_of
+from ptsmc_jax.figures.style import LIMIT, STYLES, TIME, figure_of, styled
 from ptsmc_jax.paper.remark_2 import Measured
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
 
 FAR_OFF = 3.0  # times what is drawn, from which on a limit is not drawn
+EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact motion is drawn, and a bound
+BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
@@ -64,7 +62,7 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
     axes.semilogy(log.t, np.maximum(size, 1e-16), color=STYLES[0][0], label="flown")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
-        axes.plot(before, envelopes.error_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise")
+        axes.plot(before, envelopes.error_bound(parts, before), **BOUND)
     if floor is not None and floor.window_error > 0.0:
         known = (floor.error > 0.0) & (floor.error < size.max())  # before the first samples nothing is
         axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="floor: no controller beats it")
@@ -86,17 +84,17 @@ def rate(parts: Parts, log: Log) -> Figure:
 
 def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
     """Delivered torque or input over time, its largest value marked, the limit drawn where one is given."""
-    _, label, unit = _names(parts)
-    figure, axes = figure_of(title or ("Control torque" if unit else "Control"), label)
+    _, ylabel, unit = _names(parts)
+    figure, axes = figure_of(title or ("Control torque" if unit else "Control"), ylabel)
     _components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
     if parts.controller.prescribed:
         t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
-        axes.plot(t, u, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
-        axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+        axes.plot(t, u, **EXACT)
+        axes.plot([], [], **EXACT, label="exact, perfect estimate")
     row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
     peak = log.commanded[row, column]
-    marked = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
-    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=marked)
+    label = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
+    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
         _limit(axes, limit, unit)
     _mark(axes, parts)
@@ -106,27 +104,23 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
 
 def wheels(parts: Parts, log: Log) -> Figure:
     """Momentum of the reaction wheels over time, and its limit."""
-    assert log.wheels is not None
-    figure, axes = figure_of("Reaction wheels", "momentum [N m s]")
-    return _of_wheels(figure, axes, parts, log, log.wheels[0], "h", "momentum_limit", " N m s")
+    return _of_wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
 
 
 def wheel_torque(parts: Parts, log: Log) -> Figure:
     """Torque of the reaction wheels over time, and its limit."""
+    return _of_wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
+
+
+def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, unit: str) -> Figure:
+    """A quantity of each wheel over time, the first or second of `log.wheels`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
-    figure, axes = figure_of("Torque of the reaction wheels", "torque [N m]")
-    return _of_wheels(figure, axes, parts, log, log.wheels[1], "v", "torque_limit", " N m")
-
-
-def _of_wheels(
-    figure: Figure, axes: Axes, parts: Parts, log: Log, values: Any, symbol: str, limit: str, unit: str
-) -> Figure:
-    """Numbers of each wheel over time, and their limit, a field of `Wheels`."""
     assert parts.actuators is not None
-    _components(axes, log.t, values, symbol)
-    largest = getattr(parts.actuators.wheels, limit, None)
-    if largest is not None:
-        _limit(axes, float(largest), unit)
+    figure, axes = figure_of(title, f"{quantity} [{unit}]")
+    _components(axes, log.t, log.wheels[which], "hv"[which])
+    limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)
+    if limit is not None:
+        _limit(axes, float(limit), f" {unit}")
     _mark(axes, parts)
     axes.legend(ncols=2)
     return figure
@@ -138,9 +132,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
     _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
-        axes.plot(
-            before, envelopes.sliding_bound(parts, before), color="0.35", lw=1.0, ls="--", label="bound, no noise"
-        )
+        axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND)
     axes.set_yscale("log")
     _mark(axes, parts)
     axes.legend()
@@ -164,7 +156,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
     bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in flown.values())
     for (name, (size, _, (colour, style))), ideal in zip(flown.items(), exact, strict=True):
         axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, flown")
-        axes.loglog(tau, ideal, color="0.25", lw=0.9, ls=(0, (1, 1.5)))
+        axes.loglog(tau, ideal, **EXACT)
     # slopes of theory as short lines over the error and, where it differs, under s
     span = t_f * np.array([0.3, max(0.03, delta / t_f)])
     above = 6.0 * float(np.interp(-span[0], -tau, np.maximum(*exact)))
@@ -177,7 +169,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
         axes.annotate(f"slope {name} = {slope:g}", (np.sqrt(span[0] * span[1]), np.sqrt(line[0] * line[1])),
                       fontsize=10, xytext=(6, shift), textcoords="offset points",
                       ha="left" if shift > 0 else "right")  # fmt: skip
-    axes.plot([], [], color="0.25", lw=0.9, ls=(0, (1, 1.5)), label="exact, perfect estimate")
+    axes.plot([], [], **EXACT, label="exact, perfect estimate")
     axes.set_xlabel("time to go $t_f - t$ [s]")
     axes.set_ylim(bottom=bottom / 3)
     axes.invert_xaxis()
@@ -197,30 +189,30 @@ def disturbance(parts: Parts, log: Log) -> Figure:
     return figure
 
 
-def observers(found: Sequence[Measured]) -> Figure:
+@styled
+def observers(measured: Sequence[Measured]) -> Figure:
     """What each observer makes of the disturbance, and the chattering it leaves under both signs (Remark 2)."""
-    kinds = list(dict.fromkeys(one.observer for one in found))
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(10.0, 4.5), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        for kind, (colour, style) in zip(kinds, STYLES, strict=False):
-            one = next(one for one in found if one.observer == kind and one.sign == "smooth")
-            left.semilogy(one.t, np.maximum(one.off, 1e-6), color=colour, ls=style, label=kind)
-        left.set(xlabel=TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
-        left.legend(ncols=2)
-        signs = list(dict.fromkeys(one.sign for one in found))
-        for k, sign in enumerate(signs):
-            heights = [next(o.chattering for o in found if (o.observer, o.sign) == (kind, sign)) for kind in kinds]
-            colour, hatch = STYLES[k][0], ("", "//")[k % 2]
-            at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
-            bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
-            right.bar_label(bars, fmt="%.0e", fontsize=8)
-        right.set_yscale("log")
-        right.set_axisbelow(True)
-        right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
-        right.set(ylabel="chattering after $t_f$ [N m/s]")
-        right.set_ylim(top=8.0 * right.get_ylim()[1])
-        right.legend(ncols=2)
+    runs = {(run.observer, run.sign): run for run in measured}
+    kinds = list(dict.fromkeys(run.observer for run in measured))
+    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for kind, (colour, style) in zip(kinds, STYLES, strict=False):
+        run = runs[kind, "smooth"]
+        left.semilogy(run.t, np.maximum(run.off, 1e-6), color=colour, ls=style, label=kind)
+    left.set(xlabel=TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
+    left.legend(ncols=2)
+    for k, sign in enumerate(dict.fromkeys(run.sign for run in measured)):
+        heights = [runs[kind, sign].chattering for kind in kinds]
+        colour, hatch = STYLES[k][0], ("", "//")[k % 2]
+        at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
+        bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
+        right.bar_label(bars, fmt="%.0e", fontsize=8)
+    right.set_yscale("log")
+    right.set_axisbelow(True)
+    right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
+    right.set(ylabel="chattering after $t_f$ [N m/s]")
+    right.set_ylim(top=8.0 * right.get_ylim()[1])
+    right.legend(ncols=2)
     return figure
 
 
@@ -247,8 +239,8 @@ def _limit(axes: Axes, limit: float, unit: str) -> None:
         axes.plot([], [], color="none", label=f"limit {limit:g}{unit}, beyond this axis")
         return
     for sign in (-1.0, 1.0):
-        axes.axhline(sign * limit, color="0.3", lw=1.0, ls=(0, (6, 3)))
-    axes.plot([], [], color="0.3", lw=1.0, ls=(0, (6, 3)), label=f"limit {limit:g}{unit}")
+        axes.axhline(sign * limit, **LIMIT)
+    axes.plot([], [], **LIMIT, label=f"limit {limit:g}{unit}")
 
 
 def _mark(axes: Axes, parts: Parts) -> None:

@@ -1,13 +1,13 @@
 """The common look of all figures, and how they are written."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import matplotlib.ticker
-import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
@@ -23,6 +23,10 @@ RC: Any = {
     "legend.frameon": False,
     "savefig.dpi": 130,
 }
+styled = matplotlib.rc_context(RC)  # decorates functions that draw in this look
+LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # how the line of a limit is drawn, and of the floor
+FLOOR: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
+MANY = 1e4  # times, that an axis spans, from which on the numbers between its powers of ten would overlap
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
@@ -33,22 +37,14 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     return [folder / f"{name}.png" for name in figures]
 
 
+@styled
 def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
     """A figure of one plot over time."""
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-        axes = figure.subplots()
-        axes.set(xlabel=TIME, ylabel=ylabel)
-        axes.set_title(title, loc="left", pad=19)
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=TIME, ylabel=ylabel)
+    axes.set_title(title, loc="left", pad=19)
     return figure, axes
-
-
-def edges(values: Sequence[float], logarithmic: bool) -> np.ndarray:
-    """Borders of the cells around these values, half way to the next one on the axis as it is drawn."""
-    middle = np.log(values) if logarithmic else np.asarray(values)
-    between = (middle[:-1] + middle[1:]) / 2
-    edges = np.concatenate([[2 * middle[0] - between[0]], between, [2 * middle[-1] - between[-1]]])
-    return np.exp(edges) if logarithmic else edges
 
 
 class _Decades(matplotlib.ticker.LogLocator):
@@ -59,11 +55,14 @@ class _Decades(matplotlib.ticker.LogLocator):
         return super().tick_values(vmin, vmax)
 
 
-MANY = 1e4  # times, that an axis spans, from which on the numbers between its powers of ten would overlap
-
-
-def plain_ticks(line: Any) -> None:
+def plain_ticks(line: Axis) -> None:
     """Numbers such as 0.05 on a log axis."""
     line.set_major_locator(_Decades())
     line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     line.set_minor_formatter(matplotlib.ticker.NullFormatter())
+
+
+def logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """One of the axes on a log scale, with plain numbers."""
+    axes.set(**{f"{which}scale": "log"})
+    plain_ticks(getattr(axes, f"{which}axis"))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ptsmc_jax.devices import reaction_wheels
 from ptsmc_jax.dispersions import numbers, variation
 from ptsmc_jax.dispersions.misfits import MISFITS
+from ptsmc_jax.dispersions.quantities import LEVELS
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.scenario.tables import Scenario
@@ -68,7 +69,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
         kind = getattr(table, key, None)
         return None if kind is None else kind.build(*how)
 
-    levels = {key: drawn(key) for key in variation.LEVELS}
+    levels = {key: drawn(key) for key in LEVELS}
     misfits = {key: getattr(table, key, None) for key in MISFITS}
     return variation.Dispersion(
         **scenario.spread(parts),

@@ -6,7 +6,7 @@ They limit metrics of runs from above, and margins of the loop mostly from below
 import bisect
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -98,6 +98,10 @@ class Verdict:
         """A verdict from its entry in `summary.json`, where null stands for a number that is not finite."""
         present = {field.name: entry[field.name] for field in fields(cls) if entry.get(field.name) is not None}
         return cls(**{"worst": math.nan, "margin": math.nan, **present})
+
+    def in_summary(self) -> dict[str, Any]:
+        """The verdict as `summary.json` has it, see `read`."""
+        return {**asdict(self), "met": self.met}
 
     def __str__(self) -> str:
         """The verdict in one line."""

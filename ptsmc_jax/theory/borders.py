@@ -5,16 +5,27 @@ from samples and held, periods later where there is a delay: kp and kd are (57)'
 slope. What bounds of gains and the lines of a map are drawn from, before there is a loop to linearise (`linear`).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 
 def gains(
     t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gains kp [1/s^2] and kd [1/s], (times,), at times t [s]; slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
+    """Gains kp [1/s^2] and kd [1/s], (times,) each.
 
     eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; c k and c + k after it, with
-    k = (K1 + slope)/2 and c the surface_rate [1/s].
+    k = (K1 + slope)/2.
+
+    Args:
+        t: (times,) [s].
+        t_f: the prescribed time [s].
+        eta: exponent of the law [-].
+        delta: how long before t_f it hands over [s].
+        k1: K1 of (60) [1/s].
+        slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
+        surface_rate: c [1/s].
     """
     tau = t_f - np.asarray(t, dtype=float)
     hold = tau <= delta * (1 + 1e-9)
@@ -40,19 +51,15 @@ def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
 
     late_push, early_push = push(part, 1.0), push(0.0, part)
     feedback = np.array([-kp, -kd])
-    columns = list(range(2, n))  # commands waiting, the newest first
+    # behind eps and eps' stand the commands waiting, the newest first
     if whole == 0:
         move[:2, :2] += np.outer(late_push, feedback)
     else:
-        move[:2, columns[whole - 1]] += late_push
+        move[:2, 1 + whole] += late_push
     if part > 0:
-        move[:2, columns[whole]] += early_push
-    for k in reversed(range(len(columns))):
-        move[columns[k], :] = 0.0
-        if k == 0:
-            move[columns[k], :2] = feedback
-        else:
-            move[columns[k], columns[k - 1]] = 1.0
+        move[:2, 2 + whole] += early_push
+    move[2:] = np.eye(n - 2, n, k=1)
+    move[2:3, :2] = feedback
     return move
 
 
@@ -61,7 +68,7 @@ def radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
     return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, delay))).max())
 
 
-def _last(stable, low: float, high: float) -> float:
+def _last(stable: Callable[[float], bool], low: float, high: float) -> float:
     """Largest number at which `stable` still holds, by bisection; inf where it holds at `high`."""
     if stable(high):
         return float("inf")

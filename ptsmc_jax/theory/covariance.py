@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import error_floor, linear
 
@@ -48,67 +47,95 @@ def _mean_width(width: float, sigma: float) -> float:
     at, weight = np.polynomial.hermite_e.hermegauss(101)
     if width < 0.05 * sigma:  # as good as the exact sign
         return float(np.sqrt(np.pi / 2) * np.hypot(sigma, width))
-    mean = np.sum(weight / np.cosh(np.minimum(np.abs(at) * sigma / width, 300.0)) ** 2) / np.sum(weight)
+    shares = np.minimum(np.abs(at) * sigma / width, 300.0)  # beyond that sech^2 is no number
+    mean = np.sum(weight / np.cosh(shares) ** 2) / np.sum(weight)
     return width / float(mean)
 
 
-def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
-    """Propagated: z, the commands on their way, the sensor's own states and the random walk's torque."""
-    ticks = jax.tree.map(np.asarray, run.period.now)
-    h = float(parts.period)
-    lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * h)
-    rows: Any = linear.opened_in(parts, run, lasting)
-    loops = rows.loop
-    n, m, k, whole = loops.a.shape[1], loops.command.shape[1], loops.seen.shape[2], rows.error.shape[2]
-    none = Reading(np.eye(k), np.zeros(k), np.ones(k, int), np.zeros(0), np.zeros(0))
-    sensors = None if parts.sensors is None else parts.sensors.in_step()
-    reading: Reading = none if sensors is None else sensors.reading(h)
-    waiting, own = loops.delay * m, reading.own.size
-    size = n + waiting + own + m
-    own_states, walk = slice(n + waiting, n + waiting + own), slice(size - m, size)
-    walked = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
-    factor = np.zeros((size, own))
-    factor[own_states] = np.diag(reading.own)
-    if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
-        start = np.zeros((size, 6))
-        first = whole + k  # after x and what the computer saw of it
-        start[first : first + 6] = error_floor.root(reading.start[1])
-        factor[first + 3 : first + 6] = np.diag(reading.own)
-        factor = np.hstack([factor, start])
-    p = factor @ factor.T
-    reads = np.zeros((k, size))  # x_seen
-    from_readings = np.linalg.pinv(reading.rows[:, :k])
-    reads[:, :k], reads[:, own_states] = np.eye(k), from_readings @ reading.rows[:, k:]
-    noisy = from_readings * reading.noise
-    squares, torque = np.zeros((len(lasting), 2)), 0.0
-    for j, index in enumerate(lasting):
-        row = jax.tree.map(lambda v, j=j: v[j], rows)
-        loop, dt = row.loop, float(ticks.t_next[index] - ticks.t[index])
+class _Rows(NamedTuple):
+    """How something follows from the state that is propagated, and from the noise of this sample."""
 
-        def wide(by_z: np.ndarray, by_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """Rows by the whole state, and by this sample's noise."""
-            return np.pad(by_z, [(0, 0), (0, size - n)]) + by_seen @ reads, by_seen @ noisy
+    state: np.ndarray  # (rows, size)
+    noise: np.ndarray  # (rows, readings), times 1 sigma
 
-        (sends, sent), (slides, slid), (moved, entered) = (
-            wide(*both) for both in ((loop.command, loop.direct), (row.s_command, row.s_direct), (loop.a, loop.seen))
-        )
-        moves, enters = np.eye(size), np.zeros((size, noisy.shape[1]))
-        moves[:n], enters[:n] = moved, entered
-        moves[:n, walk] += loop.disturbed
+    def covariance(self, p: np.ndarray) -> np.ndarray:
+        """Covariance (rows, rows), from that of the state before the sample, (size, size)."""
+        return self.state @ p @ self.state.T + self.noise @ self.noise.T
+
+
+class _State:
+    """The state that is propagated: z, the commands on their way, the sensors' own states, the random walk's torque."""
+
+    def __init__(self, parts: Parts, opened: linear.Opened):
+        loop: Any = opened.loop
+        self._n, self._m, k = loop.a.shape[1], loop.command.shape[1], loop.seen.shape[2]
+        self.plant = slice(0, opened.error.shape[2])
+        sensors = None if parts.sensors is None else parts.sensors.in_step()
+        self._reading = reading = error_floor.reading_of(sensors, k, float(parts.period))
+        self._waiting = loop.delay * self._m
+        before = self._n + self._waiting
+        self._own = slice(before, before + reading.own.size)
+        self.size = before + reading.own.size + self._m
+        # what the computer sees, by the state and by the noise
+        from_readings = np.linalg.pinv(reading.rows[:, :k])
+        self._seen = _Rows(np.zeros((k, self.size)), from_readings * reading.noise)
+        self._seen.state[:, :k] = np.eye(k)
+        self._seen.state[:, self._own] = from_readings @ reading.rows[:, k:]
+        # by how much the state moves by itself in a second, 1 sigma
+        self.drift = np.concatenate([np.zeros(before), reading.own_drift, error_floor.walk_of(parts)])
+
+    def start(self) -> np.ndarray:
+        """Covariance (size, size) before the first sample."""
+        reading = self._reading
+        factor = np.zeros((self.size, reading.own.size))
+        factor[self._own] = np.diag(reading.own)
+        if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
+            start = np.zeros((self.size, 6))
+            first = self.plant.stop + len(self._seen.state)  # after x and what the computer saw of it
+            start[first : first + 6] = error_floor.root(reading.start[1])
+            factor[first + 3 : first + 6] = np.diag(reading.own)
+            factor = np.hstack([factor, start])
+        return factor @ factor.T
+
+    def rows(self, by_z: np.ndarray, by_seen: np.ndarray) -> _Rows:
+        """Rows of something that follows from z, and from what the computer sees."""
+        padded = np.pad(by_z, [(0, 0), (0, self.size - self._n)])
+        return _Rows(padded + by_seen @ self._seen.state, by_seen @ self._seen.noise)
+
+    def moved(self, loop: Any, command: _Rows) -> _Rows:
+        """The whole state a period later; loop: a `linear.Loop` of numpy arrays."""
+        n, m, waiting, new = self._n, self._m, self._waiting, loop.new[0]
+        state, noise = np.eye(self.size), np.zeros((self.size, command.noise.shape[1]))
+        state[:n], noise[:n] = self.rows(loop.a, loop.seen)
+        state[:n, self.size - m :] += loop.disturbed
         if waiting:
-            moves[:n, n + waiting - m : n + waiting] += loop.new[0]
-            moves[n : n + waiting] = np.eye(size)[n - m : n + waiting - m]
-            moves[n : n + m], enters[n : n + m] = sends, sent
+            state[:n, n + waiting - m : n + waiting] += new
+            state[n : n + waiting] = np.eye(self.size)[n - m : n + waiting - m]
+            state[n : n + m], noise[n : n + m] = command
         else:
-            moves[:n], enters[:n] = moves[:n] + loop.new[0] @ sends, enters[:n] + loop.new[0] @ sent
-        torque = max(torque, float(np.sqrt(np.diag(sends @ p @ sends.T + sent @ sent.T).max())))
-        squares[j] = (
-            np.trace(row.error @ p[:whole, :whole] @ row.error.T),
-            np.mean(np.diag(slides @ p @ slides.T + slid @ slid.T)),
-        )
-        drift = np.concatenate([np.zeros(n + waiting), reading.own_drift * dt, walked * dt])
-        p = moves @ p @ moves.T + enters @ enters.T + np.diag(drift**2)
+            state[:n] += new @ command.state
+            noise[:n] += new @ command.noise
+        return _Rows(state, noise)
+
+
+def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
+    """The covariance propagated along the run, and what it makes of error, command and s."""
+    ticks = jax.tree.map(np.asarray, run.period.now)
+    lengths = ticks.t_next - ticks.t
+    lasting = np.flatnonzero(lengths > 1e-9 * float(parts.period))  # beyond rounding
+    opened = linear.opened_in(parts, run, lasting)
+    state = _State(parts, opened)
+    p = state.start()
+    squares, torque = np.zeros((len(lasting), 2)), 0.0  # of the error and of s
+    for j, index in enumerate(lasting):
+        row = jax.tree.map(lambda v, j=j: v[j], opened)
+        command = state.rows(row.loop.command, row.loop.direct)
+        s = state.rows(row.s_command, row.s_direct)
+        torque = max(torque, float(np.sqrt(np.diag(command.covariance(p)).max())))
+        squares[j, 0] = np.trace(row.error @ p[state.plant, state.plant] @ row.error.T)
+        squares[j, 1] = np.mean(np.diag(s.covariance(p)))
+        p = state.moved(row.loop, command).covariance(p) + np.diag((state.drift * lengths[index]) ** 2)
     t, t_f = ticks.t[lasting], float(parts.controller.t_f)
-    late = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
-    error, s = np.sqrt(np.mean(squares[late], axis=0))
+    in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
+    error, s = np.sqrt(np.mean(squares[in_window], axis=0))
     return Noise(float(error), torque, float(s))

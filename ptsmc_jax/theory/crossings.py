@@ -16,6 +16,7 @@ LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that i
 AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
 NEAREST = 3  # crossings of a kind that are closed in on
 SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
+REAL = 1e-2  # share of the real part below which the imaginary one counts as none, at the ends of the grid
 MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
 
 
@@ -103,37 +104,56 @@ def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points 
     return 1.0 / jnp.diagonal(s, axis1=1, axis2=2) - 1.0
 
 
-def brackets(w: Array, seen: Array) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
+class Brackets(NamedTuple):
     """Between which points L is real and may be -1 with more gain, or with less, has the size 1, is nearest to -1.
 
-    `NEAREST` each: (low, high) [rad/s] and what is zero there at both; which of them are there; frequencies to look at
-    besides.
+    `NEAREST` places of each of these four, (places,); those that there are too few of are not `there`.
     """
-    imag, size = seen.imag, jnp.log(jnp.abs(seen))
-    there, factor = real_at(seen)
+
+    low: Array  # [rad/s]
+    high: Array  # [rad/s]
+    at_low: Array  # what is zero in between: Im L, ln |L|, the slope of |1 + L|^2 by w
+    at_high: Array
+    there: Array  # bool
+    elsewhere: Array  # frequencies to look at besides [rad/s]: where L is nearest to -1, and both ends
+
+
+def brackets(w: Array, seen: Array) -> Brackets:
+    """The `Brackets` of an L [-] at frequencies w [rad/s], (points,) each."""
+    imag, size, near = seen.imag, jnp.log(jnp.abs(seen)), jnp.abs(1.0 + seen) ** 2
+    real, factor = real_at(seen)
     # one that lies a little to the other side may turn out to lie on this one
-    far = [jnp.where(there & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0)]
-    even, left = even_at(seen)
-    far.append(jnp.where(even, jnp.abs(left), jnp.inf))
-    near = jnp.abs(1.0 + seen) ** 2
-    least = jnp.append(jnp.inf, jnp.where((near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:]), near[1:-1], jnp.inf))
-    values, places = zip(*(_smallest(v) for v in (*far, least)), strict=True)
+    more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
+    even, phase = even_at(seen)
+    least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
+    nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
+    how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
+    values, places = zip(*map(_smallest, how_far), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
     slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
-    zero = [jnp.append(imag[j + e][: SPLIT[0]], size[j + e][SPLIT[0] :]) for e in (0, 1)]
-    begin = jnp.append(w[j], w[k - 1]), jnp.append(w[j + 1], w[k + 1])
-    off = jnp.append(zero[0], slope[k - 1]), jnp.append(zero[1], slope[k])
-    return (*begin, *off), jnp.isfinite(jnp.concatenate(values)), w[jnp.stack([jnp.argmin(near), 0, -1])]
+
+    def crossed(at: Array) -> Array:
+        return jnp.append(imag[at][: SPLIT[0]], size[at][SPLIT[0] :])
+
+    return Brackets(
+        low=jnp.append(w[j], w[k - 1]),
+        high=jnp.append(w[j + 1], w[k + 1]),
+        at_low=jnp.append(crossed(j), slope[k - 1]),
+        at_high=jnp.append(crossed(j + 1), slope[k]),
+        there=jnp.isfinite(jnp.concatenate(values)),
+        elsewhere=w[jnp.stack([jnp.argmin(near), 0, -1])],
+    )
 
 
 def _smallest(values: Array) -> tuple[Array, Array]:
     """The `NEAREST` least of them and their places, in order; several times as fast as to sort them all."""
-    found = []
+    least, places = [], []
     for _ in range(NEAREST):
         place = jnp.argmin(values)
-        found.append((values[place], place))
+        least.append(values[place])
+        places.append(place)
         values = jnp.where(jnp.arange(values.size) == place, jnp.inf, values)  # `at`: scattered under vmap, in vain
-    return jnp.stack([value for value, _ in found]), jnp.stack([place for _, place in found])
+    return jnp.stack(least), jnp.stack(places)
 
 
 def real_at(seen: Array) -> tuple[Array, Array]:
@@ -172,7 +192,7 @@ def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
 
 def ends_at(ends: Array) -> Array:
     """Whether L [-] is real at the ends of the grid too, bool: a pole comes to 1 there, or to -1."""
-    return jnp.abs(ends.imag) < 1e-2 * jnp.abs(ends.real)
+    return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)
 
 
 def straight(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:

@@ -63,9 +63,8 @@ def along(parts: Parts, log: Log) -> Floor:
     ticks, log = _lasting(parts, log)
     if not parts.clock.sampled or (parts.sensors is None and parts.walk_rate is None):
         return Floor(0.0, ticks.t_next, np.zeros_like(ticks.t_next))
-    delay = 0 if parts.actuators is None else parts.actuators.delay
-    seen = deviations(_model(parts, log, ticks), delay)
-    squares = np.sum(seen.reshape(len(seen), 3, -1) ** 2, axis=2)
+    sizes = deviations(_model(parts, log, ticks), parts.effective_actuators.delay)
+    squares = np.sum(sizes.reshape(len(sizes), 3, -1) ** 2, axis=2)
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
     total = float(_total(ticks.t, ticks.t_next, squares, criteria))
     return Floor(float(np.sqrt(total / float(parts.window))), ticks.t_next, np.sqrt(squares[:, 2]))
@@ -80,9 +79,11 @@ def pooled(floors: Iterable[Floor]) -> float | None:
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
     """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays."""
     ticks = jax.tree.map(np.asarray, _ticks(parts))
-    times, least = np.asarray(log.t), 1e-9 * float(np.max(ticks.t_next - ticks.t))
-    there, kept = ticks.t_next - ticks.t > least, np.append(np.diff(times) > least, True)
-    return jax.tree.map(lambda v: v[there], ticks), jax.tree.map(lambda v: np.asarray(v)[kept], log)
+    lengths = ticks.t_next - ticks.t
+    least = 1e-9 * float(np.max(lengths))
+    at_starts = np.append(np.diff(np.asarray(log.t)) > least, True)
+    lasting = jax.tree.map(lambda v: v[lengths > least], ticks)
+    return lasting, jax.tree.map(lambda v: np.asarray(v)[at_starts], log)
 
 
 @programs.jit
@@ -102,7 +103,7 @@ def deviations(model: Model, delay: int = 0) -> np.ndarray:
     Factors S of P = S S' are carried by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC 16(6), 1971):
     nothing is subtracted or inverted, so that noises of any sizes go together.
     """
-    found = np.zeros(model.output.shape[:2])
+    sizes = np.zeros(model.output.shape[:2])
     rows = np.broadcast_to(model.rows, (len(model.move), *model.rows.shape[-2:]))
     factor, largest = model.start, np.zeros(rows.shape[1])
     known = deque([(0, factor)], maxlen=delay + 1)  # period, and what the samples up to it say
@@ -119,9 +120,9 @@ def deviations(model: Model, delay: int = 0) -> np.ndarray:
         period, late = known[0]
         for j in range(period, k):
             late = moved(j, late)
-        found[k] = _sizes(model.output[k] @ np.hstack([late, model.kick[k]]))
+        sizes[k] = _sizes(model.output[k] @ np.hstack([late, model.kick[k]]))
         factor = moved(k, factor)
-    return found
+    return sizes
 
 
 def _triangular(factor: np.ndarray) -> np.ndarray:
@@ -146,40 +147,49 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     """What a run's samples say, and its error, of (the plant's local coordinates, the sensor's, the walk's torque)."""
     linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
     periods, n, m = linear.push.shape
-    clock: Any = parts.clock
-    exact = Reading(np.eye(n), np.zeros(n), np.ones(n, int), np.zeros(0), np.zeros(0))
-    said: Reading = exact if parts.sensors is None else parts.sensors.reading(float(clock.period))
-    size = n + said.own.size + m
+    reading = reading_of(parts.sensors, n, float(parts.period))
+    size = n + reading.own.size + m
     torque = slice(size - m, size)
 
     def wide(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[-1] - said.own.size  # what no sensor reads, the modes of a flexible body, comes after it
+        seen = rows.shape[-1] - reading.own.size  # what no sensor reads, the modes of a flexible body, comes after it
         rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
         return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
     # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
-    read = wide(said.rows)
-    off = np.hypot(said.noise, np.linalg.norm(read[:, n : n + said.own.size] * said.own, axis=1))
+    read = wide(reading.rows)
+    off = np.hypot(reading.noise, np.linalg.norm(read[:, n : n + reading.own.size] * reading.own, axis=1))
     unknown = UNKNOWN * np.max(np.abs(read[:, :n]) * off[:, None], axis=0)
-    start = np.diag(np.concatenate([unknown, said.own, np.zeros(m)]))
-    if said.start is not None:
-        rows, covariance = said.start
+    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(m)]))
+    if reading.start is not None:
+        rows, covariance = reading.start
         start = _corrected(start, wide(rows) @ start, root(covariance))
     lengths, sample = np.asarray(ticks.t_next - ticks.t), np.asarray(ticks.sample)
-    walk = np.zeros(m) if parts.walk_rate is None else np.asarray(parts.walk_rate)
-    drift = np.diag(np.concatenate([np.zeros(n), said.own_drift, walk]))[:, n:]
+    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts)]))[:, n:]
     move = np.tile(np.eye(size), (periods, 1, 1))
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.seen.shape[1], size))
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
     return Model(
         start=start,
-        rows=wide(said.rows_at(sample, np.append(0.0, lengths[:-1]))),
-        noise=np.where(said.available(sample), said.noise, np.inf),
+        rows=wide(reading.rows_at(sample, np.append(0.0, lengths[:-1]))),
+        noise=np.where(reading.available(sample), reading.noise, np.inf),
         kick=lengths[:, None, None] * drift,
         move=move,
         output=output,
     )
+
+
+def reading_of(sensors: Any, size: int, period: float) -> Reading:
+    """What sensors read of a state of this size, a sample each period [s]; where there are none, all of it, exactly."""
+    if sensors is None:
+        return Reading(np.eye(size), np.zeros(size), np.ones(size, int), np.zeros(0), np.zeros(0))
+    return sensors.reading(period)
+
+
+def walk_of(parts: Parts) -> np.ndarray:
+    """1 sigma of the random walk's change per second, (m,) [N m/s]; zero without one."""
+    return np.zeros(parts.plant.inputs) if parts.walk_rate is None else np.asarray(parts.walk_rate)
 
 
 def root(covariance: np.ndarray) -> np.ndarray:
@@ -204,8 +214,7 @@ class _Linear(NamedTuple):
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
-    actuators = parts.effective_actuators
-    law, plant = parts.controller, parts.plant
+    actuators, law, plant = parts.effective_actuators, parts.controller, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
     def acted(state: Any, now: tuple) -> tuple:

@@ -163,17 +163,17 @@ class _Local:
 
     def _rest(self, carry: Carry) -> Any:
         computer = carry.computer
-        kept = None if self._turned else _numbers(computer.sensors)
+        sensing = None if self._turned else _numbers(computer.sensors)
         own = _numbers(computer.law), computer.command_filter
-        return carry.acting, computer.observer, computer.applied, carry.model, kept, *own
+        return carry.acting, computer.observer, computer.applied, carry.model, sensing, *own
 
     def retract(self, z: Array) -> Carry:
         x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
         near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
-        acting, memory, applied, model, kept, law, filtered = near
+        acting, memory, applied, model, numbers, law, filtered = near
         inside = base.computer.sensors
-        inside = self._sensors.retract(inside, sensing) if self._turned else _with_numbers(inside, kept)
+        inside = self._sensors.retract(inside, sensing) if self._turned else _with_numbers(inside, numbers)
         law = _with_numbers(base.computer.law, law)
         computer = Computer(inside, self._model.retract(base.computer.seen, seen), memory, law, applied, filtered)
         return Carry(plant.retract(base.x, x), acting, computer, model)
@@ -195,9 +195,9 @@ def _numbers(memory: Any) -> list[Array]:
 
 def _with_numbers(memory: Any, numbers: list[Array]) -> Any:
     leaves, structure = jax.tree.flatten(memory)
-    given = iter(numbers)
-    new = [next(given) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
-    return jax.tree.unflatten(structure, new)
+    new = iter(numbers)
+    leaves = [next(new) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
+    return jax.tree.unflatten(structure, leaves)
 
 
 class Opened(NamedTuple):
@@ -339,23 +339,23 @@ def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
     pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # of the commands of so many periods ago
     if part > 0.0:
         pushes[whole:] = acting(loop, part, xp)
-    kept = (len(pushes) - 1) * m  # states that hold commands on their way, the newest first
+    waiting = (len(pushes) - 1) * m  # states that hold commands on their way, the newest first
     coming = xp.concatenate([a, *pushes[1:]], axis=1)
-    moving = xp.concatenate([xp.zeros((kept, n)), xp.eye(kept, k=-m)], axis=1)
-    b = xp.concatenate([pushes[0], xp.eye(kept, m)])
-    return Opening(xp.concatenate([coming, moving]), b, xp.pad(command, ((0, 0), (0, kept))))
+    moving = xp.concatenate([xp.zeros((waiting, n)), xp.eye(waiting, k=-m)], axis=1)
+    b = xp.concatenate([pushes[0], xp.eye(waiting, m)])
+    return Opening(xp.concatenate([coming, moving]), b, xp.pad(command, ((0, 0), (0, waiting))))
 
 
 def at_sensors(loop: Loop) -> Opening:
     """The loop opened at the sensors, B (n, k): the state that follows, in rad and rad/s, of what they see."""
     (n, k), (m, _) = loop.seen.shape, loop.command.shape
-    push, kept = loop.new[0], loop.delay * m
-    if not kept:
+    push, waiting = loop.new[0], loop.delay * m
+    if not waiting:
         return Opening(loop.a + push @ loop.command, loop.seen + push @ loop.direct, jnp.eye(k, n))
-    full = jnp.zeros((n + kept,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(push)
-    full = full.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + kept - m].set(jnp.eye(kept - m))
-    b = jnp.zeros((n + kept, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
-    return Opening(full, b, jnp.eye(k, n + kept))
+    full = jnp.zeros((n + waiting,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(push)
+    full = full.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + waiting - m].set(jnp.eye(waiting - m))
+    b = jnp.zeros((n + waiting, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
+    return Opening(full, b, jnp.eye(k, n + waiting))
 
 
 def delayed_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Complex[Array, "m m"]:

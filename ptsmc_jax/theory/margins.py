@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.theory import crossings, linear
-from ptsmc_jax.theory.crossings import MOST, SPLIT, Triangles
+from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
 Scalar = Float[Array, ""]
@@ -101,10 +101,10 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     NaN where the loop has a number that is not finite; with_delay: of delay too, else it is NaN.
     """
     spectrum = _spectrum(loop, sensors)
-    begin, there, elsewhere = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
-    root = jax.lax.stop_gradient(_closed_in(spectrum, begin, there))
-    L, slope = spectrum.at(jnp.append(root, elsewhere, axis=1), sloped=True)
-    values = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, there, spectrum.stable)
+    brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
+    root = jax.lax.stop_gradient(_closed_in(spectrum, brackets))
+    L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
+    values = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, brackets.there, spectrum.stable)
     axes = jnp.arange(root.shape[0])
     delay = jnp.full(axes.size, jnp.nan)
     if with_delay and not sensors:
@@ -118,8 +118,8 @@ def _crossed(L: Array) -> Array:
     return jnp.append(L[..., : SPLIT[0]].imag, jnp.log(jnp.abs(L[..., SPLIT[0] : SPLIT[1]])), axis=-1)
 
 
-def _closed_in(spectrum: _Spectrum, begin: tuple[Array, Array, Array, Array], there: Array) -> Array:
-    """Frequencies (m, places) [rad/s] of all crossings of all axes, from `crossings.brackets`.
+def _closed_in(spectrum: _Spectrum, brackets: Brackets) -> Array:
+    """Frequencies (m, places) [rad/s] of all crossings of all axes.
 
     By Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), until none moves by more than the step of Newton's
     that follows makes good.
@@ -132,15 +132,15 @@ def _closed_in(spectrum: _Spectrum, begin: tuple[Array, Array, Array, Array], th
         L, slope = spectrum.at(c, sloped=False)
         f_c = jnp.append(_crossed(L), (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :], axis=1)
         between = f_c * f_b < 0.0
-        moves = jnp.any(there & (jnp.abs(c - b) > 1e-9 * b))
+        moves = jnp.any(brackets.there & (jnp.abs(c - b) > 1e-9 * b))
         return k + 1, (jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c), moves
 
     def goes_on(state: tuple[Array, tuple, Array]) -> Array:
         return (state[0] < 10) & state[2]
 
-    first = (jnp.zeros((), int), begin, jnp.ones((), bool))
+    first = (jnp.zeros((), int), tuple(brackets[:4]), jnp.ones((), bool))
     root = jax.lax.while_loop(goes_on, closer, jax.lax.stop_gradient(first))[1][1]
-    return jnp.where(jnp.isfinite(root), root, begin[1])
+    return jnp.where(jnp.isfinite(root), root, brackets.high)
 
 
 def roughly(loop: Loop) -> dict[str, Array]:
@@ -174,7 +174,8 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
     real = jnp.append(real.real, ends.real)
     factor = -20.0 * jnp.log10(jnp.where(on & (real < 0.0), -real, 1.0))
     up, down = (jnp.min(jnp.where(side * factor > 0.0, side * factor, MOST)) for side in (1.0, -1.0))
-    angles = jnp.where(there[real.size - 2 : crosses], jnp.rad2deg(jnp.abs(jnp.angle(-even))), 180.0)
+    evens = slice(SPLIT[0], crosses)  # places where the size is 1
+    angles = jnp.where(there[evens], jnp.rad2deg(jnp.abs(jnp.angle(-even))), 180.0)
     nearest, worst = jnp.minimum(up, down), jnp.argmin(angles)
     return Margins(
         gain_up=jnp.where(stable, jnp.where(up < MOST, up, jnp.inf), -nearest),
@@ -183,7 +184,7 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
         delay=jnp.zeros_like(up),
         modulus=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # its slope by w is none: no step to take
         stable=stable,
-        crossover=jnp.where(there[real.size - 2 + worst], root[real.size - 2 + worst], jnp.nan),
+        crossover=jnp.where(there[evens][worst], root[evens][worst], jnp.nan),
     )
 
 

@@ -61,8 +61,8 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
     if seen is None:
         run = linear.nominal_jit(parts)
         seen = history(parts, run)
-    u, kept = map(np.asarray, seen)
-    last = np.flatnonzero(kept)
+    u, in_hold = map(np.asarray, seen)
+    last = np.flatnonzero(in_hold)
     last = last[last.size // 2 :]
     if 2 * last.size < FEWEST or not np.isfinite(u[last]).all():
         return None
@@ -88,10 +88,9 @@ def _reversals(values: np.ndarray, least: Any) -> np.ndarray:
 
 def _turns(values: np.ndarray, least: Any) -> np.ndarray:
     """Which of values (times, m) change their sign often enough, (m,)."""
-    asked = max(TURNS, values.shape[0] / SLOWEST)
     least = np.broadcast_to(least, values.shape[1])
-    found = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]
-    return np.asarray(found) >= asked
+    turns = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]
+    return np.asarray(turns) >= max(TURNS, values.shape[0] / SLOWEST)
 
 
 def _stays(u: np.ndarray) -> np.ndarray:
@@ -127,7 +126,7 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
 
 def none_left(margins: Any, rows: Any) -> Any:
     """The `Margins` of loops, (times, m), with none left in these rows (times,) where they are not negative anyway."""
-    found = jax.tree.map(np.asarray, margins)
-    lost = np.asarray(rows)[:, None] & found.stable
-    left = dict.fromkeys(found._fields, 0.0) | {"modulus": MOST, "stable": False, "crossover": np.nan}
-    return found._replace(**{name: np.where(lost, left[name], getattr(found, name)) for name in found._fields})
+    values = jax.tree.map(np.asarray, margins)
+    lost = np.asarray(rows)[:, None] & values.stable
+    none = dict.fromkeys(values._fields, 0.0) | {"modulus": MOST, "stable": False, "crossover": np.nan}
+    return values._replace(**{name: np.where(lost, none[name], getattr(values, name)) for name in values._fields})

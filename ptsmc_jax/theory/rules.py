@@ -11,10 +11,17 @@ Scalar = Float[Array, ""]
 def first_torque(
     inertia: Float[Array, "3 3"], q: Float[Array, "4"], eta: Scalar, t_f: Scalar, q_f: Float[Array, "4"] | None = None
 ) -> Float[Array, "3"]:
-    """Torque at t = 0 [N m] from rest to a fixed reference (None: identity), d_hat(0) = 0.
+    """Torque at t = 0 (3,) [N m] from rest to a fixed reference, d_hat(0) = 0.
 
     -2 eta^2 J T(q)^-1 (q_1 - q_1f) / t_f^2; for the identity -2 eta^2 J v / (q4 t_f^2), so a rotation by theta about n
-    takes 2 eta^2 |(J n)_i| tan(theta/2) / t_f^2 about axis i: it grows like 1/q4. inertia [kg m^2], t_f [s].
+    takes 2 eta^2 |(J n)_i| tan(theta/2) / t_f^2 about axis i: it grows like 1/q4.
+
+    Args:
+        inertia: J, (3, 3) [kg m^2].
+        q: initial attitude (4,), scalar last [-].
+        eta: exponent of the law [-].
+        t_f: the prescribed time [s].
+        q_f: the reference (4,) [-]; None: the identity.
     """
     error = q[:3] if q_f is None else q[:3] - q_f[:3]
     return -2.0 * eta**2 * (inertia @ attitude.t_inverse_times(q, error)) / t_f**2
@@ -45,7 +52,8 @@ def shortest_time(
 ) -> Scalar:
     """Shortest t_f [s] that keeps the torque below limit [N m], from rest to a fixed reference, disturbance small.
 
-    eta sqrt(2 max_i |(J n)_i| tan(theta/2) / limit) sqrt(max(1, R(eta))), with R of `later_peak_ratio`.
+    eta sqrt(2 max_i |(J n)_i| tan(theta/2) / limit) sqrt(max(1, R(eta))), with R of `later_peak_ratio`. Arguments as
+    `first_torque` has them.
 
     A turn by 90 degrees about the axis of 14 kg m^2 with 0.5 N m takes 3 sqrt(2 14 tan(45 deg) / 0.5) = 22.4 s:
 
@@ -72,7 +80,14 @@ def hold_floor(
 ) -> Scalar:
     """What an axis holds after the hand-over [-], about: |d'| / (l c (K1 + |T J^-1| K2 / width)).
 
-    The estimate of a ramp lags by J d' / l, which s = c eps holds off. disturbance_rate: |d'| [N m/s]; gain: l [N m s];
-    switching: |T J^-1| K2 [1/s^2]; width: of the smooth sign [1/s]; surface_rate: c [1/s].
+    The estimate of a ramp lags by J d' / l, which s = c eps holds off.
+
+    Args:
+        disturbance_rate: |d'| [N m/s].
+        gain: l of the observer [N m s].
+        k1: K1 [1/s].
+        switching: |T J^-1| K2 [1/s^2].
+        width: of the smooth sign [1/s].
+        surface_rate: c [1/s].
     """
     return disturbance_rate / (gain * surface_rate * (k1 + switching / width))

@@ -41,8 +41,8 @@ class Course(NamedTuple):
 
     def worst(self) -> dict[str, float]:
         """`catalogues.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
-        kept = jax.tree.map(lambda v: v[self.judged], self.at_input)
-        return {name: float(v) for name, v in kept.worst().items()}
+        where_judged = jax.tree.map(lambda v: v[self.judged], self.at_input)
+        return {name: float(v) for name, v in where_judged.worst().items()}
 
 
 def judged_times(parts: Parts) -> Float[Array, " times"]:
@@ -79,7 +79,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
 _moments = programs.jit(moments)
 
 
-class Found(NamedTuple):
+class TimedMargins(NamedTuple):
     """Margins at times of a nominal run, the last of them in hold."""
 
     t: np.ndarray  # (times,) [s]
@@ -88,13 +88,13 @@ class Found(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None = None) -> Found:
-    """Margins of sampled parts at these times to go [s], (times,), and in hold."""
+def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None = None) -> TimedMargins:
+    """Margins of sampled parts at these times to go [s], (times,), and in hold; flown: their nominal run, if known."""
     run: linear.Nominal = linear.nominal_jit(parts) if flown is None else flown
     indices = np.asarray(_moments(parts, run, left))
     loops = linear.loops_in(parts, run, indices)
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
-    return Found(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, margins.of_each(loops)))
+    return TimedMargins(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, margins.of_each(loops)))
 
 
 def judged_loops(parts: Parts, flown: linear.Nominal | None = None) -> tuple[Loop, Array]:
@@ -120,12 +120,12 @@ def along(parts: Parts, times: int = 24) -> Course:
     None is left in hold where the run does not come to rest, see `rest`.
     """
     judged, run = judged_times(parts), linear.nominal_jit(parts)
-    period = float(parts.period)
-    at_times = at(parts, jnp.append(judged, jnp.geomspace(period, float(parts.controller.t_f), times)), run)
-    places = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
-    order = np.asarray([k for _, k in sorted(places.items())] + [len(at_times.t) - 1])
+    besides = jnp.geomspace(float(parts.period), float(parts.controller.t_f), times)
+    at_times = at(parts, jnp.append(judged, besides), run)
+    first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
+    order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
     t, _, loops, at_input = jax.tree.map(lambda v: v[order], at_times)
-    count = (order < judged.size) | (order == order[-1])
+    counts = (order < judged.size) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
     at_sensors = margins.of_each(last, sensors=True)
     swing = rest.swing(parts, history(parts, run))
@@ -134,7 +134,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     else:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
-    return Course(t, count, loops, at_input, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
+    return Course(t, counts, loops, at_input, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -30,7 +30,7 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
 def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap():
     at = np.geomspace(1e-6, 0.1, 4)
     over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
-    figure = study_plots.profiles({"sign_width": ("-", at, at, over, nearest, 1e-3)}, "goal")
+    figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "goal")
     (axes,) = figure.axes
     drawn = {line.get_label(): np.asarray(line.get_xdata()).tolist() for line in axes.lines}
     assert drawn["limits kept"] == [at[1]]
@@ -56,7 +56,7 @@ def test_a_limit_far_above_what_is_drawn_is_said_and_does_not_flatten_it(limit, 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_every_grid_that_has_numbers_has_its_map(count):
     grids = {name: GRID if k < count else np.full((2, 2), np.nan) for k, name in enumerate(NAMES)}
-    axis = ("delta [s]", [1.0, 2.0], False)
+    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
     figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), {})
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == count

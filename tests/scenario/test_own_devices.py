@@ -142,7 +142,7 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     assert run.run.floor is None
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (status, error) == (0, "")
-    made = store.made(here / "out" / "simulate-s")
+    made = store.read_versions(here / "out" / "simulate-s")
     assert made["sensors_sha256"] == systems.digest("mine.py:Tilted")
     again = command("simulate", "out/simulate-s/scenario.toml", "--quiet", "--out", "new")
     assert again[0] == 2

@@ -220,7 +220,7 @@ def test_a_run_says_which_program_it_was_made_with(command, tmp_path):
     (tmp_path / "my.py").write_text(PROGRAM)
     (tmp_path / "mine.toml").write_text(SCENARIO)
     assert command("simulate", "mine.toml", "--out", "run", "--quiet", "--no-figures")[0] == 0
-    assert store.made(tmp_path / "run")["system_sha256"] == systems.digest(f"{tmp_path}/my.py:mine")
+    assert store.read_versions(tmp_path / "run")["system_sha256"] == systems.digest(f"{tmp_path}/my.py:mine")
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch, quantile, co
     some = objective.problem(
         parts, SPREAD, seed, np.arange(8), limits.names, wanted, may_break=(allowed,), banded=(banded,)
     )
-    found = optimise.search(Evaluator(limits), some, wanted, np.array([3.0, 0.5]), 2, 20, 1)
+    found = optimise.search(Evaluator(limits), some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 20, 1))
     (last,) = found.counts
     assert last.held
     assert banded or found.rounds >= 1  # the first gains found were not confirmed

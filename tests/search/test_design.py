@@ -65,8 +65,8 @@ def test_a_limit_below_the_disturbance_cannot_be_kept():
 
 def test_the_sentence_says_what_simulation_found():
     said = "the tuned gains keep peak_torque below 0.5 from t_f = 20.12 s on by theory"
-    assert design.text(0.5, 20.1234, 20.5) == f"{said}, 20.5 s as flown"
-    assert design.text(0.5, 20.1234, None) == f"{said}; none was found by simulation"
+    assert str(design.ShortestTime(0.5, 20.1234, 20.5, 1)) == f"{said}, 20.5 s as flown"
+    assert str(design.ShortestTime(0.5, 20.1234, None, 1)) == f"{said}; none was found by simulation"
 
 
 def test_shortest_time_of_a_chain():

@@ -138,7 +138,8 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     nothing = variation.Dispersion()
     some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
-    found = optimise.search(evaluate, some, [Requirement("peak_torque", 0.6)], np.array([3.0, 0.5]), 4, 40, 1)
+    settings = optimise.Settings(4, 40, 1)
+    found = optimise.search(evaluate, some, [Requirement("peak_torque", 0.6)], np.array([3.0, 0.5]), settings)
     checked = global_check.check(evaluate, found, 0)
     assert abs(checked.distance) < 1e-3
     np.testing.assert_allclose(np.log(found.value / checked.value), checked.distance, atol=1e-12)

@@ -1,6 +1,7 @@
 """Gradients of the noisy loss, bounds, the search and what is handed over."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -199,7 +200,7 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
     largest = {}
     for tail in (None, 1):
         some = replace(problem(), tail=tail)
-        found = optimise.search(Evaluator(limits), some, (), np.array([3.0, 0.5]), 2, 25, 1)
+        found = optimise.search(Evaluator(limits), some, (), np.array([3.0, 0.5]), optimise.Settings(2, 25, 1))
         f, _, _ = measure(replace(some, tail=1), jnp.asarray(found.gains))
         largest[tail] = float(np.exp(f))
     assert largest[1] <= largest[None] * (1 + 1e-6)
@@ -267,7 +268,12 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     seen = []
     evaluate = Evaluator(limits)
     found = optimise.search(
-        evaluate, some, wanted, np.array([3.0, 0.5]), 3, 40, 1, report=lambda *told: seen.append(told)
+        evaluate,
+        some,
+        wanted,
+        np.array([3.0, 0.5]),
+        optimise.Settings(3, 40, 1),
+        report=lambda *told: seen.append(told),
     )
     assert found.worst[0] <= 1.0
     assert [step.start for step in found.history] == sorted(step.start for step in found.history)
@@ -372,7 +378,8 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
     for sloped, evaluate in evaluates.items():
-        found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), 3, 40, 1, sloped=sloped)
+        settings = optimise.Settings(3, 40, 1, sloped=sloped)
+        found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), settings)
     assert evaluates[False].gradients == 0
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
 
@@ -394,11 +401,11 @@ THREE = shares.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0
 def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
     ends, counts = [], []
     for parts_of_it in ((7, 30), (30,)):
-        evaluate, seen, first = Valley(THREE), {}, np.array([0.9, 0.1, 0.5])
-        best, kept = descent.Best(first, 0, 0.0), []
+        evaluate, start = Valley(THREE), descent.Start(np.array([0.9, 0.1, 0.5]))
+        best, kept = descent.Best(start.share, 0, 0.0), []
         for steps in parts_of_it:
             kept.clear()
-            descent.descend(evaluate.slopes, problem(), best, first, steps, kept.append, seen=seen)
+            descent.descend(partial(evaluate.slopes, problem()), best, start, steps, kept.append)
         ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
         counts.append(evaluate.gradients)
     assert ends[0] == ends[1]
@@ -442,8 +449,9 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
 
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
     for steps, near in ((3, 1.0), (40, 1e-4)):
-        evaluate, best, path = Bowl(limits), descent.Best(np.array([0.9, 0.1]), 0, 0.0), []
-        descent.descend(evaluate.slopes, problem(), best, np.array([0.9, 0.1]), steps, path.append, close=1e-12)
+        start = descent.Start(np.array([0.9, 0.1]))
+        evaluate, best, path = Bowl(limits), descent.Best(start.share, 0, 0.0), []
+        descent.descend(partial(evaluate.slopes, problem()), best, start, steps, path.append, close=1e-12)
         assert evaluate.gradients <= steps
         assert best.f < near
         assert len(path) <= evaluate.gradients
@@ -492,7 +500,7 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(monkeypatch
     wanted = [Requirement("peak_torque", limit)]
     some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
     evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
-    found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), 2, 20, 0)
+    found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), optimise.Settings(2, 20, 0))
     expected = eta * np.sqrt(2 * 14.0 * np.tan(theta / 2) / limit)
     # it keeps SURE_MARGIN of the limit, which costs half as much of t_f
     np.testing.assert_allclose(found.gains[0], expected * (1 + rounds.SURE_MARGIN / 2), rtol=2e-4)

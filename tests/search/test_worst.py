@@ -158,7 +158,7 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case():
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     eta = np.sqrt(1.9 / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
     robust, plain = (
-        optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 2, 20, 0, robust=robust)
+        optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), optimise.Settings(2, 20, 0, robust=robust))
         for robust in (True, False)
     )
     assert robust.hardest is not None
@@ -176,7 +176,8 @@ def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     wanted = [replace(one, quantile=0.9) for one in wanted]
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
-    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), 1, 1, 0, robust=True)
+    settings = optimise.Settings(1, 1, 0, robust=True)
+    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), settings)
     assert found.margin == rounds.MARGIN
 
 

@@ -11,6 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
+from tuning.errors import UsageError
 from tuning.studies import mapping
 
 SHORT = """
@@ -34,7 +35,7 @@ def asked(x, y, text=SHORT):
 
 def flown(x, y, text=SHORT, trials=6):
     loaded, across, up = asked(x, y, text)
-    return loaded, across, up, mapping.fly(loaded, across, up, 3, trials, lambda done, total: None)
+    return loaded, across, up, mapping.fly(loaded, across, up, 3, trials, lambda done, total: None).cells
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_axes(text, values):
              "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3"]
 )  # fmt: skip
 def test_bad_axes_are_refused_in_a_sentence(text):
-    with pytest.raises(mapping.AxisError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
+    with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
         mapping.axis(text, "--y")
 
 
@@ -120,7 +121,7 @@ def test_a_map_on_which_everything_fails_is_written(tmp_path):
     text = SHORT.replace("min_deg = 20.0, max_deg = 60.0", "min_deg = 180.0, max_deg = 180.0")
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text, trials=2)
     assert all(c.failures == 2 for c in cells)
-    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
+    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)
     assert (tmp_path / "map.csv").exists()
 
 
@@ -130,7 +131,7 @@ def test_a_map_of_nothing_but_zeros_is_written(tmp_path):
     perfect += "disturbance.kind = 'none'\nloop = { mode = 'sampled', period = 0.1 }"
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", perfect, trials=1)
     assert all(c.window_error == 0.0 for c in cells)
-    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)  # nothing but zeros to colour
+    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)  # nothing but zeros to colour
 
 
 def test_a_period_is_mapped_in_the_sampled_loop_only():
@@ -159,7 +160,7 @@ def test_borders_are_drawn_over_period_and_delta_only():
 
 def test_folder_holds_the_map(mapped, tmp_path):
     loaded, x, y, cells = mapped
-    mapping.write(tmp_path, loaded, x, y, cells, 3, figures=True)
+    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)
     with (tmp_path / "map.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["loop.period"]) for row in rows] == [c.x for c in cells]
@@ -192,8 +193,9 @@ def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_u
     radii = np.array([cell.hold_radius for cell in cells]).reshape(2, 3)
     assert np.all(radii[:, 0] < 1.0 + 1e-6)  # a slow mode is damped
     assert np.all(radii[:, -1] > 1.0 + 1e-3)  # one that the loop is late for is driven
-    across, _ = mapping.spillover(loaded, x, y, cells)["the same in hold"]
+    across, _ = mapping.spillover(mapping.Map(loaded, x, y, cells))["the same in hold"]
     after = np.flatnonzero(radii[0] > 1.0 + 1e-6)[0]
     assert np.all((across[np.isfinite(across)] > x.values[0]) & (across[np.isfinite(across)] < x.values[-1]))
     assert x.values[after - 1] < np.nanmin(across) < x.values[after]
-    assert mapping.spillover(asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")[0], x, y, cells) == {}
+    rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
+    assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}

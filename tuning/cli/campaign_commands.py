@@ -2,10 +2,9 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -25,6 +24,10 @@ from tuning.cli.options import (
 )
 from tuning.errors import UsageError
 from tuning.output import campaign_terminal, terminal
+
+if TYPE_CHECKING:
+    from ptsmc_jax.campaigns.cluster import Cluster
+    from tuning.studies.campaign_folder import Folder
 
 CAMPAIGN_SEED = 1000  # not that of a search: a proof does without the trials that gains were tuned on
 MOST = 2**32  # trials: their numbers have 32 bits
@@ -93,8 +96,8 @@ def montecarlo(
     input or a full disk, 130 interrupted.
     """
     share = _shard(shard)
-    given = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
-    tls = {name: str(path) for name, path in given.items() if path is not None}
+    tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
+    tls = {name: str(path) for name, path in tls_files.items() if path is not None}
     confident, clustered, a_part = until_confident is not None, cluster is not None, share != (1, 1) or dry_run
     for refused, sentence in (
         (tls and not clustered, "--tls-ca, --tls-cert and --tls-key go with --cluster only"),
@@ -147,19 +150,22 @@ def montecarlo(
     return _summarised(folder, quiet, figures)
 
 
-@contextlib.contextmanager
-def _elsewhere(cluster: str | None, tls: dict[str, str]) -> Iterator[Any]:
+def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
     """What flies parts on a cluster, which is left at the end; None: they are flown here."""
     if cluster is None:
-        yield None
-        return
+        return contextlib.nullcontext()
     from ptsmc_jax.campaigns import cluster as clusters
 
-    with contextlib.closing(clusters.connected(cluster, tls)) as connected:
-        yield connected
+    return contextlib.closing(clusters.connected(cluster, tls))
 
 
-def _flown(folder: Any, share: tuple[int, int], report: Any, elsewhere: Any, width: float | None) -> Any:
+def _flown(
+    folder: "Folder",
+    share: tuple[int, int],
+    report: campaign_terminal.Progress,
+    elsewhere: "Cluster | None",
+    width: float | None,
+) -> "Folder":
     """The campaign flown, its share of it; width: until every requirement's share is known to within it."""
     from tuning.studies import campaign_folder
 
@@ -217,14 +223,14 @@ def worst(
     opened = campaign_folder.opened(folder)
     frame = campaign_summary.worst(opened, by, n)
     store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
-    told = []
+    inputs = []
     if why:
-        asked = [one.metric for one in scenarios.requirements(opened.scenario)]
-        told = campaign_summary.why(opened, list(dict.fromkeys((by, *asked))), n)
-        store.write_csv(folder / "why.csv", list(told[0]) if told else [], [list(one.values()) for one in told])
+        required = [requirement.metric for requirement in scenarios.requirements(opened.scenario)]
+        inputs = campaign_summary.why(opened, list(dict.fromkeys((by, *required))), n)
+        store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
         campaign_terminal.worst(frame, by, folder, opened.scenario.plant.kind, own_code=bool(opened.programs))
-        campaign_terminal.why(told)
+        campaign_terminal.why(inputs)
     return 0
 
 
@@ -255,12 +261,12 @@ def replay(
     store.check(place, force or out is None)  # a replay of the same trial is the same
     own_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
-    found = campaign_summary.replay(opened, trial)
-    store.write(place, lambda making: single.write(making, opened.scenario, found.run, opened.seed, trial, figures))
+    again = campaign_summary.replay(opened, trial)
+    store.write(place, lambda making: single.write(making, opened.scenario, again.run, opened.seed, trial, figures))
     if not quiet:
-        terminal.run(single.summary(found.run, opened.scenario), opened.scenario.plant.kind, place)
-        campaign_terminal.replayed(found.off, found.rounding, campaign_summary.SAME)
-    return 0 if found.off is None or found.off <= campaign_summary.SAME else 1
+        terminal.run(single.summary(again.run, opened.scenario), opened.scenario.plant.kind, place)
+        campaign_terminal.replayed(again.off, again.rounding, campaign_summary.SAME)
+    return 0 if again.off is None or again.off <= campaign_summary.SAME else 1
 
 
 def _configured(folder: Path) -> None:
@@ -268,17 +274,17 @@ def _configured(folder: Path) -> None:
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.configure import configure
 
-    configure(keep_programs=True, device="cpu", bits=32 if store.made(folder).get("precision") == 32 else 64)
+    configure(keep_programs=True, device="cpu", bits=32 if store.read_versions(folder).get("precision") == 32 else 64)
 
 
-def _summarised(folder, quiet: bool, figures: bool) -> int:
+def _summarised(folder: "Folder", quiet: bool, figures: bool) -> int:
     from tuning.studies import campaign_summary
 
-    found = campaign_summary.summarise(folder)
-    campaign_summary.write_summary(folder, found, figures)
+    summary = campaign_summary.summarise(folder)
+    campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
-        campaign_terminal.campaign(found, folder.path)
-    return 0 if found["status"] == "met" else 1
+        campaign_terminal.campaign(summary, folder.path)
+    return 0 if summary["status"] == "met" else 1
 
 
 def _shard(value: str) -> tuple[int, int]:

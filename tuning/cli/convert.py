@@ -13,31 +13,31 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from tuning.errors import UsageError
 
-SEQUENCE = "ZYX"
-DIGITS = 12
+SEQUENCE = "ZYX"  # of Euler angles, where none is given
+DIGITS = 12  # that are printed: more would be rounding of the conversion
 
 
-def quaternion(given: Mapping[str, str | None]) -> np.ndarray:
+def quaternion(texts: Mapping[str, str | None]) -> np.ndarray:
     """Unit quaternion (4,), scalar last, of the one attitude key that is given as text; numbers by commas or spaces.
 
     A `sequence` may stand beside euler_deg. Raises UsageError, naming the option.
     """
-    keys = [key for key in ATTITUDE_KEYS if given.get(key) is not None]
+    keys = [key for key in ATTITUDE_KEYS if texts.get(key) is not None]
     options = [_option(key) for key in ATTITUDE_KEYS]
     if len(keys) != 1:
-        said = f"{' and '.join(map(_option, keys))} are given" if keys else "no attitude is given"
-        raise UsageError(f"{said}, but must be exactly one of {', '.join(options)}")
+        wrong = f"{' and '.join(map(_option, keys))} are given" if keys else "no attitude is given"
+        raise UsageError(f"{wrong}, but must be exactly one of {', '.join(options)}")
     (key,) = keys
-    values = _numbers(key, str(given[key]))
+    values = _numbers(key, str(texts[key]))
     rows = key == "dcm_body_to_inertial" and len(values) == 9
     raw: dict[str, object] = {key: [values[k : k + 3] for k in (0, 3, 6)] if rows else values}
     if key == "euler_deg":
-        raw["sequence"] = given.get("sequence") or SEQUENCE
+        raw["sequence"] = texts.get("sequence") or SEQUENCE
     try:
         scenario = typing.cast(SpacecraftScenario, parsing.parse({"initial": raw}))
         return attitude_keys.quaternion(scenario.initial, "initial")
     except ScenarioError as error:
-        raise UsageError(re.sub(r"initial\.(\w+)", lambda found: _option(found[1]), str(error))) from None
+        raise UsageError(re.sub(r"initial\.(\w+)", lambda match: _option(match[1]), str(error))) from None
 
 
 def lines(q: np.ndarray, sequence: str | None = None) -> list[str]:

@@ -39,17 +39,15 @@ def export(
 
     Exit status: 0 done, 2 bad input, or something in it that C cannot say.
     """
-    loaded, folder = prepare(scenario, "export", out, trust=trust)
+    loaded, folder = prepare(scenario, "export", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
-
-    store.check(folder, force)
     from ptsmc_jax.onboard import folder as controllers
     from ptsmc_jax.onboard import templates
 
-    made = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
-    store.write(folder, lambda making: controllers.write(making, made, seed, trials))
+    controller = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
+    store.write(folder, lambda making: controllers.write(making, controller, seed, trials))
     if not quiet:
-        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(made.code.counts).items() if n)
+        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
         terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")
     return 0
 

@@ -26,8 +26,8 @@ from tuning.cli.options import (
     Seed,
     Times,
     Trust,
-    against_of,
     prepare,
+    times_against,
     whole_number,
 )
 from tuning.errors import UsageError
@@ -64,21 +64,19 @@ def simulate(
 
     Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
     """
-    loaded, folder = prepare(scenario, "simulate", out, trust=trust)
-    from ptsmc_jax.campaigns import store
-
-    store.check(folder, force)
-    from ptsmc_jax.campaigns import runs
+    loaded, folder = prepare(scenario, "simulate", out, trust=trust, force=force)
+    from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
     from tuning.studies import single
 
     computer = None if controller is None else flight_commands.Compiled(controller)
     loaded = loaded if computer is None else computer.flown(loaded)
     ready = study(loaded, drawn=trial is not None)
-    if timing.steps(ready.parts) > LONG and not quiet:
-        terminal.say(f"flying {timing.steps(ready.parts)} integration steps, with their history")
-    run, said = (runs.fly(ready, seed, trial), {}) if computer is None else computer.fly(ready, seed, trial)
-    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, **said))
+    steps = timing.steps(ready.parts)
+    if steps > LONG and not quiet:
+        terminal.say(f"flying {steps} integration steps, with their history")
+    run, decided_by = (runs.fly(ready, seed, trial), {}) if computer is None else computer.fly(ready, seed, trial)
+    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, **decided_by))
     if not quiet:
         terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
     return 0 if run.met else 1
@@ -101,11 +99,11 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
 
     with terminal.Progress(quiet) as report:
         report("flying the paper's figures", 0, 0)
-        made = reproduction.reproduce()
-    store.write(folder, lambda making: reproduction.write(making, made, figures))
+        reproduced = reproduction.reproduce()
+    store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
     if not quiet:
-        terminal.reproduction(reproduction.summary(made), folder)
-    return 0 if made.ok else 1
+        terminal.reproduction(reproduction.summary(reproduced), folder)
+    return 0 if reproduced.ok else 1
 
 
 @app.command(name="map")
@@ -130,23 +128,18 @@ def map_(
 
     Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
     """
-    loaded, folder = prepare(scenario, "map", out, device, trust=trust)
+    loaded, folder = prepare(scenario, "map", out, device, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
-
-    store.check(folder, force)
     from tuning.studies import mapping
 
-    try:
-        across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
-    except mapping.AxisError as error:
-        raise UsageError(str(error)) from None
+    across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
     if across.key == up.key:
         raise UsageError(f"--y is {y}, but must be another key than --x")
     with terminal.Progress(quiet) as report:
-        cells = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
-    store.write(folder, lambda making: mapping.write(making, loaded, across, up, cells, seed, figures))
+        flown = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
+    store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
     if not quiet:
-        terminal.grid(cells, (across.key, up.key), folder)
+        terminal.grid(flown.cells, (across.key, up.key), folder)
     return 0
 
 
@@ -165,20 +158,18 @@ def margins(
 
     Exit status: 0 done and stable in hold, 1 done but not stable, 2 bad input.
     """
-    loaded, folder = prepare(scenario, "margins", out, trust=trust)
+    loaded, folder = prepare(scenario, "margins", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
-
-    store.check(folder, force)
     from tuning.studies import stability
 
     with terminal.Progress(quiet) as report:
         report("linearising the loop", 0, 0)
         ready, course = stability.find(loaded)
     store.write(folder, lambda making: stability.write(making, ready, course, figures))
-    found = stability.summary(ready, course)
+    summary = stability.summary(ready, course)
     if not quiet:
-        terminal.margins(found, folder)
-    return 0 if found["stable"] else 1
+        terminal.margins(summary, folder)
+    return 0 if summary["stable"] else 1
 
 
 @app.command
@@ -208,15 +199,16 @@ def tune(
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
-    goal = tuner.GOALS[loaded.search.objective]
     known_by = tune_files.identity(loaded, seed, globally=global_check)
-    return searches.run(
-        loaded, folder, known_by, force, quiet, goal,
+    search = searches.LongSearch(
+        known_by,
+        tuner.GOALS[loaded.search.objective],
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
-        write=lambda making, found: tune_files.write(making, loaded, found, figures, known_by),
+        write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
         summary=tune_files.summary,
-        shown=terminal.tuning,
-    )  # fmt: skip
+        show=terminal.tuning,
+    )
+    return searches.run(search, loaded, folder, force=force, quiet=quiet)
 
 
 @app.command
@@ -242,18 +234,22 @@ def pareto(
     Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
     interrupted.
     """
-    chosen = against_of(against, times, points)
+    chosen_times = times_against(against, times, points)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
     from tuning.studies import fronts
 
     loaded = searches.with_tune(loaded)
-    front = fronts.KINDS[against](loaded, seed, points or 20, chosen)
-    return searches.run(
-        loaded, folder, front.known_by, force, quiet, "window error", work=front.trace,
-        write=lambda making, found: front.write(making, found, figures),
-        summary=front.summary,
-        shown=terminal.front,
-    )  # fmt: skip
+    study, asked = fronts.study_of(against, loaded, points, chosen_times)
+    known_by = study.identity(loaded, seed, asked)
+    search = searches.LongSearch(
+        known_by,
+        "window error",
+        work=lambda report, journal: study.trace(loaded, seed, asked, report, journal),
+        write=lambda making, traced: study.write(making, loaded, traced, figures, known_by),
+        summary=lambda traced: study.summary(traced, loaded),
+        show=terminal.front,
+    )
+    return searches.run(search, loaded, folder, force=force, quiet=quiet)
 
 
 @app.command
@@ -287,15 +283,16 @@ def compare(
     loaded = searches.with_tune(loaded)
     posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals)
-    return searches.run(
-        loaded, folder, known_by, force, quiet,
+    search = searches.LongSearch(
+        known_by,
         comparing.tuner.GOALS[loaded.search.objective],
-        check=posed,
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
-        write=lambda making, found: comparing.write(making, loaded, found, figures, known_by),
+        write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
         summary=comparing.summary,
-        shown=terminal.comparison,
-    )  # fmt: skip
+        show=terminal.comparison,
+        check=posed,
+    )
+    return searches.run(search, loaded, folder, force=force, quiet=quiet)
 
 
 @app.command

@@ -15,7 +15,7 @@ from ptsmc_jax.scenario.values import Kind, Table
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
-COLUMN, WIDTH = 36, 120
+COLUMN, WIDTH = 36, 120  # at which a meaning begins, and lines end
 # Values shown for keys that are off and have none of their own; a system's own name is what a user puts there.
 EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",

@@ -14,9 +14,17 @@ if TYPE_CHECKING:
 
 
 def whole_number(
-    option: str, said: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()
+    option: str, text: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()
 ) -> Parameter:
-    """An option that is a whole number; said: its help. What is none raises UsageError, as `main` tells it."""
+    """An option that is a whole number.
+
+    Args:
+        option: its name in refusals, a `UsageError` that `main` prints.
+        text: its help.
+        least: the smallest number allowed.
+        most: the largest one.
+        names: what it is called on the command line, where that is not its parameter's name.
+    """
 
     def read(_: Any, tokens: Sequence[Token]) -> int:
         value = tokens[0].value
@@ -24,23 +32,23 @@ def whole_number(
             raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
         return int(value)
 
-    return Parameter(name=names or None, converter=read, help=said)
+    return Parameter(name=names or None, converter=read, help=text)
 
 
-def number_between(option: str, said: str, least: float, most: float) -> Parameter:
-    """An option that is a number between two others; likewise."""
+def number_between(option: str, text: str, least: float, most: float) -> Parameter:
+    """An option that is a number between two others; see `whole_number`."""
 
     def read(_: Any, tokens: Sequence[Token]) -> float:
         value = tokens[0].value
         try:
-            found = float(value)
+            number = float(value)
         except ValueError:
-            found = float("nan")
-        if not least < found < most:
+            number = float("nan")
+        if not least < number < most:
             raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
-        return found
+        return number
 
-    return Parameter(converter=read, help=said)
+    return Parameter(converter=read, help=text)
 
 
 ScenarioFile = Annotated[
@@ -87,19 +95,8 @@ Times = Annotated[
 INTERRUPTED = 130  # exit status
 
 
-def times_of(option: str, value: str) -> tuple[float, ...]:
-    """Two times or more, between commas [s]."""
-    try:
-        found = tuple(sorted(float(part) for part in value.split(",")))
-    except ValueError:
-        found = ()
-    if len(found) < 2 or len(set(found)) < len(found) or not all(0.0 < t_f < float("inf") for t_f in found):
-        raise UsageError(f"{option} is {value}, but must be two times or more in s, all different, such as 20,30,45")
-    return found
-
-
-def against_of(against: str, times: str | None, points: int | None) -> tuple[float, ...]:
-    """The times that are asked for, none where there are none [s]."""
+def times_against(against: str, times: str | None, points: int | None) -> tuple[float, ...]:
+    """The times of --times, two or more between commas [s], none without it; raises UsageError where none fit."""
     if against not in ("torque", "t_f"):
         raise UsageError(f"--against is {against}, but must be torque or t_f")
     if against == "t_f" and points is not None:
@@ -108,7 +105,13 @@ def against_of(against: str, times: str | None, points: int | None) -> tuple[flo
         return ()
     if against != "t_f":
         raise UsageError(f"--times is {times}, but must be absent without --against t_f")
-    return times_of("--times", times)
+    try:
+        listed = tuple(sorted(float(part) for part in times.split(",")))
+    except ValueError:
+        listed = ()
+    if len(listed) < 2 or len(set(listed)) < len(listed) or not all(0.0 < t_f < float("inf") for t_f in listed):
+        raise UsageError(f"--times is {times}, but must be two times or more in s, all different, such as 20,30,45")
+    return listed
 
 
 def prepare(
@@ -119,10 +122,20 @@ def prepare(
     bits: Literal[32, 64] = 64,
     *,
     trust: bool,
+    force: bool | None = None,
 ) -> "tuple[Scenario, Path]":
     """The checked scenario, which may be flown, and the folder for the results; the backend is configured on the way.
 
-    trust: code that the scenario names may be run where it lies in results.
+    Args:
+        scenario: its file; None: the paper's Case I.
+        command: after which the folder is named where none is given.
+        out: the folder that is asked for, if any.
+        device: what is flown on, "cpu" or "gpu".
+        bits: of every number.
+        trust: code that the scenario names may be run where it lies in results.
+        force: whether the folder may hold something already; None: the command looks at that later.
+
+    Raises ScenarioError, RefusedError or UsageError where one of these cannot be followed.
     """
     if device != "cpu" and device != "gpu":
         raise UsageError(f"--device is {device}, but must be cpu or gpu")
@@ -144,4 +157,9 @@ def prepare(
         own_parts.allow_scenario(scenario, loaded, trust)
     loaded = reading.complete(loaded)
     name = "default" if scenario is None else scenario.stem
-    return loaded, out if out is not None else Path("out") / f"{command}-{name}"
+    folder = out if out is not None else Path("out") / f"{command}-{name}"
+    if force is not None:
+        from ptsmc_jax.campaigns import store
+
+        store.check(folder, force)
+    return loaded, folder

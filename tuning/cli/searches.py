@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,22 @@ from tuning.output import terminal
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
+    from tuning.search.journal import Journal
 
 STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
+
+
+@dataclass(frozen=True)
+class LongSearch:
+    """A search that takes minutes to hours: what does it, and how its outcome is kept and shown."""
+
+    known_by: dict[str, Any]  # what tells it from others in a folder, see `store.begin`
+    goal: str  # what the progress says is minimised
+    work: Callable[[terminal.Progress, "Journal"], Any]  # searches; what it returns has a `status`
+    write: Callable[[Path, Any], None]  # fills a result folder with that outcome
+    summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of it
+    show: Callable[[dict[str, Any], Path, str], None]  # prints such a summary, the folder, and how it came about
+    check: Callable[[], Any] = lambda: None  # raises what is refused besides the scenario, before a folder is begun
 
 
 def with_tune(scenario: "Scenario") -> "Scenario":
@@ -21,50 +36,34 @@ def with_tune(scenario: "Scenario") -> "Scenario":
     return scenario if scenario.tune is not None else replace(scenario, tune={})
 
 
-def run(
-    loaded: "Scenario",
-    folder: Path,
-    known_by: dict[str, Any],
-    force: bool,
-    quiet: bool,
-    goal: str,
-    *,
-    work: Callable[..., Any],
-    write: Callable[[Path, Any], None],
-    summary: Callable[[Any], dict[str, Any]],
-    shown: Callable[[dict[str, Any], Path, str], None],
-    check: Callable[[], Any] = lambda: None,
-) -> int:
-    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status.
-
-    check: what it refuses besides the scenario, before a folder is begun.
-    """
+def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
+    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing, study
 
     tables = parsing.dump(loaded)
-    done = None if force else store.previous(folder, tables, known_by)
+    done = None if force else store.previous(folder, tables, search.known_by)
     if done is not None and done["status"] != "interrupted":
         if not quiet:
-            shown(done, folder, "already done")
+            search.show(done, folder, "already done")
         return STATUS[done["status"]]
-    going_on = not force and store.begun(folder, tables, known_by)
+    going_on = not force and store.begun(folder, tables, search.known_by)
     if not going_on:
         store.check(folder, force)
     study(loaded)  # what it refuses, it refuses before the search
-    check()
+    search.check()
     from tuning.search.journal import Journal
 
-    journal = Journal(store.begin(folder, tables, known_by, fresh=not going_on))
+    journal = Journal(store.begin(folder, tables, search.known_by, fresh=not going_on))
     try:
-        with terminal.Progress(quiet, goal) as report:
-            found = work(report, journal)
+        with terminal.Progress(quiet, search.goal) as report:
+            outcome = search.work(report, journal)
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return STATUS["interrupted"]
-    store.write(folder, lambda making: write(making, found))
-    if found.status != "interrupted":
+    store.write(folder, lambda making: search.write(making, outcome))
+    if outcome.status != "interrupted":
         store.end(folder)
     if not quiet:
-        shown(summary(found), folder, "interrupted" if found.status == "interrupted" else "done")
-    return STATUS[found.status]
+        search.show(search.summary(outcome), folder, "interrupted" if outcome.status == "interrupted" else "done")
+    return STATUS[outcome.status]

@@ -20,8 +20,8 @@ def report(
     from ptsmc_jax.campaigns import store
     from tuning.output import page
 
-    made = page.build(folder)
-    store.write(folder, lambda making: store.write_text(making / "report.html", made))
+    content = page.build(folder)
+    store.write(folder, lambda making: store.write_text(making / "report.html", content))
     if not quiet:
         terminal.say(f"page in {folder / 'report.html'}")
     return 0
@@ -110,11 +110,11 @@ def convert_attitude(
     """
     from tuning.cli import convert
 
-    given = {
+    texts = {
         "quat_xyzw": quat_xyzw, "quat_wxyz": quat_wxyz, "rotvec_deg": rotvec_deg, "mrp": mrp,
         "dcm_body_to_inertial": dcm_body_to_inertial, "euler_deg": euler_deg, "sequence": sequence,
     }  # fmt: skip
-    terminal.say(*convert.lines(convert.quaternion(given), sequence))
+    terminal.say(*convert.lines(convert.quaternion(texts), sequence))
     return 0
 
 

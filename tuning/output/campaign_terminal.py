@@ -1,12 +1,20 @@
 """What the commands of a campaign print."""
 
+import itertools
 import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tuning.output import pointing_sentences, sentences, terminal
+from tuning.output.cells import Table
 from tuning.output.progress_lines import Bar
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from ptsmc_jax.campaigns.campaign import Tally
+    from tuning.studies.campaign_folder import Folder
 
 
 class Progress(Bar):
@@ -16,8 +24,8 @@ class Progress(Bar):
         super().__init__(quiet)
         self._started: tuple[float, int] | None = None
 
-    def __call__(self, standing: Any) -> None:
-        """standing: a `campaign.Tally`."""
+    def __call__(self, standing: "Tally") -> None:
+        """Show where the campaign stands."""
         now = time.monotonic()
         if self._started is None:
             self._started = now, standing.done
@@ -30,23 +38,23 @@ class Progress(Bar):
         self._lines(text, 0, 0)
 
 
-def campaign(found: dict[str, Any], folder: Path) -> None:
+def campaign(summary: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
-    terminal.say(*sentences.campaign_counts(found))
-    terminal.table(sentences.campaign(found))
-    terminal.say(*pointing_sentences.heading(found))
-    for table in pointing_sentences.tables(found):
+    terminal.say(*sentences.campaign_counts(summary))
+    terminal.table(sentences.campaign(summary))
+    terminal.say(*pointing_sentences.heading(summary))
+    for table in pointing_sentences.tables(summary):
         terminal.table(table)
     terminal.say(
-        *sentences.campaign_error(found),
-        *map(sentences.verdict, found["verdicts"]),
-        *sentences.campaign_drivers(found),
-        *sentences.cautions(found),
+        *sentences.campaign_error(summary),
+        *map(sentences.verdict, summary["verdicts"]),
+        *sentences.campaign_drivers(summary),
+        *sentences.cautions(summary),
         f"results in {folder}",
     )
 
 
-def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
+def share_done(folder: "Folder", share: tuple[int, int], *, planned: bool) -> None:
     """A share of a campaign, or its plan, is done."""
     if planned:
         print(f"plan of {folder.trials} trials in {folder.dry.folder}; nothing was flown")
@@ -57,42 +65,52 @@ def share_done(folder: Any, share: tuple[int, int], *, planned: bool) -> None:
     print("when all are there, in this folder or gathered into one: ptsmc summarize DIR")
 
 
-def worst(frame: Any, by: str, folder: Path, kind: str, *, own_code: bool = False) -> None:
-    """The worst trials, and how to see one in full; kind: of the plant; own_code: flying it runs code of one's own."""
+def worst(frame: "pl.DataFrame", by: str, folder: Path, kind: str, *, own_code: bool = False) -> None:
+    """The worst trials, and how to see one in full.
+
+    Args:
+        frame: their rows, the worst first.
+        by: the metric that they are the worst by.
+        folder: the campaign's.
+        kind: of the plant.
+        own_code: flying it runs code of one's own.
+    """
     wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
     names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
     rows = [
         tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
         for row in frame.select(names).iter_rows()
     ]
-    terminal.table(sentences.Table(tuple(sentences.with_unit(name, kind) for name in names), rows))
+    terminal.table(Table(tuple(sentences.with_unit(name, kind) for name in names), rows))
     one = f"ptsmc replay {folder} --trial {frame['trial'][0]}" + (" --trust" if own_code else "")
     terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 
-def why(told: list[dict[str, Any]]) -> None:
+def why(inputs: list[dict[str, Any]]) -> None:
     """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
+    inputs: rows as `campaign_summary.why` makes them.
     """
-    for metric, trial in dict.fromkeys((one["metric"], one["trial"]) for one in told):
-        mine = [one for one in told if (one["metric"], one["trial"]) == (metric, trial)]
-        heading = f"{metric} {mine[0]['value']:.4g} in trial {trial}"
-        shown = [one for one in mine if one["first_order"] is not None]
-        if shown and math.isfinite(mine[0]["value"]):
-            mine = sorted((one for one in shown if _explained(one) >= COUNTS), key=_explained, reverse=True)
+    for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
+        rows = list(group)
+        value = rows[0]["value"]
+        with_share = [row for row in rows if row["first_order"] is not None]
+        if with_share and math.isfinite(value):
+            rows = sorted((row for row in with_share if _explained(row) >= COUNTS), key=_explained, reverse=True)
         else:
-            mine.sort(key=lambda one: -abs(one["percentile"] - 50.0))
-        said = [
-            f"{m['input']} {m['drawn']:.4g} at {m['percentile']:.1f} % (median {m['median']:.3g})" for m in mine[:4]
+            rows.sort(key=lambda row: -abs(row["percentile"] - 50.0))
+        texts = [
+            f"{row['input']} {row['drawn']:.4g} at {row['percentile']:.1f} % (median {row['median']:.3g})"
+            for row in rows[:4]
         ]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
-        terminal.say(f"{heading}: {', '.join(said) or nothing}")
+        terminal.say(f"{metric} {value:.4g} in trial {trial}: {', '.join(texts) or nothing}")
 
 
-def _explained(one: dict[str, Any]) -> float:
+def _explained(row: dict[str, Any]) -> float:
     """The share of its metric's variance that an input explains."""
-    return max(one["first_order"], one["rank_correlation"] ** 2)
+    return max(row["first_order"], row["rank_correlation"] ** 2)
 
 
 COUNTS = 0.05  # of a metric's variance, that an input explains at least to be named as a reason

@@ -1,5 +1,6 @@
-"""What is said of a result: its summary as it is read, and tables of text."""
+"""What is said of a result: its summary as it is read, tables of text, numbers as text."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,25 @@ class Table:
 
     head: tuple[str, ...]
     rows: list[tuple[str, ...]]
+
+
+def digits(value: float | None, form: str, none: str = "-") -> str:
+    """A number in this format; `none` where there is none, or NaN.
+
+    >>> digits(0.12345, ".3g"), digits(None, ".3g"), digits(float("nan"), ".3g", "never")
+    ('0.123', '-', 'never')
+    """
+    return none if value is None or value != value else f"{value:{form}}"
+
+
+def lost(counts: Mapping[str, int]) -> tuple[int, str]:
+    """How many trials did not end well, of counts by status, and in words how they ended.
+
+    >>> lost({"ok": 5, "missed": 2, "singular": 0, "diverged": 1})
+    (3, '2 missed, 1 diverged')
+    """
+    bad = {status: count for status, count in counts.items() if count and status != "ok"}
+    return sum(bad.values()), ", ".join(f"{count} {status}" for status, count in bad.items())
 
 
 def number(cell: str) -> Any:

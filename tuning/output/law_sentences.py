@@ -8,7 +8,7 @@ from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts, sentences
-from tuning.output.cells import Summary, Table
+from tuning.output.cells import Summary, Table, digits, lost
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,13 @@ class Question:
     limit: str = ""  # metric whose limit is drawn
 
 
-def _untold(name: str, which: str) -> Value:
-    def of(law: Summary) -> float | None:
-        return law["untold"].get(which, {}).get("window_error")
+def _untold(name: str, change: str) -> Value:
+    """The window error with a change that the law is not told of, one of `WORDS`."""
 
-    return Value(name, "-", of, ".2e", lambda law: law["untold"].get(which, {}).get("window_error_interval"))
+    def of(law: Summary, key: str = "window_error") -> Any:
+        return law["untold"].get(change, {}).get(key)
+
+    return Value(name, "-", of, ".2e", lambda law: of(law, "window_error_interval"))
 
 
 def _hold(name: str) -> Value:
@@ -51,10 +53,10 @@ def _hold(name: str) -> Value:
     unit = MARGINS[name][0]
 
     def of(law: Summary) -> float | None:
-        asked = {v["metric"]: v for v in law["verdicts"]}.get(name)
-        if asked is not None:
-            unlimited = asked["failures"] == 0 and asked["worst"] in (None, math.inf)  # JSON has no number for it
-            return math.inf if unlimited else asked["worst"]
+        verdict = {v["metric"]: v for v in law["verdicts"]}.get(name)
+        if verdict is not None:
+            unlimited = verdict["failures"] == 0 and verdict["worst"] in (None, math.inf)  # JSON has no number for it
+            return math.inf if unlimited else verdict["worst"]
         hold = (law["margins"] or {}).get("hold", {})
         return math.inf if name in hold and hold[name] is None else hold.get(name)  # null where it is unlimited
 
@@ -133,15 +135,14 @@ class Answer:
 def answers(summary: Summary) -> list[Answer]:
     """An answer to each question that some law has a number for."""
     laws = summary["laws"]
-    known = [q for q in QUESTIONS if any(value.of(law) is not None for value in q.values for law in laws.values())]
-    return [Answer(one.title, _table(one, laws), _chart(one, laws), one.note) for one in known]
+    answered = [q for q in QUESTIONS if any(value.of(law) is not None for value in q.values for law in laws.values())]
+    return [Answer(q.title, _table(q, laws), _chart(q, laws), q.note) for q in answered]
 
 
 def _chart(question: Question, laws: Summary) -> page_charts.Chart:
     drawn, each = question.values[: question.drawn], list(laws.values())
     series = {value.name: (list(map(value.of, each)), list(map(value.interval, each))) for value in drawn}
-    what = question.what or drawn[0].name
-    axis = f"{what} [{drawn[0].unit}]"
+    axis = f"{question.what or drawn[0].name} [{drawn[0].unit}]"
     return page_charts.laws(list(laws), series, axis, _marks(question, each), question.logarithmic)
 
 
@@ -155,53 +156,52 @@ def _marks(question: Question, laws: list[Summary]) -> dict[str, float]:
 
 
 def _table(question: Question, laws: Summary) -> Table:
-    kept = [value for value in question.values if any(value.of(law) is not None for law in laws.values())]
-    head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in kept]
-    within = question.judged and any(kept[0].interval(law) for law in laws.values())
-    asked = list(dict.fromkeys(verdict["metric"] for law in laws.values() for verdict in law["verdicts"]))
+    columns = [value for value in question.values if any(value.of(law) is not None for law in laws.values())]
+    first = columns[0]
+    head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in columns]
+    with_interval = question.judged and any(first.interval(law) for law in laws.values())
+    required = list(dict.fromkeys(verdict["metric"] for law in laws.values() for verdict in law["verdicts"]))
     rows = []
     for name, law in laws.items():
-        cells = [_cell(value, value.of(law)) for value in kept]
-        if within:
-            low, high = kept[0].interval(law) or (None, None)
-            cells.insert(1, "-" if low is None else f"{low:{kept[0].digits}} to {high:{kept[0].digits}}")
+        cells = [_cell(value, law) for value in columns]
+        if with_interval:
+            low, high = first.interval(law) or (None, None)
+            cells.insert(1, "-" if low is None else f"{low:{first.digits}} to {high:{first.digits}}")
         if question.judged:
-            told = {verdict["metric"]: verdict for verdict in law["verdicts"]}
-            cells += ["-" if metric not in told else _broken(told[metric]) for metric in asked]
-            cells.append("yes" if law["met"] else "no")
-        rows.append((name.replace("_", " "), *cells))
-    if within:
+            beyond = {verdict["metric"]: _beyond(verdict) for verdict in law["verdicts"]}
+            cells += [*(beyond.get(metric, "-") for metric in required), "yes" if law["met"] else "no"]
+        rows.append((_name(name), *cells))
+    if with_interval:
         head.insert(1, "95 %")
     if question.judged:
-        head += [*(f"trials beyond {metric}" for metric in asked), "all limits met"]
+        head += [*(f"trials beyond {metric}" for metric in required), "all limits met"]
     return Table(("", *head), rows)
 
 
-def _broken(told: Summary) -> str:
+def _beyond(verdict: Summary) -> str:
     """How many trials break a requirement, and whether these are too many."""
-    return f"{told['failures']} of {told['trials']}" + ("" if told["met"] else ": NOT met")
+    return f"{verdict['failures']} of {verdict['trials']}" + ("" if verdict["met"] else ": NOT met")
 
 
-def _cell(value: Value, known: float | int | None) -> str:
-    if known is None or known != known:
-        return "-"
-    return "unlimited" if math.isinf(known) else f"{known:{value.digits}}"
+def _cell(value: Value, law: Summary) -> str:
+    number = value.of(law)
+    return "unlimited" if number is not None and math.isinf(number) else digits(number, value.digits)
 
 
 def lines(summary: Summary) -> Iterator[str]:
     """The gains of each law, trials that went wrong, and limits that it breaks."""
     yield from sentences.paper_refused(summary)
-    for law, found in summary["laws"].items():
-        gains = ", ".join(f"{name} {value:.4g}" for name, value in found["gains"].items())
-        bound = "".join(f"; {name} on its {side} bound" for name, side in found["at_bound"].items())
-        yield f"gains of {law}: {gains}{bound}"
-        missed = [f"{n} {status}" for status, n in found["counts"].items() if n and status != "ok"]
-        if missed:
-            yield f"  of {summary['trials']} trials {', '.join(missed)}"
-        yield from (f"  {sentences.verdict(told)}" for told in found["verdicts"] if not told["met"])
-        for which, other in found["untold"].items():
-            if other["lost"]:
-                yield f"  {WORDS[which]} {other['lost']} of {summary['trials']} trials fail or miss t_f"
+    for name, law in summary["laws"].items():
+        gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law["gains"].items())
+        bound = "".join(f"; {gain} on its {side} bound" for gain, side in law["at_bound"].items())
+        yield f"gains of {name}: {gains}{bound}"
+        bad, ended = lost(law["counts"])
+        if bad:
+            yield f"  of {summary['trials']} trials {ended}"
+        yield from (f"  {sentences.verdict(verdict)}" for verdict in law["verdicts"] if not verdict["met"])
+        for change, figures in law["untold"].items():
+            if figures["lost"]:
+                yield f"  {WORDS[change]} {figures['lost']} of {summary['trials']} trials fail or miss t_f"
     yield f"a trial has settled when its angle stays below {summary['settling_angle']:g} rad from then on"
 
 
@@ -214,13 +214,15 @@ WORDS = {
 
 def winner(summary: Summary) -> str:
     """Which law has the smallest error of those that meet every requirement, and how far the paper's is behind it."""
-    met = {law: found["window_error"] for law, found in summary["laws"].items() if found["met"]}
-    known = {law: error for law, error in met.items() if error is not None}
-    if not known:
+    errors = {name: law["window_error"] for name, law in summary["laws"].items() if law["met"]}
+    errors = {name: error for name, error in errors.items() if error is not None}
+    if not errors:
         return "no law meets every requirement"
-    best, ours = min(known, key=lambda law: known[law]), "prescribed_time"
-    behind = f"; {_name(ours)} has {known[ours] / known[best]:.3g} times that" if best != ours and ours in known else ""
-    return f"of the laws that meet every requirement {_name(best)} has the smallest error, {known[best]:.2e}{behind}"
+    best, ours = min(errors, key=errors.__getitem__), "prescribed_time"
+    behind = ""
+    if ours in errors and best != ours:
+        behind = f"; {_name(ours)} has {errors[ours] / errors[best]:.3g} times that"
+    return f"of the laws that meet every requirement {_name(best)} has the smallest error, {errors[best]:.2e}{behind}"
 
 
 def _name(law: str) -> str:

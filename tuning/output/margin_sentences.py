@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
-from tuning.output.cells import Summary, Table
+from tuning.output.cells import Summary, Table, digits
 
 ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
 COLUMNS = {
@@ -19,13 +19,12 @@ COLUMNS = {
 def table(summary: Summary) -> Table:
     """Margins in hold: of each axis of the plant's input alone, of all at once, and of what each sensor sees."""
 
-    def row(where: str, found: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
-        known = (found.get(name, "-") for name in COLUMNS)
-        return where, *(none if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in known)
+    def row(where: str, margins: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
+        return where, *(digits(margins[name], ".3g", none) if name in margins else "-" for name in COLUMNS)
 
-    rows = [row(f"input {name}", found) for name, found in summary["hold"].items()]
+    rows = [row(f"input {name}", margins) for name, margins in summary["hold"].items()]
     rows.append(row("all inputs", summary["together"], "none" if summary["stable"] else "-"))
-    rows += [row(name, found) for name, found in summary["sensors"].items()]
+    rows += [row(name, margins) for name, margins in summary["sensors"].items()]
     return Table(("in hold", *COLUMNS.values()), rows)
 
 
@@ -43,14 +42,14 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
             f"these margins are of the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
             "(another start: [initial])"
         )
-    for counts in (True, False):
-        times = sorted(one["time_to_go"] for one in summary["before"] if not one["stable"] and one["judged"] == counts)
-        if not times:
-            continue
-        when = f"at {times[0]:.3g}" if len(times) == 1 else f"at {len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
-        yield f"before the hand-over the loop with its gains frozen is unstable {when} s to go" + (
-            "" if counts else ", where gains change too fast, or the loop is too slow, for that to say much"
-        )
+    unstable = [loop for loop in summary["before"] if not loop["stable"]]
+    for judged, caveat in (
+        (True, ""), (False, ", where gains change too fast, or the loop is too slow, for that to say much"),
+    ):  # fmt: skip
+        times = sorted(loop["time_to_go"] for loop in unstable if loop["judged"] == judged)
+        if times:
+            span = f"{times[0]:.3g}" if len(times) == 1 else f"{len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
+            yield f"before the hand-over the loop with its gains frozen is unstable at {span} s to go{caveat}"
     if summary["stable"] and with_least:
         yield f"the worst margins in hold, and before the hand-over where judged: {left(summary)}"
     if summary["said"]:
@@ -62,28 +61,26 @@ def left(summary: Summary) -> str:
     return _shown(summary["worst"])
 
 
-def tuned(found: Mapping[str, Any] | None) -> Iterator[str]:
+def tuned(worst: Mapping[str, Any] | None) -> Iterator[str]:
     """What tuned gains leave, see `stability.worst`, and whether an engineer would ask for more."""
-    places = {"hold": "in hold", "before": "before the hand-over"}
-    for where, place in places.items():
-        if found is None or where not in found:
+    for where, place in (("hold", "in hold"), ("before", "before the hand-over")):
+        if worst is None or where not in worst:
             continue
-        known = found[where]
-        if "swing" in known:
-            yield _swings(known["swing"])
+        margins = worst[where]
+        if "swing" in margins:
+            yield _swings(margins["swing"])
             continue
-        if not known["stable"]:
+        if not margins["stable"]:
             yield f"with the tuned gains the frozen loop is NOT stable {place}"
             continue
-        yield f"margins that the tuned gains leave {place}: {_shown(known)}"
-        few = [
-            f"{least:g} {MARGINS[name][0]} of {_short(name)}"
-            for name, least in ENOUGH.items()
-            if known[name] is not None and known[name] < least
-        ]
+        yield f"margins that the tuned gains leave {place}: {_shown(margins)}"
+        few = " and ".join(
+            f"{enough:g} {MARGINS[name][0]} of {_short(name)}"
+            for name, enough in ENOUGH.items()
+            if margins[name] is not None and margins[name] < enough
+        )
         if few:
-            least = " and ".join(few)
-            yield f"the loop has less than {least} {place}: what the model leaves out may cost the stability"
+            yield f"the loop has less than {few} {place}: what the model leaves out may cost the stability"
 
 
 def _swings(swing: Mapping[str, Any]) -> str:
@@ -94,10 +91,10 @@ def _swings(swing: Mapping[str, Any]) -> str:
     )
 
 
-def _shown(found: Mapping[str, Any]) -> str:
+def _shown(margins: Mapping[str, Any]) -> str:
     """The margins that are limited, in words."""
-    known = {name: found[name] for name in MARGINS if found[name] is not None}
-    return ", ".join(f"{_short(name)} {value:.3g} {MARGINS[name][0]}" for name, value in known.items())
+    limited = [name for name in MARGINS if margins[name] is not None]
+    return ", ".join(f"{_short(name)} {margins[name]:.3g} {MARGINS[name][0]}" for name in limited)
 
 
 def _short(name: str) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
+from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.errors import UsageError
 from tuning.output import (
     cells,
@@ -94,7 +95,7 @@ def read(folder: Path) -> Result:
     """A result folder. Raises RefusedError where it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is one that a ptsmc command left")
-    versions = store.made(folder)
+    versions = store.read_versions(folder)
     command = versions.get("command")
     if str(command) not in SECTIONS:
         raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command left")
@@ -154,9 +155,9 @@ def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
-def _table(made: sentences.Table, note: str = "") -> Block:
-    numbers = all(row[-1][:1] in "-0123456789" for row in made.rows)  # the last column, which else is words or a unit
-    return Block("table", head=made.head, rows=made.rows, note=note, shape="numbers" if numbers else "")
+def _table(table: cells.Table, note: str = "") -> Block:
+    numbers = all(row[-1][:1] in "-0123456789" for row in table.rows)  # the last column, which else is words or a unit
+    return Block("table", head=table.head, rows=table.rows, note=note, shape="numbers" if numbers else "")
 
 
 def _text(lines: Iterable[str]) -> Block:
@@ -168,11 +169,10 @@ def _limits(verdicts: list[dict[str, Any]]) -> list[Section]:
     if not verdicts:
         return []
     bars = []
-    for one in verdicts:
-        share = np.nan_to_num(_value(one["margin"]), nan=np.inf)
+    for verdict in verdicts:
         bars.append({
-            "label": one["metric"].replace("_", " "), "text": sentences.verdict(one) + _distance(one),
-            "met": one["met"], "limit": 300, "width": round(min(400.0, 300.0 * share), 1),
+            "label": verdict["metric"].replace("_", " "), "text": sentences.verdict(verdict) + _distance(verdict),
+            "met": verdict["met"], "limit": 300, "width": round(min(400.0, 300.0 * _nearness(verdict)), 1),
         })  # fmt: skip
     note = "The line is the limit; a bar that ends before it keeps the limit."
     return [Section("Requirements", [Block("bars", bars=bars, note=note)])]
@@ -217,7 +217,7 @@ def _simulate(result: Result) -> tuple[Heading, list[Section]]:
 def _tune(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
-    farthest = max(summary["verdicts"], key=lambda v: np.nan_to_num(_value(v["margin"]), nan=np.inf), default=None)
+    farthest = max(summary["verdicts"], key=_nearness, default=None)
     lines = [f"tuned gains: {gains}", *sentences.accuracy(summary)]
     if farthest is not None:
         lines.insert(1, sentences.verdict(farthest) + _distance(farthest))
@@ -225,35 +225,27 @@ def _tune(result: Result) -> tuple[Heading, list[Section]]:
         rows = list(csv.DictReader(file))
     goal = list(rows[0])[2]
     caption = "The way of every start to the optimum next to it, by slopes; a hollow point breaks a limit."
+    said_of = (search_sentences.advice, search_sentences.search, search_sentences.trust, search_sentences.shortest)
+    trust = _text(line for lines_of in said_of for line in lines_of(summary))
     sections = [
         *_limits(summary["verdicts"]),
         Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
-        Section(
-            "Can the result be trusted?",
-            [
-                _text(
-                    [
-                        *search_sentences.advice(summary),
-                        *search_sentences.search(summary),
-                        *search_sentences.trust(summary),
-                        *search_sentences.shortest(summary),
-                    ]
-                )
-            ],
-        ),
+        Section("Can the result be trusted?", [trust]),
         Section("Search", [result.chart("search", page_charts.search(rows, goal), caption)]),
     ]
     return _verdict(summary, lines, bool(summary["verdicts"])), sections
 
 
-def _value(known: float | None) -> float:
-    return np.nan if known is None else known
+def _nearness(verdict: dict[str, Any]) -> float:
+    """How near a verdict comes to its limit, 1 at it; infinite where a trial has no value."""
+    margin = verdict["margin"]
+    return float("inf") if margin is None or margin != margin else margin
 
 
 def _distance(verdict: dict[str, Any]) -> str:
     """How far what decides a verdict is from its limit: the largest value, or that of the share that is asked for."""
-    margin = _value(verdict["margin"])
-    if np.isnan(margin) or verdict.get("at_least") or verdict["limit"] == 0.0:
+    margin = verdict["margin"]
+    if margin is None or margin != margin or verdict.get("at_least") or verdict["limit"] == 0.0:
         return ""
     share = f"{sentences.ratio(100 * margin)} % of the limit"
     if verdict.get("quantile") is None or verdict["trials"] == 1:
@@ -262,8 +254,6 @@ def _distance(verdict: dict[str, Any]) -> str:
 
 
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     if "slews" in result.summary:
         return _slew_times(result)
     summary, units = result.summary, {name: entry.unit for name, entry in CATALOGUES[result.kind].items()}
@@ -274,44 +264,45 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
         Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
         Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
     ]
-    gains = {"met": "Gains", "not met": "No gains"}.get(summary["status"])
-    said = None if gains is None else f"{gains} on the front meet every requirement"
+    gains = "Gains" if summary["status"] == "met" else "No gains"
     lines = [*search_sentences.along_the_front(summary), sentences.front_heading(summary)]
-    return _with_headline(summary, lines, said), sections
+    return _with_headline(summary, lines, f"{gains} on the front meet every requirement"), sections
 
 
 def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
     met, times = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
-    said = f"At {met} of {times} prescribed times gains meet every requirement"
+    headline = f"At {met} of {times} prescribed times gains meet every requirement"
     lines = [*search_sentences.fastest(summary), sentences.slew_times_heading(summary)]
-    heading = _with_headline(summary, lines, said)
-    return heading, [Section("What a faster slew costs", blocks)]
+    return _with_headline(summary, lines, headline), [Section("What a faster slew costs", blocks)]
 
 
-def _with_headline(summary: dict[str, Any], lines: list[str], said: str | None) -> Heading:
-    """What a front says first; said: its headline where requirements are asked for."""
+def _with_headline(summary: dict[str, Any], lines: list[str], headline: str) -> Heading:
+    """What a front says first, with this headline where requirements are asked for."""
     asked = bool(summary["requirements"])
     heading = _verdict(summary, lines, asked)
-    return replace(heading, headline=said) if asked and said is not None else heading
+    return replace(heading, headline=headline) if asked else heading
 
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
-    lines = [f"each law is tuned alike, with all of its gains free, and judged on {judged}"]
-    lines.append(law_sentences.winner(summary))
-    meets = {"met": "The paper's law, tuned, meets every requirement",
-             "not met": "The paper's law, tuned, does NOT meet every requirement"}  # fmt: skip
-    mood = {"met": "good", "not met": "bad"}.get(summary["status"], "bad")
-    headline = meets.get(summary["status"], "Interrupted: the best so far")
-    lines += sentences.cautions(summary)
-    sections = [
-        Section(one.title, [result.chart(f"question_{number}", one.chart, one.note), _table(one.table)])
-        for number, one in enumerate(law_sentences.answers(summary))
+    lines = [
+        f"each law is tuned alike, with all of its gains free, and judged on {judged}",
+        law_sentences.winner(summary),
+        *sentences.cautions(summary),
     ]
-    return Heading(mood, headline, lines), [*sections, Section("Gains", [_text(law_sentences.lines(summary))])]
+    headline = {
+        "met": "The paper's law, tuned, meets every requirement",
+        "not met": "The paper's law, tuned, does NOT meet every requirement",
+    }.get(summary["status"], "Interrupted: the best so far")
+    sections = [
+        Section(answer.title, [result.chart(f"question_{k}", answer.chart, answer.note), _table(answer.table)])
+        for k, answer in enumerate(law_sentences.answers(summary))
+    ]
+    sections.append(Section("Gains", [_text(law_sentences.lines(summary))]))
+    return Heading("good" if summary["status"] == "met" else "bad", headline, lines), sections
 
 
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
@@ -336,7 +327,7 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
     with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     head = tuple(sentences.with_unit(name, result.kind) for name in rows[0])
-    table = sentences.Table(head, [tuple(map(cells.short, row)) for row in rows[1:]])
+    table = cells.Table(head, [tuple(map(cells.short, row)) for row in rows[1:]])
     pairs = [dict(zip(("x", "y", *rows[0][2:]), map(cells.number, row), strict=True)) for row in rows[1:]]
     first, *others = sentences.grid(pairs, (rows[0][0], rows[0][1]))
     heading = Heading("calm", first[0].upper() + first[1:], others)
@@ -345,10 +336,12 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
 
 def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    stable = "calm", f"The loop is stable: {margin_sentences.left(summary)}"
-    said = stable if summary["stable"] else ("bad", "The loop in hold is NOT stable")
-    sections = [Section("Margins", [_table(margin_sentences.table(summary))])]
-    return Heading(*said, list(margin_sentences.lines(summary, with_least=False))), sections
+    lines = list(margin_sentences.lines(summary, with_least=False))
+    if summary["stable"]:
+        heading = Heading("calm", f"The loop is stable: {margin_sentences.left(summary)}", lines)
+    else:
+        heading = Heading("bad", "The loop in hold is NOT stable", lines)
+    return heading, [Section("Margins", [_table(margin_sentences.table(summary))])]
 
 
 def _reproduce(result: Result) -> tuple[Heading, list[Section]]:
@@ -395,4 +388,4 @@ def _origin(result: Result) -> Iterator[Section]:
     note = "Where the scenario above is the file scenario.toml." if path.exists() else ""
     yield Section("How to make this again", [Block("code", text=made_again.call(versions, result.scenario), note=note)])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
-    yield Section("Made by", [_table(sentences.Table(("", "version"), rows))])
+    yield Section("Made by", [_table(cells.Table(("", "version"), rows))])

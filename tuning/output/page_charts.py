@@ -73,14 +73,14 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
         axes[f"yaxis{number}"] = {"domain": place, "exponentformat": "e"}
         text = f"{what} [{unit}]: {', '.join(names)}" if unit else ", ".join(names)
         notes.append({**above, "x": 0.0, "xref": "paper", "xanchor": "left", "y": top, "text": text})
-    shapes = [
-        {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
-         "line": {"color": "#777", "dash": "dot", "width": 1}}
-        for at in marks.values()
-    ]  # fmt: skip
-    anchor = "y" if len(blocks) == 1 else f"y{len(blocks)}"
-    time = {"title": {"text": "time [s]"}, "anchor": anchor}
+    shapes = [_upright(at, color="#777", dash="dot", width=1) for at in marks.values()]
+    time = {"title": {"text": "time [s]"}, "anchor": "y" if len(blocks) == 1 else f"y{len(blocks)}"}
     return {"data": data, "layout": _layout(**axes, xaxis=time, shapes=shapes, annotations=notes)}
+
+
+def _upright(at: float, **line: Any) -> Chart:
+    """A line across the whole height of a chart; line: how it is drawn."""
+    return {"type": "line", "x0": at, "x1": at, "yref": "paper", "y0": 0, "y1": 1, "line": line}
 
 
 def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
@@ -123,10 +123,10 @@ def _line(points: np.ndarray, name: str, colour: str, width: int, dash: str = "s
 def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None) -> Chart:
     """Error against peak torque: the front, what is beaten, and the paper's and the scenario's own gains."""
     points = summary["points"]
-    kept = [p for p in points if not p["dominated"]]
+    on_front = [p for p in points if not p["dominated"]]
     groups = [
-        ("front", kept, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
-        ("knee", [p for p in kept if p["knee"]], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
+        ("front", on_front, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
+        ("knee", [p for p in on_front if p["knee"]], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
         ("beaten by others", [p for p in points if p["dominated"]], {"mode": "markers", "marker": {"symbol": "x"}}),
         *((name, [summary[name]], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
           for name in ("paper", "before") if name in summary),
@@ -142,16 +142,14 @@ def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None
             })  # fmt: skip
     along = {"title": {"text": f"peak torque [{units['peak_torque']}]"}, "type": "log"}
     up = {"title": {"text": f"RMS window error [{units['window_error']}]"}, **_DECADES}
-    shapes = [] if limit is None else [
-        {"type": "line", "x0": limit, "x1": limit, "yref": "paper", "y0": 0, "y1": 1, "line": {"dash": "dash"}}
-    ]  # fmt: skip
-    said = []
+    shapes = [] if limit is None else [_upright(limit, dash="dash")]
+    notes = []
     if summary.get("floor"):
         level = {"y0": summary["floor"], "y1": summary["floor"], "xref": "paper", "x0": 0, "x1": 1}
         shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
-        said.append({"text": "floor", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(summary["floor"]),
-                     "yanchor": "bottom", "showarrow": False})  # fmt: skip
-    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=said)}
+        notes.append({"text": "floor", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(summary["floor"]),
+                      "yanchor": "bottom", "showarrow": False})  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=notes)}
 
 
 def _bars(points: Sequence[dict[str, Any]]) -> Chart:
@@ -175,15 +173,16 @@ def laws(
     series: label -> (a number for each law, its interval); axis: what they are; marks: lines to draw, by what they are.
     logarithmic: where they span a decade or more, whose ends the axis names.
     """
-    every = [v for values, _ in series.values() for v in values if v is not None and np.isfinite(v)]
+    finite = {label: [None if v is None or not np.isfinite(v) else v for v in values]
+              for label, (values, _) in series.items()}  # fmt: skip
+    every = [v for values in finite.values() for v in values if v is not None]
     logarithmic = logarithmic and bool(every) and min(every) > 0.0 and max(every) >= 10.0 * min(every)
     labels, data = [name.replace("_", " ") for name in names], []
-    for k, (label, (values, intervals)) in enumerate(series.items()):
-        known = [None if v is None or not np.isfinite(v) else v for v in values]
+    for k, (label, (_, intervals)) in enumerate(series.items()):
         away = [(0.0, 0.0) if v is None or not both else (both[1] - v, v - both[0])
-                for v, both in zip(known, intervals, strict=True)]  # fmt: skip
+                for v, both in zip(finite[label], intervals, strict=True)]  # fmt: skip
         data.append({
-            "type": "scatter", "mode": "markers", "name": label, "x": known, "y": labels,
+            "type": "scatter", "mode": "markers", "name": label, "x": finite[label], "y": labels,
             "hovertemplate": "%{y}: %{x:.4g}<extra>" + label + "</extra>", "showlegend": len(series) > 1,
             "marker": {"size": 10, "color": COLOURS[k % len(COLOURS)], "symbol": SYMBOLS[k % len(SYMBOLS)]},
             "error_x": {"type": "data", "symmetric": False, "thickness": 1.5, "visible": any(intervals),
@@ -191,11 +190,10 @@ def laws(
         })  # fmt: skip
     across = {"title": {"text": axis}, **({**_DECADES, "dtick": 1} if logarithmic else {})}
     up = {"autorange": "reversed", "automargin": True, "type": "category"}
-    lines = [{"type": "line", "x0": at, "x1": at, "yref": "paper", "y0": 0, "y1": 1, "line": {"dash": "dot"}}
-             for at in marks.values()]  # fmt: skip
-    said = [{"text": what, "x": np.log10(at) if logarithmic else at, "yref": "paper", "y": 0, "yanchor": "bottom",
-             "xanchor": "left", "showarrow": False} for what, at in marks.items()]  # fmt: skip
-    return {"data": data, "layout": _layout(xaxis=across, yaxis=up, shapes=lines, annotations=said)}
+    lines = [_upright(at, dash="dot") for at in marks.values()]
+    notes = [{"text": what, "x": np.log10(at) if logarithmic else at, "yref": "paper", "y": 0, "yanchor": "bottom",
+              "xanchor": "left", "showarrow": False} for what, at in marks.items()]  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=across, yaxis=up, shapes=lines, annotations=notes)}
 
 
 def search(rows: Sequence[Mapping[str, str]], goal: str) -> Chart:

@@ -37,15 +37,15 @@ def is_index(metric: str) -> bool:
 
 def budget(summary: Summary) -> Table | None:
     """What the indices keep to, each about the axes and as a half-cone; None: no pointing is observed."""
-    told = summary.get("pointing")
-    if not told:
+    pointing = summary.get("pointing")
+    if not pointing:
         return None
     rows = []
     for index, what in INDICES.items():
-        if index in told["budget"]:
+        if index in pointing["budget"]:
             name, _, meaning = what.partition(", ")
-            over = f"{meaning} ({told['window']:g} s)" if "window" in meaning else meaning
-            rows.append((name, *(angle(told["budget"][index].get(axis)) for axis in AXES), over))
+            over = f"{meaning} ({pointing['window']:g} s)" if "window" in meaning else meaning
+            rows.append((name, *(angle(pointing["budget"][index].get(axis)) for axis in AXES), over))
     return Table(("index", "x", "y", "z", "half-cone", "largest in the observation of"), rows)
 
 
@@ -53,55 +53,52 @@ def heading(summary: Summary) -> Iterator[str]:
     """What the numbers of the budget mean."""
     from ptsmc_jax.simulation.requirements import fewest_trials
 
-    told = summary.get("pointing")
-    if told:
-        boresight = ", ".join(f"{v:g}" for v in told["boresight"])
-        begins = f"{told['after']:g} s after t_f" if told["after"] else "t_f"
-        yield (
-            f"pointing from {begins} to t_end, boresight {boresight}: {100 * told['probability']:g} % of the runs keep "
-            f"to the angles of this budget, with {100 * told['confidence']:g} % confidence"
-        )
-        if any(value is None for axes in told["budget"].values() for value in axes.values()):
-            few, more = (fewest_trials(told["probability"], confidence) for confidence in USUAL)
-            least = f"{more} runs without a failure show a value, and {few} with 90 % confidence"
-            lost = summary["flown"] - summary["counts"]["ok"]
-            why = f"{lost} runs that are not ok are beyond every angle" if summary["flown"] >= more and lost else least
-            yield f"where the budget has -, {why}"
+    pointing = summary.get("pointing")
+    if not pointing:
+        return
+    boresight = ", ".join(f"{v:g}" for v in pointing["boresight"])
+    begins = f"{pointing['after']:g} s after t_f" if pointing["after"] else "t_f"
+    yield (
+        f"pointing from {begins} to t_end, boresight {boresight}: {100 * pointing['probability']:g} % of the runs keep "
+        f"to the angles of this budget, with {100 * pointing['confidence']:g} % confidence"
+    )
+    if any(value is None for axes in pointing["budget"].values() for value in axes.values()):
+        few, more = (fewest_trials(pointing["probability"], confidence) for confidence in USUAL)
+        least = f"{more} runs without a failure show a value, and {few} with 90 % confidence"
+        lost = summary["flown"] - summary["counts"]["ok"]
+        why = f"{lost} runs that are not ok are beyond every angle" if summary["flown"] >= more and lost else least
+        yield f"where the budget has -, {why}"
 
 
 def compliance(summary: Summary) -> Table | None:
     """Requirements on pointing as a review takes them over; None: there are none."""
-    rows = []
-    for told in summary["verdicts"]:
-        if is_index(told["metric"]):
-            index, _, axis = told["metric"].rpartition("_")
-            rows.append(_row(told, INDICES[index].partition(",")[0], axis))
+    rows = [_row(verdict) for verdict in summary["verdicts"] if is_index(verdict["metric"])]
     if not rows:
         return None
     head = ("index", "about", "at most", "probability", "interpretation", "confidence", "shown", "runs", "beyond")
     return Table((*head, "needed without", "verdict"), rows)
 
 
-def _row(told: Summary, index: str, axis: str) -> tuple[str, ...]:
-    kind = told.get("interpretation") or "ensemble"
-    probability, confidence = told["quantile"], told["confidence"]
-    margin = told["margin"]
+def _row(verdict: Summary) -> tuple[str, ...]:
+    index, _, axis = verdict["metric"].rpartition("_")
+    kind = verdict.get("interpretation") or "ensemble"
+    probability, confidence, margin = verdict["quantile"], verdict["confidence"], verdict["margin"]
     if kind == "ensemble":
-        shown = angle(None if margin is None else margin * told["limit"])
+        shown = angle(None if margin is None else margin * verdict["limit"])
     else:
-        shown = f"{100 * told['shown']:.6g} % of the time"
+        shown = f"{100 * verdict['shown']:.6g} % of the time"
     return (
-        index,
+        INDICES[index].partition(",")[0],
         "half-cone" if axis == "boresight" else axis,
-        angle(told["limit"]),
+        angle(verdict["limit"]),
         "all flown" if probability is None else f"{100 * probability:g} %",
         kind,
         "none asked" if confidence is None else f"{100 * confidence:g} %",
         shown,
-        str(told["trials"]),
-        str(told["failures"]),
+        str(verdict["trials"]),
+        str(verdict["failures"]),
         _needed(kind, probability, confidence),
-        "met" if told["met"] else "NOT met",
+        "met" if verdict["met"] else "NOT met",
     )
 
 

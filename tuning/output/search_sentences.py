@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 from tuning.output import margin_sentences
-from tuning.output.cells import Summary
+from tuning.output.cells import Summary, lost
 
 AGREE = 0.01  # slopes off from differences by more than this share say little
 
@@ -14,15 +14,15 @@ def search(summary: Summary) -> Iterator[str]:
     record = summary["search"]
     for metric, ratio in record.get("largest_over_limit", {}).items():
         if ratio is None or ratio > 1.0:
-            far = _far(summary, metric, ratio)
-            yield f"no gains found within the bounds keep every limit: with the best ones {far}"
+            how_far = _how_far(summary, metric, ratio)
+            yield f"no gains found within the bounds keep every limit: with the best ones {how_far}"
     yield from _went_on(record)
-    for one in record.get("confirmed", []):
-        most = "none would have to be" if one["allowed"] is None else f"at most {one['allowed']} allowed"
+    for count in record.get("confirmed", []):
+        most = "none would have to be" if count["allowed"] is None else f"at most {count['allowed']} allowed"
         yield (
-            f"{one['metric']} {'confirmed' if one['held'] else 'NOT confirmed'} on {one['trials']} trials that the "
-            f"search did not see: {one['beyond']} beyond the limit, {most}; the verdict on fresh trials is met with a "
-            f"probability of {100 * one['probability']:.3g} %"
+            f"{count['metric']} {'confirmed' if count['held'] else 'NOT confirmed'} on {count['trials']} trials that "
+            f"the search did not see: {count['beyond']} beyond the limit, {most}; the verdict on fresh trials is met "
+            f"with a probability of {100 * count['probability']:.3g} %"
         )
     if record.get("hardest") is not None:
         yield _worst_case(record["hardest"], tuned_for=record.get("worst_case", False))
@@ -33,24 +33,24 @@ def search(summary: Summary) -> Iterator[str]:
             f"{record['seconds']:.0f} s" + "".join(f", {what} {spent:.0f} s" for what, spent in steps if spent >= 1.0)
         )
     if summary.get("differential_evolution") is not None:
-        yield _globally(summary["differential_evolution"], record)
+        yield _beside_evolution(summary["differential_evolution"], record)
 
 
 def _went_on(record: Summary) -> Iterator[str]:
     """That gains broke a limit on fresh trials, and the search went on."""
     earlier = record.get("earlier", [])
-    margins = [*(one["margin"] for one in earlier[1:]), record.get("margin", 0.0)]
-    for one, margin in zip(earlier, margins, strict=False):
-        reached = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in one["over"].items())
+    next_margins = [*(search["margin"] for search in earlier[1:]), record.get("margin", 0.0)]
+    for search, margin in zip(earlier, next_margins, strict=False):
+        over = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in search["over"].items())
         yield (
-            f"gains that kept every limit in the search reached {reached} on fresh trials (seed {one['fresh_seed']}): "
+            f"gains that kept every limit in the search reached {over} on fresh trials (seed {search['fresh_seed']}): "
             f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
-            f"{100 * one['margin']:.2g} %, and what it found is judged on other trials"
+            f"{100 * search['margin']:.2g} %, and what it found is judged on other trials"
         )
 
 
 def _worst_case(hardest: Summary, *, tuned_for: bool) -> str:
-    """How far the worst case inside the dispersions goes."""
+    """How far the worst case inside the dispersions goes; tuned_for: whether the search tuned for it."""
     if hardest["unbounded"]:
         moved = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "what is drawn"
         reach = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "makes the loop diverge")
@@ -63,41 +63,40 @@ def _worst_case(hardest: Summary, *, tuned_for: bool) -> str:
     return f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
 
 
-def _globally(checked: Summary, record: Summary) -> str:
+def _beside_evolution(check: Summary, record: Summary) -> str:
     """What differential evolution found, beside the search."""
-    kept = all(ratio is not None and ratio <= 1.0 for ratio in record["largest_over_limit"].values())
+    search_keeps = all(ratio is not None and ratio <= 1.0 for ratio in record["largest_over_limit"].values())
     beside = {
-        (True, True): f"and the goal of the tuned gains is {100 * checked['distance']:+.2f} % off that",
+        (True, True): f"and the goal of the tuned gains is {100 * check['distance']:+.2f} % off that",
         (True, False): "with gains that break a limit, which the tuned gains keep",
         (False, True): "with gains that keep every limit, unlike the tuned ones",
         (False, False): "with gains that do not keep every limit, as the tuned ones do not",
-    }[kept, checked["kept"]]
+    }[search_keeps, check["kept"]]
     return (
-        f"differential evolution, a global search with {checked['rollouts']} rollouts, found {checked['value']:.4e}, "
+        f"differential evolution, a global search with {check['rollouts']} rollouts, found {check['value']:.4e}, "
         f"{beside}"
     )
 
 
-def _far(summary: Summary, metric: str, ratio: float | None) -> str:
+def _how_far(summary: Summary, metric: str, ratio: float | None) -> str:
     """How far the training trials are beyond a limit, or how many of them do not arrive, in words."""
     if ratio is not None and math.isfinite(ratio):
         limit = next((f", {v['limit']:g} {v['unit']}," for v in summary["verdicts"] if v["metric"] == metric), "")
         return f"{metric} reaches {ratio:.3g} times its limit{limit} on the training trials"
     training = summary.get("training", {})
-    lost = {status: n for status, n in training.get("counts", {}).items() if n and status != "ok"}
-    if not lost:
+    bad, ended = lost(training.get("counts", {}))
+    if not bad:
         return f"a training trial has no {metric}"
-    ended = ", ".join(f"{n} {status}" for status, n in lost.items())
-    return f"{sum(lost.values())} of {training['trials']} training trials do not arrive ({ended}), and so keep no limit"
+    return f"{bad} of {training['trials']} training trials do not arrive ({ended}), and so keep no limit"
 
 
 def advice(summary: Summary) -> Iterator[str]:
     """What to change where fresh trials break a requirement that the search kept."""
     record = summary["search"]
-    kept = {metric for metric, ratio in record["largest_over_limit"].items() if ratio is not None and ratio <= 1.0}
     for verdict in summary["verdicts"]:
-        over = verdict["margin"]
-        if verdict["met"] or verdict["metric"] not in kept or verdict.get("at_least") or not verdict["limit"]:
+        searched, over = record["largest_over_limit"].get(verdict["metric"]), verdict["margin"]
+        kept_in_search = searched is not None and searched <= 1.0
+        if verdict["met"] or not kept_in_search or verdict.get("at_least") or not verdict["limit"]:
             continue
         larger = f"tune.trials = {4 * record.get('averaged', 256)}"
         if over is None or not math.isfinite(over):
@@ -112,8 +111,8 @@ def advice(summary: Summary) -> Iterator[str]:
 
 def trust(summary: Summary) -> Iterator[str]:
     """What the gains do, and whether the slopes are right."""
-    believed = summary.get("trust")
-    influence = {} if believed is None else believed["influence"]
+    record = summary.get("trust")
+    influence = {} if record is None else record["influence"]
     for gain, side in summary["at_bound"].items():
         if influence.get(gain) == "none":
             continue
@@ -121,16 +120,16 @@ def trust(summary: Summary) -> Iterator[str]:
     for gain, how in influence.items():
         if how == "none":
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
-    if believed is None:
+    if record is None:
         return
-    yield from margin_sentences.tuned(believed.get("margins"))
-    if believed["slopes_off_central_differences"] is None:
+    yield from margin_sentences.tuned(record.get("margins"))
+    if record["slopes_off_central_differences"] is None:
         yield (
             "the gains were found by evolution, since the exact sign has no slopes to go by; with sign_width free, its "
             "width is a gain too"
         )
         return
-    off = {place: value for place, value in believed["slopes_off_central_differences"].items() if value is not None}
+    off = {place: value for place, value in record["slopes_off_central_differences"].items() if value is not None}
     shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
     if max(off.values(), default=0.0) <= AGREE:
         yield f"slopes by automatic differentiation agree with differences to {shown}"
@@ -147,7 +146,7 @@ def shortest(summary: Summary) -> Iterator[str]:
 
     times = summary.get("shortest_t_f")
     if times is not None:
-        yield design.text(times["limit"], times["theory"], times["simulated"])
+        yield str(design.ShortestTime(**times))
 
 
 def along_the_front(summary: Summary) -> Iterator[str]:
@@ -161,6 +160,6 @@ def along_the_front(summary: Summary) -> Iterator[str]:
 
 def fastest(summary: Summary) -> Iterator[str]:
     """The shortest of the prescribed times whose gains meet every requirement."""
-    found = min((slew for slew in summary["slews"] if slew["meets"]), key=lambda slew: slew["t_f"], default=None)
-    if found is not None and summary["requirements"]:
-        yield f"the shortest of them is t_f = {found['t_f']:g} s, with an RMS window error of {found['rms']:.3g}"
+    shortest = min((slew for slew in summary["slews"] if slew["meets"]), key=lambda slew: slew["t_f"], default=None)
+    if shortest is not None and summary["requirements"]:
+        yield f"the shortest of them is t_f = {shortest['t_f']:g} s, with an RMS window error of {shortest['rms']:.3g}"

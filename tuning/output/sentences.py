@@ -4,44 +4,37 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ptsmc_jax.simulation.catalogues import MARGINS
+from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 from tuning.output import pointing_sentences
-from tuning.output.cells import Summary, Table
+from tuning.output.cells import Summary, Table, digits, lost
 
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
 
-def verdict(told: Summary) -> str:
-    """A verdict in one line; over many trials with the share of them that keeps the limit."""
+def verdict(entry: Summary) -> str:
+    """A verdict of a summary in one line; over many trials with the share of them that keeps the limit."""
     from ptsmc_jax.simulation.requirements import Verdict
 
-    text = str(Verdict.read(told))
-    if told.get("share_of_time") is not None or "share_interval" not in told:
+    text = str(Verdict.read(entry))
+    if entry.get("share_of_time") is not None or "share_interval" not in entry:
         return text
-    low, high = told["share_interval"]
-    text += f"; {100 * told['share']:.6g} % of trials keep the limit (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
-    if told["quantile"] is not None and told["confidence"] is not None:
-        text += f", at least {100 * told['share_bound']:.6g} % at {100 * told['confidence']:g} % one-sided confidence"
-        if told["share"] > told["quantile"]:
-            so_many = "so many failures" if told["failures"] else "no failure"
-            text += f"; with {so_many} {told['fewest_trials']} trials would do"
+    low, high = entry["share_interval"]
+    text += f"; {100 * entry['share']:.6g} % of trials keep the limit (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
+    if entry["quantile"] is not None and entry["confidence"] is not None:
+        text += f", at least {100 * entry['share_bound']:.6g} % at {100 * entry['confidence']:g} % one-sided confidence"
+        if entry["share"] > entry["quantile"]:
+            so_many = "so many failures" if entry["failures"] else "no failure"
+            text += f"; with {so_many} {entry['fewest_trials']} trials would do"
     return text
 
 
 def run(summary: Summary, kind: str) -> Table:
     """Metrics of one run; kind: of its plant."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     none = "never" if summary["status"] in ("ok", "missed") else "-"
-    known = {name: said for name, said in CATALOGUES[kind].items() if name in summary}
     rows = [
-        (
-            name,
-            none if (value := summary[name]) is None or value != value else f"{value:.5g}",
-            entry.unit,
-            entry.meaning,
-        )
-        for name, entry in known.items()
+        (name, digits(summary[name], ".5g", none), entry.unit, entry.meaning)
+        for name, entry in CATALOGUES[kind].items()
+        if name in summary
     ]
     return Table(("metric", "value", "unit", "meaning"), rows)
 
@@ -52,8 +45,6 @@ def with_unit(name: str, kind: str) -> str:
     >>> with_unit("largest_peak_torque", "spacecraft"), with_unit("delay_margin", "chain"), with_unit("status", "chain")
     ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
     """
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     units = {metric: entry.unit for metric, entry in CATALOGUES[kind].items()}
     units |= {"torque": units["peak_torque"], "delay_margin": "s"}
     units |= {"initial_angle": "rad"} if kind == "spacecraft" else {}
@@ -64,9 +55,9 @@ def with_unit(name: str, kind: str) -> str:
 def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str]) -> Iterator[str]:
     """What was flown over two keys, across and up; pairs: a map's rows by column, x and y those of the keys."""
     flown = [pair for pair in pairs if pair["status"] == "flown"]
-    known = [pair for pair in flown if pair["window_error"] == pair["window_error"]]
-    if known:
-        best = min(known, key=lambda pair: (pair["failures"], pair["window_error"]))
+    with_error = [pair for pair in flown if pair["window_error"] == pair["window_error"]]  # not NaN
+    if with_error:
+        best = min(with_error, key=lambda pair: (pair["failures"], pair["window_error"]))
         where = f"{keys[0]} = {best['x']:.4g} and {keys[1]} = {best['y']:.4g}"
         failed = f", where {best['failures']:.0f} trials failed" if best["failures"] else ""
         peak = f"where the mean peak of the input is {best['peak_torque']:.3g}"
@@ -86,31 +77,28 @@ def run_lines(summary: Summary) -> list[str]:
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     units = {**CATALOGUES[kind], **MARGINS}
     return [
-        {"metric": name, "worst": summary.get(name), "at_least": False, **told, "unit": units[name][0], "trials": 1,
-         "failures": int(not told["met"])}
-        for name, told in summary["verdicts"].items()
+        {"metric": name, "worst": summary.get(name), "at_least": False, **entry, "unit": units[name][0], "trials": 1,
+         "failures": int(not entry["met"])}
+        for name, entry in summary["verdicts"].items()
     ]  # fmt: skip
 
 
 def tuning(summary: Summary) -> Table:
     """Gains and what they do, beside the paper's and those before."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
     from tuning.search.gains import base, units
 
-    called = summary.get("paper_is", "paper")  # what its column is
-    groups = {called: summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
+    paper = summary.get("paper_is", "paper")  # the heading of its column
+    groups = {paper: summary.get("paper"), "before": summary.get("before"), "tuned": summary["fresh"]}
     groups = {name: group for name, group in groups.items() if group is not None}
     rows: list[tuple[str, ...]] = []
     kind = summary.get("plant", "spacecraft")  # not yet said in earlier results
-    known = units(kind) | summary.get("gain_units", {})
+    gain_units = units(kind) | summary.get("gain_units", {})
     for gain in dict.fromkeys(name for group in groups.values() for name in group["gains"]):
-        cells = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
-        if len(set(cells)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):
-            rows.append((gain, *("-" if v is None else f"{v:.6g}" for v in cells), known[base(gain)]))
+        values = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
+        if len(set(values)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):
+            rows.append((gain, *(digits(v, ".6g") for v in values), gain_units[base(gain)]))
     trials = summary["fresh"]["trials"]
     for label, metric, statistic in (
         ("RMS window error", "window_error", "rms"),
@@ -119,10 +107,11 @@ def tuning(summary: Summary) -> Table:
         ("largest peak torque", "peak_torque", "max"),
         ("mean effort", "effort", "mean"),
     ):
-        found = (group[metric][statistic] if group[metric] else None for group in groups.values())
-        rows.append((label, *("-" if v is None else f"{v:.4g}" for v in found), CATALOGUES[kind][metric][0]))
+        values = [group[metric][statistic] if group[metric] else None for group in groups.values()]
+        rows.append((label, *(digits(v, ".4g") for v in values), CATALOGUES[kind][metric].unit))
         if label == "RMS window error" and summary["fresh"].get("floor"):
-            rows.append(("times the floor", *(_times(group) for group in groups.values()), ""))
+            floors = [group.get("floor") for group in groups.values()]
+            rows.append(("times the floor", *(digits(v, ".3g") for v in map(over_floor, values, floors)), ""))
     rows.append(("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), ""))
     return Table(("", *groups, "unit"), rows)
 
@@ -143,10 +132,9 @@ PAPER = {  # columns of the paper's gains in words
 def accuracy(summary: Summary) -> Iterator[str]:
     """How accurate the tuned gains are; no praise where trials do not arrive or limits are broken."""
     fresh, times = summary["fresh"], summary["accuracy_gain_over_paper"]
-    lost = {status: n for status, n in fresh["counts"].items() if n and status != "ok"}
-    if lost:
-        ended = ", ".join(f"{n} {status}" for status, n in lost.items())
-        yield f"with the tuned gains {sum(lost.values())} of {fresh['trials']} fresh trials do not arrive: {ended}"
+    bad, ended = lost(fresh["counts"])
+    if bad:
+        yield f"with the tuned gains {bad} of {fresh['trials']} fresh trials do not arrive: {ended}"
     broken = [v["metric"] for v in summary["verdicts"] if not v["met"]]
     paper = PAPER[summary.get("paper_is", "paper")]
     if times is not None and fresh["counts"].get("ok", 0):
@@ -164,10 +152,11 @@ def accuracy(summary: Summary) -> Iterator[str]:
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
         yield "the scenario's own gains are more accurate than the tuned ones: see tune.bounds and the requirements"
     if trained and fresh:
-        both = [f"{one['rms']:.3e} on the {where} trials" + _between(one.get("rms_interval"), ".3e")
-                for where, one in (("training", trained), ("fresh", fresh))]  # fmt: skip
-        said = ", ".join(both)
-        yield f"the tuned gains' RMS window error is {said}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
+        errors = ", ".join(
+            f"{error['rms']:.3e} on the {where} trials" + _between(error.get("rms_interval"), ".3e")
+            for where, error in (("training", trained), ("fresh", fresh))
+        )
+        yield f"the tuned gains' RMS window error is {errors}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
 
 
 def cautions(summary: Summary) -> Iterator[str]:
@@ -191,11 +180,6 @@ def over_floor(error: float | None, least: float | None) -> float | None:
     return error / least if error and least else None
 
 
-def _times(group: Summary) -> str:
-    times = over_floor(group["window_error"] and group["window_error"]["rms"], group.get("floor"))
-    return "-" if times is None else f"{times:.3g}"
-
-
 def paper_refused(summary: Summary) -> Iterator[str]:
     """Why nothing is set beside the paper's gains, if so."""
     if summary.get("paper_refused"):
@@ -208,28 +192,37 @@ def _between(interval: Sequence[float] | None, digits: str) -> str:
 
 def front(summary: Summary) -> Table:
     """Points that no other one beats, and the paper's and the scenario's own gains."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
     from tuning.search.gains import base
 
     units = CATALOGUES[summary["plant"]]
-    kept = [point for point in summary["points"] if not point["dominated"]]
-    names = list(kept[0]["gains"]) if kept else []
+    points = [("", point) for point in summary["points"] if not point["dominated"]]
+    names = list(points[0][1]["gains"]) if points else []
+    points += [(name, summary[name]) for name in ("paper", "before") if name in summary]
     rows: list[tuple[str, ...]] = []
-    for name, point in [("", p) for p in kept] + [(n, summary[n]) for n in ("paper", "before") if n in summary]:
-        low, high = point["interval"] or (None, None)
-        marks = [word for word in ("knee", "meets") if point[word]]
-        if point["failures"]:
-            marks.append(f"{point['failures']} failed or missed")
+    for name, point in points:
         gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
-        cells = ["-" if value is None else f"{value:.4g}" for value in gains]
+        cells = [digits(value, ".4g") for value in gains]
         if summary.get("floor"):
-            cells.insert(0, "-" if point["rms"] is None else f"{point['rms'] / summary['floor']:.3g}")
-        within = "-" if low is None or high is None else f"{50 * (high - low) / point['rms']:.1f} %"
-        numbers = (_digits(point["peak"], ".4g"), _digits(point["mean_peak"], ".4g"), _digits(point["rms"], ".3e"))
-        rows.append((name, *numbers, within, *cells, ", ".join(marks)))
-    torque, error = units["peak_torque"][0], units["window_error"][0]
+            cells.insert(0, digits(over_floor(point["rms"], summary["floor"]), ".3g"))
+        numbers = (digits(point["peak"], ".4g"), digits(point["mean_peak"], ".4g"), digits(point["rms"], ".3e"))
+        rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
+    torque, error = units["peak_torque"].unit, units["window_error"].unit
     beside = ("times the floor",) if summary.get("floor") else ()
     return Table(("", f"largest peak [{torque}]", "mean peak", f"RMS error [{error}]", "+-", *beside, *names, ""), rows)
+
+
+def _spread(point: Summary) -> str:
+    """Half the interval of a point's RMS error, as a share of that error."""
+    if not point["interval"]:
+        return "-"
+    low, high = point["interval"]
+    return f"{50 * (high - low) / point['rms']:.1f} %"
+
+
+def _marks(point: Summary) -> str:
+    """What is worth knowing of a point besides its numbers."""
+    marks = [word for word in ("knee", "meets") if point.get(word)]
+    return ", ".join(marks + ([f"{point['failures']} failed or missed"] if point["failures"] else []))
 
 
 def front_lines(summary: Summary) -> Iterator[str]:
@@ -253,34 +246,26 @@ def front_heading(summary: Summary) -> str:
 
 def slew_times(summary: Summary) -> Table:
     """Each prescribed time: the error, what it costs, its gains."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     units, slews = CATALOGUES[summary["plant"]], summary["slews"]
     costs, names = (list(slews[0][key]) if slews else [] for key in ("costs", "gains"))
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for slew in slews:
-        low, high = slew["interval"] or (None, None)
-        within = "-" if low is None or high is None else f"{50 * (high - low) / slew['rms']:.1f} %"
-        marks = ["meets"] if slew["meets"] else []
-        marks += [f"{slew['failures']} failed or missed"] if slew["failures"] else []
-        numbers = (f"{slew['t_f']:g}", _digits(slew["rms"], ".3e"), within)
-        numbers += tuple(_digits(slew["costs"][name], ".4g") for name in costs)
-        rows.append((*numbers, *(f"{slew['gains'][name]:.4g}" for name in names), ", ".join(marks)))
-    head = (f"{name.replace('_', ' ')} [{units[name][0]}]" for name in costs)
-    return Table(("t_f [s]", f"RMS error [{units['window_error'][0]}]", "+-", *head, *names, ""), rows)
+        numbers = (f"{slew['t_f']:g}", digits(slew["rms"], ".3e"), _spread(slew))
+        cells = [digits(slew["costs"][name], ".4g") for name in costs] + [f"{slew['gains'][n]:.4g}" for n in names]
+        rows.append((*numbers, *cells, _marks(slew)))
+    head = (f"{name.replace('_', ' ')} [{units[name].unit}]" for name in costs)
+    return Table(("t_f [s]", f"RMS error [{units['window_error'].unit}]", "+-", *head, *names, ""), rows)
 
 
 def slew_times_lines(summary: Summary) -> Iterator[str]:
     """What the fastest slew costs beside the slowest, and which times have no gains."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     units, slews = CATALOGUES[summary["plant"]], summary["slews"]
     if len(slews) > 1:
         fast, slow = slews[0], slews[-1]
         for name in fast["costs"]:
             one, other = fast["costs"][name], slow["costs"][name]
             if one and other:
-                yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name][0]} at t_f = {fast['t_f']:g} s, "
+                yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
                        f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
         if fast["rms"] and slow["rms"]:
             yield (f"RMS window error: {fast['rms']:.3e} at t_f = {fast['t_f']:g} s, {fast['rms'] / slow['rms']:.3g} "
@@ -300,26 +285,19 @@ def slew_times_heading(summary: Summary) -> str:
 
 def campaign(summary: Summary) -> Table:
     """Quantiles of every metric."""
-    from ptsmc_jax.simulation.catalogues import CATALOGUES
-
     rows: list[tuple[str, ...]] = []
-    for name, told in summary["quantiles"].items():
+    for name, statistics in summary["quantiles"].items():
         if pointing_sentences.is_index(name):
             continue
-        far = told["0.9973"]
+        median, far, largest = statistics["0.5"]["value"], statistics["0.9973"], statistics.get("max")
         between = f"{_number(far['low'])}..{_number(far['high'])}"
-        cells = (told["0.5"]["value"], far["value"])
         unit = CATALOGUES[summary["plant"]].get(name, ("",))[0]
-        rows.append((name, *(_number(v) for v in cells), between, _number(told.get("max")), unit))
+        rows.append((name, _number(median), _number(far["value"]), between, _number(largest), unit))
     return Table(("", "median", "99.73 %", "its 95 % interval", "largest", "unit"), rows)
 
 
 def _number(value: float | None) -> str:
-    return "none" if value in (float("inf"), float("-inf")) else _digits(value, ".3g")
-
-
-def _digits(value: float | None, form: str) -> str:
-    return "-" if value is None or value != value else f"{value:{form}}"
+    return "none" if value in (float("inf"), float("-inf")) else digits(value, ".3g")
 
 
 def campaign_counts(summary: Summary) -> Iterator[str]:
@@ -348,28 +326,30 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
     """The law, observer and filter of a scenario's tables, with the numbers that they fly with; kind: of its plant."""
     from tuning.search.gains import units
 
-    known, rows = units(kind), list[tuple[str, ...]]()
+    gain_units = units(kind)
+    rows: list[tuple[str, ...]] = []
     prefixes = {"controller": "", "observer": "observer_", "filter": "filter_", "sensors": "sensors_"}
     for table, prefix in prefixes.items():
         own = scenario.get(table, {}).get("kind") == "own"  # its class, which reading does not run, has the units
         for key, value in scenario.get(table, {}).items():
             numbers = value if isinstance(value, list) else [value]
             each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]
-            said = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
-            unit = "" if own and key not in ("t_f", "delta") else known.get(prefix + key, "").replace("-", "")
-            rows.append((f"{table}.{key}", said, unit))
+            text = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
+            unit = "" if own and key not in ("t_f", "delta") else gain_units.get(prefix + key, "").replace("-", "")
+            rows.append((f"{table}.{key}", text, unit))
     return Table(("key", "value", "unit"), rows)
 
 
 def campaign_drivers(summary: Summary) -> Iterator[str]:
     """What drives the error and the metrics of the requirements."""
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
-        driven = summary["drivers"].get(name, {}).items()
-        driven = [(key, found) for key, found in driven if max(map(abs, found.values())) >= WEAK]
-        driven = sorted(driven, key=lambda item: -max(map(abs, item[1].values())))[:3]
-        if driven:
-            said = (f"{key} {d['rank_correlation']:+.2f} ({100 * d['first_order']:.0f} %)" for key, d in driven)
-            yield f"{name} hangs on {', '.join(said)}: rank correlation (share of its variance)"
+        drivers = summary["drivers"].get(name, {})
+        strength = {key: max(map(abs, driver.values())) for key, driver in drivers.items()}
+        strongest = sorted((key for key in drivers if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
+        if strongest:
+            shown = ((key, drivers[key]["rank_correlation"], drivers[key]["first_order"]) for key in strongest)
+            texts = (f"{key} {rank:+.2f} ({100 * share:.0f} %)" for key, rank, share in shown)
+            yield f"{name} hangs on {', '.join(texts)}: rank correlation (share of its variance)"
 
 
 def claims(summary: Summary) -> Table:

@@ -2,10 +2,14 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tuning.output import margin_sentences, search_sentences, sentences
 from tuning.output.progress_lines import Bar
+
+if TYPE_CHECKING:
+    from tuning.output.cells import Table as Content
+    from tuning.studies.mapping import Cell
 
 WIDE = 1000  # columns of what is no terminal
 
@@ -38,7 +42,7 @@ def reproduction(summary: dict[str, Any], folder: Path) -> None:
     say("claims.md says why, and gives the slips as printed", f"results in {folder}")
 
 
-def grid(cells: list[Any], keys: tuple[str, str], folder: Path) -> None:
+def grid(cells: "list[Cell]", keys: tuple[str, str], folder: Path) -> None:
     """What was flown over two keys, across and up."""
     say(*sentences.grid([asdict(cell) for cell in cells], keys), f"results in {folder}")
 
@@ -81,26 +85,23 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
 
     alike = f"each law is tuned alike and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
-    for one in law_sentences.answers(summary):
-        table(one.table, title=one.title, title_justify="left")
-    said = [law_sentences.winner(summary), *law_sentences.lines(summary)]
-    say(*said, *sentences.cautions(summary), f"results in {folder}")
+    for answer in law_sentences.answers(summary):
+        table(answer.table, title=answer.title, title_justify="left")
+    say(law_sentences.winner(summary), *law_sentences.lines(summary))
+    say(*sentences.cautions(summary), f"results in {folder}")
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
     """A front of accuracy against torque, or against t_f, as its `summary.json` says."""
     if "slews" in summary:
-        return slew_times(summary, folder, how)
-    say(f"front {how}: {sentences.front_heading(summary)}")
-    table(sentences.front(summary))
-    say(*sentences.front_lines(summary), *sentences.cautions(summary), f"results in {folder}")
-
-
-def slew_times(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """What a faster slew costs, as its `summary.json` says."""
-    say(f"{how}: {sentences.slew_times_heading(summary)}")
-    table(sentences.slew_times(summary))
-    say(*sentences.slew_times_lines(summary), *sentences.cautions(summary), f"results in {folder}")
+        say(f"{how}: {sentences.slew_times_heading(summary)}")
+        table(sentences.slew_times(summary))
+        say(*sentences.slew_times_lines(summary))
+    else:
+        say(f"front {how}: {sentences.front_heading(summary)}")
+        table(sentences.front(summary))
+        say(*sentences.front_lines(summary))
+    say(*sentences.cautions(summary), f"results in {folder}")
 
 
 def say(*lines: str) -> None:
@@ -111,16 +112,16 @@ def say(*lines: str) -> None:
         Console(highlight=False).print(line, soft_wrap=True, markup=False)
 
 
-def table(cells: sentences.Table, **style: Any) -> None:
+def table(content: "Content", **style: Any) -> None:
     """Print a table; style: of rich's `Table`."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(*map(escape, cells.head), pad_edge=False, **{"box": None, **style})
-    for row in cells.rows:
-        made.add_row(*map(Text, row))
+    printed = Table(*map(escape, content.head), pad_edge=False, **{"box": None, **style})
+    for row in content.rows:
+        printed.add_row(*map(Text, row))
     # a file or a pipe has no width: what does not fit into 80 columns would be cut
     width = None if Console().is_terminal else WIDE
-    Console(highlight=False, width=width).print(made)
+    Console(highlight=False, width=width).print(printed)

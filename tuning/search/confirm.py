@@ -56,9 +56,9 @@ def may_break(requirement: Requirement, requirements: Sequence[Requirement], tri
     if quantile is None:
         return None, False
     if confidence is None or trials >= SHOWN * fewest_trials(quantile, confidence):
-        kept = must_keep(trials, quantile, confidence)
-        assert kept is not None
-        return trials - kept, False
+        least = must_keep(trials, quantile, confidence)
+        assert least is not None
+        return trials - least, False
     return min(FARTHER, allowed(requirement, fresh_trials(requirements), counted_on(requirements)) or 0), True
 
 
@@ -91,22 +91,23 @@ def count(
     fresh, many = fresh_trials(requirements), counted_on(requirements)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
     flown = flights.trials(problem.others(numbers), gains)
-    found = []
+    counts = []
     for requirement in requirements:
         values = np.where(flown.finished, getattr(flown.metrics, requirement.metric), np.inf)
         ratio = over(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
-        order = np.argsort(-ratio, kind="stable")
+        farthest_first = numbers[np.argsort(-ratio, kind="stable")]
         beyond = int(np.sum(ratio > 1.0))
         most = allowed(requirement, fresh, many)
-        found.append(
+        last = most or 0
+        counts.append(
             Count(
                 metric=requirement.metric,
                 trials=many,
                 beyond=beyond,
                 allowed=most,
                 probability=probability(requirement, fresh, many, beyond),
-                harder=numbers[order[(most or 0) : beyond]],
-                band=numbers[order[max(0, (most or 0) - FARTHER) : (most or 0) + NEARER]],
+                harder=farthest_first[last:beyond],
+                band=farthest_first[max(0, last - FARTHER) : last + NEARER],
             )
         )
-    return found
+    return counts

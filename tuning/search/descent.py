@@ -2,12 +2,13 @@
 
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import minimize
 
 from tuning.search.evaluate import Measured, Sloped
-from tuning.search.objective import Problem, ended, failures
+from tuning.search.objective import ended, failures
 
 SLACK = 1e-4  # of a limit that an admissible point may use
 BROKEN = 1e3  # metric / limit by which a trial that fails is over, beside those that end
@@ -58,34 +59,44 @@ class _EnoughError(Exception):
     """A descent has looked at as many points as it may."""
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a descent begins, and how."""
+
+    share: np.ndarray  # (gains,)
+    scale: float = BOLD  # the first step is the slope over its square
+    fixed: Sequence[int] = ()  # gains that stay as they are
+    # the points that a shorter descent from here looked at, which are not flown again: a longer one goes on from there
+    seen: dict[bytes, Sloped] = field(default_factory=dict)
+
+
 def descend(
-    slopes: Callable[[Problem, np.ndarray], Sloped],
-    problem: Problem,
+    slopes: Callable[[np.ndarray], Sloped],
     best: Best,
-    share: np.ndarray,
+    start: Start,
     steps: int,
     keep: Callable[[Sloped], None],
-    *,
     close: float = CLOSE,
-    scale: float = BOLD,
-    fixed: Sequence[int] = (),
-    seen: dict[bytes, Sloped] | None = None,
 ) -> None:
-    """Go downhill from these shares, (gains,), inside the bounds, and keep the best point in `best`.
+    """Go downhill from a start inside the bounds.
 
-    At most so many points are looked at, with slopes; fewer where F changes by less than `close`. The first step is the
-    slope over scale^2. fixed: gains that stay as they are. keep is called with what was measured at each point that the
-    descent goes through, without those that it only tries. seen: the points that a shorter descent from here looked at,
-    which are not flown again: a longer one goes on where it stopped. slopes: measures a problem at a point (1, gains).
+    Args:
+        slopes: measures the problem at a point (1, gains).
+        best: is offered every point.
+        start: where it begins.
+        steps: how many points may be looked at.
+        keep: is called with what was measured at each point that the descent goes through, without those that it only
+            tries.
+        close: change of F at which it ends.
     """
-    seen = {} if seen is None else seen
+    seen, scale = start.seen, start.scale
 
     def at(scaled: np.ndarray) -> Sloped:
         key, point = scaled.tobytes(), np.clip(scaled / scale, 0.0, 1.0)[None]
         if key not in seen:
             if len(seen) == steps:
                 raise _EnoughError
-            seen[key] = slopes(problem, point)
+            seen[key] = slopes(point)
         if seen[key].finite[0]:
             best.offer(point, seen[key])
         return seen[key]
@@ -100,16 +111,17 @@ def descend(
         if scaled.tobytes() in seen:
             keep(seen[scaled.tobytes()])
 
-    first = scale * share
-    keep(at(first))
+    first = scale * start.share
+    at_start = at(first)
+    keep(at_start)
     with contextlib.suppress(_EnoughError):
         minimize(
             lambda scaled: float(at(scaled).f[0]),
             first.copy(),
             jac=lambda scaled: _usable(at(scaled).f_slope)[0] / scale,
             method="SLSQP",
-            bounds=[(at, at) if k in fixed else (0.0, scale) for k, at in enumerate(first)],
-            constraints=[limits] if problem.rows else [],
+            bounds=[(own, own) if k in start.fixed else (0.0, scale) for k, own in enumerate(first)],
+            constraints=[limits] if at_start.c.shape[1] else [],
             callback=passed,
             options={"maxiter": steps, "ftol": close},
         )

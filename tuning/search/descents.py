@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
-from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, descend, largest
+from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.lockstep import Ask, in_step
 from tuning.search.objective import FAILED, Problem, failures, fewer_trials
@@ -24,8 +24,7 @@ from tuning.search.starts import CHOOSING, STEEP, SWEPT, charged, promising, spr
 from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # starts from whose best points a further round goes on
-# most starts are given up after descents on EXPLORED trials, of which at least AVERAGED count in the objective
-EXPLORED, AVERAGED = 32, 16
+EXPLORED, AVERAGED = 32, 16  # trials on which most starts are given up; at least so many count in the objective
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
@@ -47,13 +46,11 @@ class Step:
 
 
 @dataclass(frozen=True)
-class _Start:
-    """Where a descent begins, or goes on."""
+class _Racer:
+    """A start in a race, and the history that led to it."""
 
-    share: np.ndarray  # (gains,)
-    scale: float
-    seen: dict[bytes, Sloped]  # points that it looked at before
-    before: list[Step]  # of its history, those of earlier descents
+    start: Start
+    before: list[Step]
 
 
 def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple[dict, dict]:
@@ -104,7 +101,7 @@ class Descents:
         return self._best is not None and bool(np.isfinite(self._best.f))
 
     @property
-    def best_so_far(self) -> tuple[float, float]:
+    def so_far(self) -> tuple[float, float]:
         """The goal of the best point, and how far it is beyond a limit."""
         return (np.nan, np.nan) if self._best is None else self._best.so_far
 
@@ -135,15 +132,11 @@ class Descents:
         """The points gone through, in the order of the starts and of each start's steps."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
-    def prepare(self, problem: Problem) -> None:
-        """Begin to compile what a search will need later, beside its first steps."""
-        self._evaluate.prepare(problem)
-
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
         """Descend from the scenario's own gains, (gains,), on a few trials."""
         self._own = self._evaluate.bounds.share(own)
-        self._report(SETTING_OUT, 0, 2, *self.best_so_far)
-        self._descend(_few_trials(problem), self._own, 0, max(2, self._steps // 2), scale=CAREFUL)
+        self._report(SETTING_OUT, 0, 2, *self.so_far)
+        self._descend(_few_trials(problem), 0, Start(self._own, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
@@ -151,8 +144,8 @@ class Descents:
         The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
         """
         problem, few, more = _few_trials(problem), max(2, self._steps // 4), max(2, self._steps // 2)
-        self._report(SETTING_OUT, 1, 2, *self.best_so_far)
-        self._descend(problem, self.share, 0, more, scale=CAREFUL, afresh=True)
+        self._report(SETTING_OUT, 1, 2, *self.so_far)
+        self._descend(problem, 0, Start(self.share, CAREFUL), more, afresh=True)
         first = starting_points(self._evaluate, self.tightened(problem), self.share, starts, seed, self._report)
         racing = dict(enumerate(first))
         rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
@@ -179,11 +172,13 @@ class Descents:
 
         scales: of the descents, by turns.
         """
-        ranked, points = list(starts), {k: dict[bytes, Sloped]() for k in starts}
-        histories = {k: list(self._history.get(k, ())) for k in starts}
+        racers = {
+            k: _Racer(Start(share, scales[k % len(scales)]), list(self._history.get(k, ())))
+            for k, share in starts.items()
+        }
+        ranked = list(starts)
         for count, steps in rungs:
-            chosen = {k: _Start(starts[k], scales[k % len(scales)], points[k], histories[k]) for k in ranked[:count]}
-            self._descend_in_lockstep(problem, chosen, steps, what, afresh=afresh)
+            self._descend_in_lockstep(problem, {k: racers[k] for k in ranked[:count]}, steps, what, afresh=afresh)
             afresh = False
             ended = [k for k in ranked if k in self._ends]
             ranked = sorted(ended, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
@@ -192,41 +187,38 @@ class Descents:
     def _descend_in_lockstep(
         self,
         problem: Problem,
-        starts: Mapping[int, _Start],
+        racers: Mapping[int, _Racer],
         steps: int,
         what: str,
         *,
         afresh: bool,
     ) -> None:
         """Descend from each of these starts, as many at a time as there are devices."""
-        tightened, bests, told = self.tightened(problem), dict[int, Best](), 0
+        tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
-        def from_start(k: int, ask: Ask) -> None:
-            one, keep = starts[k], partial(self._keep, k)
-            best = bests[k] = Best(one.share, len(problem.rows), self._margin)
-            self._history[k] = list(one.before)  # it goes through the same points again, and on
-            descend(
-                lambda _, point: ask(point), tightened, best, one.share, steps, keep, scale=one.scale, seen=one.seen
-            )
+        def race(k: int, ask: Ask) -> None:
+            bests[k] = Best(racers[k].start.share, len(problem.rows), self._margin)
+            self._history[k] = list(racers[k].before)  # it goes through the same points again, and on
+            descend(ask, bests[k], racers[k].start, steps, partial(self._keep, k))
 
         def tell() -> None:
-            nonlocal told
+            nonlocal reports
             begun = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
             best = min(begun, key=lambda best: best.rank)
-            while told < len(bests):  # once for each that has begun
-                self._report(what, told, len(starts), *best.so_far)
-                told += 1
+            while reports < len(bests):  # once for each that has begun
+                self._report(what, reports, len(racers), *best.so_far)
+                reports += 1
 
-        def flown(points: list[np.ndarray]) -> list[Sloped]:
+        def fly(points: list[np.ndarray]) -> list[Sloped]:
             tell()
             measured = self._evaluate.slopes(tightened, np.concatenate(points))
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(from_start, k) for k in starts], flown, len(jax.local_devices()))
+            in_step([partial(race, k) for k in racers], fly, len(jax.local_devices()))
             tell()
         finally:  # interrupted too
-            for k in starts:
+            for k in racers:
                 if k in bests:
                     self._take(bests[k], tightened, k, afresh=afresh)
                     afresh = False
@@ -240,21 +232,25 @@ class Descents:
     def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]], fixed: Sequence[int] = ()) -> None:
         """Descend from each of these (start, shares); the best point found takes the place of the best so far."""
         for k, (start, share) in enumerate(ends):
-            self._descend(problem, share, start, self._steps, scale=CAREFUL, fixed=fixed, afresh=k == 0)
+            self._descend(problem, start, Start(share, CAREFUL, fixed), self._steps, afresh=k == 0)
 
     def sweep(self, problem: Problem, own: np.ndarray) -> None:
         """The best of the scenario's gains and of points spread widely, where there are no slopes."""
         tightened = self.tightened(problem)
         share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
         share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
-        best = Best(share[0], len(problem.rows), self._margin)
+        self._take(self._best_of(tightened, share), tightened, 0, afresh=True)
+
+    def _best_of(self, tightened: Problem, share: np.ndarray) -> Best:
+        """The best of these points, (points, gains), flown without slopes."""
+        best = Best(share[0], len(tightened.rows), self._margin)
         best.offer(share, self._evaluate.fly(tightened, share))
-        self._take(best, tightened, 0, afresh=True)
+        return best
 
     def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
         """Look for better points around these shares, without slopes."""
-        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
-        best.offer(share[None], self._evaluate.fly(tightened, share[None]))
+        tightened = self.tightened(problem)
+        best = self._best_of(tightened, share[None])
         try:
             evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
                    lambda done, steps: self._report(EVOLVING, done, steps, *best.so_far),
@@ -263,13 +259,12 @@ class Descents:
             self._take(best, tightened, 0, afresh=True)
         on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
         if on_samples.size:
-            best = Best(on_samples[0], len(problem.rows), self._margin)
-            best.offer(on_samples, self._evaluate.fly(tightened, on_samples))
+            best = self._best_of(tightened, on_samples)
             self._take(best, tightened, 0, afresh=best.over <= self.best.over)
 
     def _finish(self, problem: Problem) -> None:
-        self._report(FINISHING, 0, 1, *self.best_so_far)
-        self._descend(problem, self.share, self._from, self._steps, scale=CAREFUL, close=FINISH * CLOSE)
+        self._report(FINISHING, 0, 1, *self.so_far)
+        self._descend(problem, self._from, Start(self.share, CAREFUL), self._steps, close=FINISH * CLOSE)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         ends = [(self._from, share) for share in self._with_the_hand_over_on_a_sample(problem)]
         self._instead(problem, ends, fixed=times)
@@ -310,35 +305,25 @@ class Descents:
         named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
         t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)
         samples = (t_f - named["delta"]) / period
-        found = []
+        shares = []
         for sample in sorted({math.floor(samples + 1e-9), math.ceil(samples - 1e-9)}):
-            if bounds.lower[at] * (1 - 1e-9) <= t_f - sample * period <= bounds.upper[at]:
-                gains = self.gains.copy()
-                gains[at] = t_f - sample * period
-                share = self.share.copy()
+            delta = t_f - sample * period
+            if bounds.lower[at] * (1 - 1e-9) <= delta <= bounds.upper[at]:
+                gains, share = self.gains.copy(), self.share.copy()
+                gains[at] = delta
                 share[at] = bounds.share(gains)[at]
-                found.append(share)
-        return found
+                shares.append(share)
+        return shares
 
     def _descend(
-        self,
-        problem: Problem,
-        share: np.ndarray,
-        start: int,
-        steps: int,
-        *,
-        scale: float,
-        close: float = CLOSE,
-        fixed: Sequence[int] = (),
-        afresh: bool = False,
+        self, problem: Problem, number: int, start: Start, steps: int, close: float = CLOSE, *, afresh: bool = False
     ) -> None:
-        best, tightened = Best(share, len(problem.rows), self._margin), self.tightened(problem)
-        keep = partial(self._keep, start)
+        """Descend from a start of this number, and take what it finds."""
+        best, tightened = Best(start.share, len(problem.rows), self._margin), self.tightened(problem)
         try:
-            slopes = self._evaluate.slopes
-            descend(slopes, tightened, best, share, steps, keep, close=close, scale=scale, fixed=fixed)
+            descend(partial(self._evaluate.slopes, tightened), best, start, steps, partial(self._keep, number), close)
         finally:  # interrupted too
-            self._take(best, tightened, start, afresh=afresh)
+            self._take(best, tightened, number, afresh=afresh)
 
     def _take(self, best: Best, tightened: Problem, start: int, *, afresh: bool) -> None:
         """Take what was found where it is better than the best so far; afresh: whatever it is, of another problem."""

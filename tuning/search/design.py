@@ -1,5 +1,7 @@
 """The design rule that a torque limit asks for: the shortest t_f, by theory and confirmed by simulation."""
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax
@@ -30,15 +32,12 @@ class ShortestTime:
     trials: int
 
     def __str__(self) -> str:
-        return text(self.limit, self.theory, self.simulated)
-
-
-def text(limit: float, by_theory: float | None, simulated: float | None) -> str:
-    """A `ShortestTime` in one line."""
-    if by_theory is None:
-        return f"no t_f up to {FARTHEST:g} times the scenario's keeps peak_torque below {limit:g} with the tuned gains"
-    said = f"the tuned gains keep peak_torque below {limit:g} from t_f = {by_theory:.4g} s on by theory"
-    return said + (f", {simulated:.4g} s as flown" if simulated is not None else "; none was found by simulation")
+        """All of it in one line."""
+        limit = f"peak_torque below {self.limit:g}"
+        if self.theory is None:
+            return f"no t_f up to {FARTHEST:g} times the scenario's keeps {limit} with the tuned gains"
+        flown = "; none was found by simulation" if self.simulated is None else f", {self.simulated:.4g} s as flown"
+        return f"the tuned gains keep {limit} from t_f = {self.theory:.4g} s on by theory{flown}"
 
 
 def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) -> ShortestTime:
@@ -48,10 +47,10 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
     By simulation: the same search on flown trials, begun at what theory says.
     """
     ready = scenario.study(flown)
-    starts = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
+    drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
 
     def predicted(t_f: float) -> float:
-        return float(_predicted(ready.parts, *starts, t_f))
+        return float(_predicted(ready.parts, *drawn, t_f))
 
     own = float(ready.parts.controller.t_f)
     lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
@@ -69,19 +68,14 @@ def shortest_time(flown: Scenario, limit: float, seed: int, trials: np.ndarray) 
         return _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
 
     # in the scenario's own time, by the program that judges it; only where that is too short in a longer one
-    found = simulated_in(ready, own) if rule <= own else None
-    if found is not None:
-        return ShortestTime(limit, rule, found, len(trials))
-    longest = max(1.5 * rule, own)
-    try:
-        roomy = scenario.study(scenario.replace(
-            flown, controller__t_f=longest, loop__t_end=longest + float(ready.parts.t_end) - own
-        ))  # fmt: skip
-    except ScenarioError:  # a reference that runs into the law's singularity later, say
-        return ShortestTime(limit, rule, None, len(trials))
-
-    found = simulated_in(roomy, longest)
-    return ShortestTime(limit, rule, found, len(trials))
+    shortest = simulated_in(ready, own) if rule <= own else None
+    if shortest is None:
+        longest = max(1.5 * rule, own)
+        t_end = longest + float(ready.parts.t_end) - own
+        with contextlib.suppress(ScenarioError):  # a reference that runs into the law's singularity later, say
+            roomy = scenario.study(scenario.replace(flown, controller__t_f=longest, loop__t_end=t_end))
+            shortest = simulated_in(roomy, longest)
+    return ShortestTime(limit, rule, shortest, len(trials))
 
 
 @programs.jit
@@ -94,10 +88,27 @@ def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: ja
     return jnp.max(jax.vmap(peak)(trials))
 
 
-def _smallest(peak, limit: float, start: float, lowest: float, longest: float, close: float, most: int) -> float | None:
+def _smallest(
+    peak: Callable[[float], float],
+    limit: float,
+    start: float,
+    lowest: float,
+    longest: float,
+    close: float,
+    most: int,
+) -> float | None:
     """Smallest t_f at which peak(t_f) <= limit, the last crossing when t_f shrinks from where the limit is kept.
 
     Peaks fall about like 1 / t_f^2, so each guess is the last one times sqrt(peak / limit), kept inside the bracket.
+
+    Args:
+        peak: of the input by t_f [s].
+        limit: that it is to keep.
+        start: the first t_f to look at [s].
+        lowest: below which none is looked at [s].
+        longest: beyond which none is looked at [s]; None is returned where it breaks the limit.
+        close: relative width of the bracket at which the search ends.
+        most: peaks that may be looked at.
     """
     over, kept = lowest, None  # t_f known to break the limit, and to keep it
     guess = start

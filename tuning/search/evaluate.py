@@ -96,33 +96,30 @@ class Evaluator:
             widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
             return np.pad(c, widths, constant_values=fill)
 
-        both = {name: fill for name, fill in (("c", -1.0), ("c_slope", 0.0)) if name in flown}
-        return flown | {
-            name: np.concatenate([padded(flown[name], fill), padded(of_loop[name], fill)], axis=1)
-            for name, fill in both.items()
-        }
+        for name, fill in (("c", -1.0), ("c_slope", 0.0)):
+            if name in flown:
+                flown[name] = np.concatenate([padded(flown[name], fill), padded(of_loop[name], fill)], axis=1)
+        return flown
 
     def _fly(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
         gains = self._gains(share)[0]
         flown = flights.fly(problem.fleet, gains)
         metrics = np.stack([getattr(flown.metrics, name) for name in watched(problem)], axis=-1)
-        found = _in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(flown.status))
-        return {"gains": gains, **found}
+        return {"gains": gains, **_in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(flown.status))}
 
     def _slopes(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
         gains, along = self._gains(share)
-        seen = flights.sloped(problem.fleet, gains, along, watched(problem))
-        found = _in_calls(partial(_judged_slopes, problem.rules), gains, along, *seen)
-        return {"gains": gains, **found}
+        flown = flights.sloped(problem.fleet, gains, along, watched(problem))
+        return {"gains": gains, **_in_calls(partial(_judged_slopes, problem.rules), gains, along, *flown)}
 
     def _gains(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gains of shares, (points, gains), and what a share of each more makes of them, (points, gains, gains)."""
-        found = _in_calls(partial(_gains, bounds=self.bounds), share)
-        return found["gains"], found["along"]
+        gains = _in_calls(partial(_gains, bounds=self.bounds), share)
+        return gains["gains"], gains["along"]
 
 
 def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
-    """What a program of `TOGETHER` points finds for these, arrays over the points first."""
+    """What a program for `TOGETHER` points makes of these, arrays over the points first."""
     count = len(arrays[0])
     padded = [np.resize(v, (-(-count // TOGETHER) * TOGETHER, *v.shape[1:])) for v in arrays]
     calls = [

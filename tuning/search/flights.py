@@ -35,6 +35,16 @@ class Fleet(NamedTuple):
     trials: np.ndarray  # (trials,) that name the noise
     coordinates: Mapping[str, np.ndarray]  # of what is drawn, arrays over the trials first
 
+    @property
+    def by_trial(self) -> dict[str, Any]:
+        """What each of the trials is flown with, arrays over them first."""
+        return {"trial": self.trials, "coordinates": dict(self.coordinates)}
+
+    @property
+    def shared(self) -> tuple[Parts, Dispersion, jax.Array]:
+        """What all of them are flown with."""
+        return self.parts, self.dispersion, jnp.uint32(self.seed)
+
 
 class Slopes(NamedTuple):
     """Metrics and statuses, with slopes along so many directions; arrays over points and trials first."""
@@ -51,9 +61,12 @@ def movable(dispersion: Dispersion) -> tuple[str, ...]:
 
 def fly(fleet: Fleet, gains: np.ndarray) -> Flown:
     """The trials at every point of gains, (points, gains); arrays (points, trials)."""
-    rows = _Rows(len(gains), fleet.trials, ROWS)
-    what = {"gains": gains}, {"trial": fleet.trials, "coordinates": dict(fleet.coordinates)}
-    return rows.flown(lambda some, needed: _fly(*_fixed(fleet), some, needed, fleet.names, rows.devices), *what)
+    rows = _Rows(len(gains), len(fleet.trials), ROWS)
+
+    def call(some: dict[str, Any], needed: np.int32) -> Flown:
+        return _fly(*fleet.shared, some, needed, fleet.names, rows.devices)
+
+    return rows.flown(call, {"gains": gains}, fleet.by_trial)
 
 
 def trials(fleet: Fleet, gains: np.ndarray) -> Trials:
@@ -68,77 +81,70 @@ def sloped(
     metrics: tuple[str, ...],
     shifts: Mapping[str, np.ndarray] | None = None,
 ) -> Slopes:
-    """The trials at every point of gains, (points, gains), with slopes of these metrics along directions of its own.
+    """The trials at every point of gains with slopes along directions.
 
-    directions: (points, directions, gains); shifts: what moves the coordinates along each, (trials, directions,
-    numbers) for each of `movable`; None: nothing.
+    Args:
+        fleet: the trials.
+        gains: (points, gains).
+        directions: along which each point's gains move, (points, directions, gains).
+        metrics: names of those that are wanted.
+        shifts: what moves the coordinates along each direction, (trials, directions, numbers) for each of `movable`;
+            None: nothing.
     """
-    rows, count = _Rows(len(gains), fleet.trials, SLOPED), directions.shape[1]
+    rows, count = _Rows(len(gains), len(fleet.trials), SLOPED), directions.shape[1]
     if shifts is None:
         free = {name: np.shape(fleet.coordinates[name]) for name in movable(fleet.dispersion)}
         shifts = {name: np.zeros((shape[0], count, *shape[1:])) for name, shape in free.items()}
-    by_trial = {"trial": fleet.trials, "coordinates": dict(fleet.coordinates), "shifts": dict(shifts)}
-    values, slopes = rows.flown(
-        lambda some, needed: _sloped(*_fixed(fleet), some, needed, fleet.names, metrics, rows.devices),
-        {"gains": gains, "directions": directions},
-        by_trial,
-    )
+
+    def call(some: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
+        return _sloped(*fleet.shared, some, needed, fleet.names, metrics, rows.devices)
+
+    by_point = {"gains": gains, "directions": directions}
+    values, slopes = rows.flown(call, by_point, {**fleet.by_trial, "shifts": dict(shifts)})
     return Slopes(values[..., :-1], values[..., -1].astype(int), slopes[..., :-1])
 
 
 def prepare(fleet: Fleet) -> None:
     """Begin to compile what `fly` needs, beside what is being done."""
-    rows = _Rows(1, fleet.trials, ROWS)
-    by_trial = {"trial": fleet.trials, "coordinates": dict(fleet.coordinates)}
-    some = rows.some(rows.calls[0], {"gains": np.zeros((1, len(fleet.names)))}, by_trial)
-    _fly.prepare(*_fixed(fleet), some, np.int32(0), fleet.names, rows.devices)
-
-
-def _fixed(fleet: Fleet) -> tuple:
-    return fleet.parts, fleet.dispersion, jnp.uint32(fleet.seed)
+    rows = _Rows(1, len(fleet.trials), ROWS)
+    some, _ = rows.some(0, {"gains": np.zeros((1, len(fleet.names)))}, fleet.by_trial)
+    _fly.prepare(*fleet.shared, some, np.int32(0), fleet.names, rows.devices)
 
 
 class _Rows:
-    """All trials at all points as rows of `ROW` trials each, shared out over the devices."""
+    """So many trials at so many points as rows of `ROW` trials each, at most `most` of them a device in one call."""
 
-    def __init__(self, points: int, trials: np.ndarray, most: int):
+    def __init__(self, points: int, trials: int, most: int):
         self.devices = len(jax.local_devices())
-        self._count, each = len(trials), max(1, -(-len(trials) // ROW))
-        self._trials = np.resize(np.arange(self._count), (each, ROW))  # of the rows at each point
-        rows = np.arange(points * each)
-        self._points, self._most = points, most
-        self.calls = [rows[k : k + self.devices * most] for k in range(0, rows.size, self.devices * most)]
+        self._points, self._count, self._most = points, trials, most
+        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))  # of the rows at each point
+        self._rows = points * len(self._trials)
 
-    def some(self, rows: np.ndarray, by_point: dict[str, Any], by_trial: dict[str, Any]) -> dict[str, Any]:
-        """What (devices, rows) fly, those of one call first; by_point, by_trial: arrays over points, and trials."""
-        places = np.zeros((self.devices, self._most), int)
-        share = -(-rows.size // self.devices)
-        places[:, :share] = np.resize(rows, (self.devices, share))
-        point, row = np.divmod(places, len(self._trials))
-        each = self._trials[row]
-        return {
-            **{name: np.asarray(v)[point] for name, v in by_point.items()},
-            **jax.tree.map(lambda v: np.asarray(v)[each], by_trial),
-        }
+    def some(self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]) -> tuple[dict[str, Any], int]:
+        """What the rows of one call fly, from the first on, arrays (devices, rows, ..), and how many a device has.
+
+        by_point, by_trial: arrays over points, and trials.
+        """
+        count = min(self._rows - first, self.devices * self._most)
+        places, share = montecarlo.shared_out(count, self.devices, self._most)
+        point, row = np.divmod(first + places, len(self._trials))
+        trial = self._trials[row]
+        by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}
+        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), share
 
     def flown(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
-        """What the program finds: arrays (points, trials, ..)."""
-        found = []
-        for rows in self.calls:
-            share = -(-rows.size // self.devices)
-            results = program(self.some(rows, by_point, by_trial), np.int32(share))
-            found.append(jax.tree.map(lambda v, n=rows.size, share=share: self._of_rows(v, share)[:n], results))
+        """What the program makes of all rows: arrays (points, trials, ..)."""
+        calls = []
+        for first in range(0, self._rows, self.devices * self._most):
+            some, share = self.some(first, by_point, by_trial)
+            results = program(some, np.int32(share))
+            calls.append(jax.tree.map(lambda v, share=share: montecarlo.gathered(v, share), results))
 
         def joined(*calls: np.ndarray) -> np.ndarray:
-            whole = np.concatenate(calls)
-            return whole.reshape(self._points, -1, *whole.shape[2:])[:, : self._count]
+            rows = np.concatenate(calls)[: self._rows]
+            return rows.reshape(self._points, -1, *rows.shape[2:])[:, : self._count]
 
-        return jax.tree.map(joined, *found)
-
-    @staticmethod
-    def _of_rows(v: Any, share: int) -> np.ndarray:
-        kept = np.asarray(v)[:, :share]
-        return kept.reshape(-1, *kept.shape[2:])
+        return jax.tree.map(joined, *calls)
 
 
 @programs.jit(static_argnames=("names", "devices"))
@@ -160,9 +166,9 @@ def _fly(
     def flown(row: dict[str, Any]) -> Flown:
         return lanes.vmap(one, (None, 0, 0))(row["gains"], row["trial"], row["coordinates"])
 
-    first = jax.tree.map(lambda v: v[0, 0], rows)
-    made = jax.eval_shape(one, first["gains"], *jax.tree.map(lambda v: v[0], (first["trial"], first["coordinates"])))
-    return _row_by_row(flown, jax.tree.map(lambda v: jnp.zeros((ROW, *v.shape), v.dtype), made), rows, needed, devices)
+    first = jax.tree.map(lambda v: v[0, 0, 0], {name: rows[name] for name in ("trial", "coordinates")})
+    result = jax.eval_shape(one, rows["gains"][0, 0], first["trial"], first["coordinates"])
+    return montecarlo.row_by_row(flown, result, ROW, rows, needed, devices)
 
 
 @programs.jit(static_argnames=("names", "metrics", "devices"))
@@ -192,23 +198,6 @@ def _sloped(
         )
         return values, jnp.moveaxis(slopes, 0, 1)
 
-    count = rows["directions"].shape[2]
-    made = jnp.zeros((ROW, len(metrics) + 1)), jnp.zeros((ROW, count, len(metrics) + 1))
-    return _row_by_row(sloped, made, rows, needed, devices)
-
-
-def _row_by_row(flown: Callable, empty: Any, rows: dict[str, Any], needed: jax.Array, devices: int) -> Any:
-    """`flown` of each of the first rows of each device; empty: what it is of a row that is not flown."""
-
-    def of_device(rows: dict[str, Any]) -> Any:
-        own = jax.tree.map(lambda v: v[0], rows)
-        count = own["trial"].shape[0]
-
-        def step(k: jax.Array, found: Any) -> Any:
-            made = flown(jax.tree.map(lambda v: v[k], own))
-            return jax.tree.map(lambda into, v: into.at[k].set(v), found, made)
-
-        every = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *v.shape)), empty)
-        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, every))
-
-    return montecarlo.spread(of_device, rows, devices)
+    values = len(metrics) + 1
+    result = jax.eval_shape(lambda: (jnp.zeros(values), jnp.zeros((rows["directions"].shape[2], values))))
+    return montecarlo.row_by_row(sloped, result, ROW, rows, needed, devices)

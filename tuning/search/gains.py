@@ -24,37 +24,38 @@ from ptsmc_jax.simulation.gains import with_gains as with_gains
 def units(plant: str) -> dict[str, str]:
     """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
     tables: Any = SCENARIOS[plant].TABLES
-    named: list[tuple[type[Table], dict[str, str]]] = [
+    gains_of_tables: list[tuple[type[Table], dict[str, str]]] = [
         *((law, {name: name for name in law.gains}) for law in tables["controller"].values()),
         *((observer, {"gain": "observer_gain"}) for observer in tables["observer"].values()),
         *((one, {"bandwidth": "filter_bandwidth"}) for one in FILTERS.values()),
         (CommandFilter, {"corner": "command_corner"}),
     ]
-    found: dict[str, str] = {}
-    for table, gains in named:
+    unit_of: dict[str, str] = {}
+    for table, gains in gains_of_tables:
         for key in keys.of(table):
             if key.name in gains:
-                found.setdefault(gains[key.name], key.unit or "-")
-    return found
+                unit_of.setdefault(gains[key.name], key.unit or "-")
+    return unit_of
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
     """The unit of each gain of a scenario, those of a law or an observer of one's own among them."""
-    found = units(scenario.plant.kind)
+    unit_of = units(scenario.plant.kind)
     for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_"), (scenario.sensors, SENSORS)):
-        if table is None:
-            continue
-        named = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}
-        found |= {name: unit for name, unit in named.items() if name in table.gains}
-    return found
+        if table is not None:
+            own = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}
+            unit_of |= {name: unit for name, unit in own.items() if name in table.gains}
+    return unit_of
 
 
 def named(scenario: Scenario) -> tuple[str, ...]:
     """Names of the free gains, axis by axis where the scenario says so."""
-    tune, names = scenario.search, list[str]()
-    for name in tune.gains:
-        each = tune.per_axis and name == "observer_gain"
-        names += [f"{AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))] if each else [name]
+    names: list[str] = []
+    for name in scenario.search.gains:
+        if scenario.search.per_axis and name == "observer_gain":
+            names += [f"{AXIS}{k + 1}" for k in range(len(getattr(scenario.observer, "gain", ())))]
+        else:
+            names.append(name)
     return tuple(names)
 
 
@@ -68,17 +69,17 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
     if scenario.motion == "chain":
         gains["eta"] = scenario.order + 1.0
-    gain = {"observer_gain": disturbance_bounds.observer_gain(scenario)}
-    return {**gains, **gain} if scenario.observer.kind == "nonlinear" else gains
+    observer_gain = disturbance_bounds.observer_gain(scenario)
+    return gains | ({"observer_gain": observer_gain} if scenario.observer.kind == "nonlinear" else {})
 
 
 def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
     if not table.prescribed:
-        kept = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
+        common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
-        law = {"kind": "prescribed_time", **error, **kept, "delta": own["delta"]}
+        law = {"kind": "prescribed_time", **error, **common, "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)
 
@@ -87,12 +88,13 @@ def paper_is(scenario: Scenario) -> str:
     """What the paper's gains are for a scenario: its own, scaled to another body or period, or those of its law."""
     if not scenario.controller.prescribed:
         return "paper's law"
-    own, kept = of_paper(scenario), {"delta": 0.05, "observer_gain": 10.0}
-    return "paper" if all(own.get(name, value) == value for name, value in kept.items()) else "paper, scaled"
+    own, as_written = of_paper(scenario), {"delta": 0.05, "observer_gain": 10.0}
+    return "paper" if all(own.get(name, value) == value for name, value in as_written.items()) else "paper, scaled"
 
 
 def differ(one: Scenario, other: Scenario) -> bool:
     """Whether two scenarios fly another law or other gains; a default is what it stands for."""
     one, other = one.written(), other.written()
-    kept = ("controller", "observer", "estimator", "sensors")
-    return any(getattr(one, name) != getattr(other, name) for name in kept)
+    return any(
+        getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "estimator", "sensors")
+    )

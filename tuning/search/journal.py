@@ -20,9 +20,9 @@ class Journal:
     def __init__(self, path: Path | None = None):
         self._path, self._records, self._next = path, [], 0
         if path is not None and path.exists():
-            self._records, kept = _read(path)
+            self._records, end = _read(path)
             with path.open("r+b") as file:
-                file.truncate(kept)
+                file.truncate(end)
 
     @property
     def replaying(self) -> bool:
@@ -51,8 +51,7 @@ class Journal:
 
     def _drop(self) -> None:
         assert self._path is not None
-        kept = b"".join(_packed(record) for record in self._records[: self._next])
-        self._path.write_bytes(kept)
+        self._path.write_bytes(b"".join(_packed(record) for record in self._records[: self._next]))
         del self._records[self._next :]
 
 

@@ -70,8 +70,9 @@ def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]]
                 if raised is not None:
                     raise raised
                 if not any(task.ended for task in active):  # else another may begin, and ask with these
-                    for task, told in zip(active, answer([task.question for task in active]), strict=True):
-                        task.tell(told)
+                    answers = answer([task.question for task in active])
+                    for task, one in zip(active, answers, strict=True):
+                        task.tell(one)
             except BaseException as error:
                 raised = error
                 for task in active:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
-from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.campaigns import margin_verdicts, montecarlo
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
@@ -77,12 +77,8 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     shares = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
     near = np.max(np.nan_to_num(shares, nan=WITHOUT, neginf=-1e9), axis=0)
     trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
-    return replace(asked, coordinates=_drawn(asked.dispersion, asked.seed, trials)), max(float(near.max()), 0.0)
-
-
-@programs.jit
-def _drawn(dispersion: Dispersion, seed: Array, trials: Array) -> Coordinates:
-    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
+    coordinates = montecarlo.coordinates(asked.dispersion, asked.seed, trials)
+    return replace(asked, coordinates=coordinates), max(float(near.max()), 0.0)
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax import programs
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -108,12 +107,20 @@ def problem(
     banded: tuple[bool, ...] | None = None,
     **others: object,
 ) -> Problem:
-    """A problem over these trials of the seed; others: fields of `Problem`.
+    """A problem over training trials.
 
-    may_break: how many trials may break each requirement, None for those on every trial; of these trials, or, banded,
-    of a band that joins later, until when each of these must keep it. By default all are on every trial.
+    Args:
+        parts: the nominal ones.
+        dispersion: what is drawn about them.
+        seed: of the draws and the noise.
+        trials: numbers of the training trials, all of which are averaged.
+        names: of the free gains.
+        requirements: that are kept.
+        may_break: how many trials may break each of them, None for those on every trial, as all are by default.
+        banded: whether these are trials of a band that joins later, until when every training trial must keep it.
+        others: fields of `Problem`.
     """
-    made = Problem(
+    empty = Problem(
         parts=parts,
         dispersion=dispersion,
         seed=jnp.uint32(seed),
@@ -127,35 +134,27 @@ def problem(
         metrics=tuple(r.metric for r in requirements),
         may_break=may_break or (None,) * len(requirements),
     )
-    alone = kept_by_every_trial(made) if banded is None else kept_by_every_trial(made) | np.asarray(banded, dtype=bool)
-    made = with_trials(made, trials, counted=alone)
-    return replace(made, among=~made.counted, **others)
+    alone = kept_by_every_trial(empty) | np.asarray(banded or False, dtype=bool)
+    posed = with_trials(empty, trials, counted=alone)
+    return replace(posed, among=~posed.counted, **others)
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
     """Coordinates of these trials, arrays over the trials first; drawn so many at a time, by one program."""
     numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // DRAWN)) * DRAWN)
     calls = [
-        _coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
+        montecarlo.coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
         for k in range(0, numbers.size, DRAWN)
     ]
     return jax.tree.map(lambda *many: jnp.concatenate(many)[: len(trials)], *calls)
 
 
-@programs.jit
-def _coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
-    return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
-
-
-def with_trials(
-    problem: Problem, trials: np.ndarray, coordinates: Coordinates | None = None, counted: np.ndarray | None = None
-) -> Problem:
-    """The problem with these trials added, which count in the constraints; coordinates: if not their own.
+def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None = None) -> Problem:
+    """The problem with these trials added, which count in the constraints.
 
     counted: (requirements,) bool, which limits they must keep; by default those that every trial must keep.
     """
-    if coordinates is None:
-        coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
+    coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
     rows = np.asarray(kept_by_every_trial(problem) if counted is None else counted, dtype=bool)
     return replace(
         problem,
@@ -170,7 +169,7 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
     """The problem averaged over the first so many trials only, with those that were added; shares of them as before."""
     if averaged >= problem.averaged:
         return problem
-    kept = np.r_[:averaged, problem.averaged : problem.trials.size]
+    fewer = np.r_[:averaged, problem.averaged : problem.trials.size]
 
     def share(count: int) -> int:
         return max(1, math.ceil(count * averaged / problem.averaged))
@@ -180,10 +179,10 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
 
     return replace(
         problem,
-        trials=problem.trials[kept],
-        among=problem.among[:, kept],
-        counted=problem.counted[:, kept],
-        coordinates={name: v[kept] for name, v in problem.coordinates.items()},
+        trials=problem.trials[fewer],
+        among=problem.among[:, fewer],
+        counted=problem.counted[:, fewer],
+        coordinates={name: v[fewer] for name, v in problem.coordinates.items()},
         averaged=averaged,
         may_break=tuple(map(allowed, problem.may_break, np.asarray(problem.among)[:, 0].tolist())),
         tail=None if problem.tail is None else share(problem.tail),
@@ -259,12 +258,12 @@ def failures(c: np.ndarray) -> np.ndarray:
 
 def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:
     """Over those that end, or the `tail` worst of them: beside `FAILED`^2 no digit of theirs would be left."""
-    left = squares < FAILED**2
-    count = jnp.sum(left)
-    kept = jnp.where(left, squares, 0.0)
+    ends = squares < FAILED**2
+    count = jnp.sum(ends)
+    counted = jnp.where(ends, squares, 0.0)
     if tail is not None:
-        kept, count = jax.lax.top_k(kept, tail)[0], jnp.minimum(count, tail)
-    return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(kept) / jnp.maximum(count, 1), FAILED**2))
+        counted, count = jax.lax.top_k(counted, tail)[0], jnp.minimum(count, tail)
+    return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(counted) / jnp.maximum(count, 1), FAILED**2))
 
 
 def _asked(rules: Rules, row: int, over: Float[Array, " trials"]) -> Float[Array, " trials"]:

@@ -25,6 +25,19 @@ HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would b
 
 
 @dataclass(frozen=True)
+class Settings:
+    """How a search goes about it."""
+
+    starts: int  # from which it descends
+    steps: int  # points that may be looked at from each of them
+    seed: int  # of the points that starts are chosen among
+    sloped: bool = True  # F has slopes to go by
+    robust: bool = False  # what joins is the worst case inside the dispersions' support
+    judged: bool = True  # say how hard the worst case is
+    margin: float = 0.0  # to keep from the limits, where it is more than the search's own
+
+
+@dataclass(frozen=True)
 class Search:
     """Outcome of a search."""
 
@@ -48,47 +61,46 @@ def search(
     problem: Problem,
     requirements: Sequence[Requirement],
     own: np.ndarray,
-    starts: int,
-    steps: int,
-    seed: int,
+    settings: Settings,
     *,
-    sloped: bool = True,
-    robust: bool = False,
-    judged: bool = True,
-    margin: float = 0.0,
     report: Report = lambda *_: None,
     prepare: Callable[[], None] = lambda: None,
 ) -> Search:
     """Minimise F with every requirement met on the training trials.
 
     `Descents` finds gains, `Rounds` says which trials they must meet besides those that are drawn: after each search,
-    harder ones join, and the search goes on. own: (gains,) the scenario's gains, the first start. steps: points that
-    may be looked at from each start. sloped: F has slopes to go by. robust: what joins is the worst case inside the
-    dispersions' support. judged: say how hard the worst case is. margin: to keep from the limits, where it is more than
-    the search's own. report is called after every step; prepare once the search's own programs are being compiled, for
-    those of what comes after it. Interrupted, it returns the best so far once there is one.
+    harder ones join, and the search goes on. Interrupted, it returns the best so far once there is one.
+
+    Args:
+        evaluate: measures the problem.
+        problem: what is minimised over the training trials.
+        requirements: those of its limits.
+        own: (gains,) the scenario's gains, the first start.
+        settings: how the search goes about it.
+        report: is called after every step.
+        prepare: is called once the search's own programs are being compiled, for those of what comes after it.
     """
-    rounds = Rounds(evaluate, problem, requirements, robust=robust)
-    margin = max(margin, rounds.margin)
-    report = Work(report, evaluate, *planned(rounds.problem, starts, steps, sloped=sloped))
-    descents = Descents(evaluate, margin, steps, np.random.default_rng(seed), report)
+    sloped, starts = settings.sloped, settings.starts
+    rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
+    margin = max(settings.margin, rounds.margin)
+    report = Work(report, evaluate, *planned(rounds.problem, starts, settings.steps, sloped=sloped))
+    descents = Descents(evaluate, margin, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted = False
 
     def tell(what: str) -> None:
-        report(what, 0, 0, *descents.best_so_far)
+        report(what, 0, 0, *descents.so_far)
 
     try:
         if sloped:
-            descents.prepare(rounds.problem)
+            evaluate.prepare(rounds.problem)
             prepare()
             descents.set_out(rounds.problem, own)
         else:
             descents.sweep(rounds.problem, own)
         rounds.begin(descents.gains)
         if sloped:
-            descents.descend(
-                rounds.problem, descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
-            )
+            shares = descents.explore(rounds.problem, starts, settings.seed) if starts > 1 else {0: descents.share}
+            descents.descend(rounds.problem, shares)
         else:
             descents.evolve(rounds.problem, descents.share)
         while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
@@ -97,7 +109,7 @@ def search(
                 descents.again(rounds.problem)
             else:
                 descents.evolve(rounds.problem, descents.share, NEARBY)
-        if judged:
+        if settings.judged:
             rounds.judge(descents.gains, tell)
     except KeyboardInterrupt:
         if not descents.started:

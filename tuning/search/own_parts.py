@@ -8,7 +8,7 @@ import ast
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
     """
     programs, folder = named(scenario), _results(path)
     if folder is not None:
-        allow(programs, path, store.made(folder), trusted)
+        allow(programs, path, store.read_versions(folder), trusted)
         return
     beside = os.path.realpath(path.parent) + os.sep
     _say({key: where for key, where in programs.items() if not systems.location(where).startswith(beside)}, path)
@@ -83,13 +83,13 @@ def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
 def alone(file: Path) -> bool:
     """Whether a copy of a Python file can be run: it imports nothing from its own folder, and asks not where it is."""
     try:
-        found = list(ast.walk(ast.parse(file.read_bytes())))
+        nodes = list(ast.walk(ast.parse(file.read_bytes())))
     except (OSError, ValueError, SyntaxError, RecursionError):
         return False
-    imported = {alias.name for node in found if isinstance(node, ast.Import) for alias in node.names}
-    imported |= {node.module for node in found if isinstance(node, ast.ImportFrom) and node.module}
+    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
     beside = (file.with_name(name.partition(".")[0]) for name in imported)
-    asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in found)
+    asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
     return not asks and not any(one.is_dir() or one.with_suffix(".py").exists() for one in beside)
 
 
@@ -100,9 +100,6 @@ def _say(programs: Mapping[str, str], where_named: Path) -> None:
 
 def _results(scenario: Path) -> Path | None:
     """The folder that a command left and a scenario file lies in, itself or in a folder of it; links count as both."""
-    return next((folder for folder in _around(scenario) if (folder / "versions.json").exists()), None)
-
-
-def _around(path: Path) -> Iterator[Path]:
-    for found in (Path(os.path.abspath(path)), Path(os.path.realpath(path))):
-        yield from found.parents[:2]
+    paths = Path(os.path.abspath(scenario)), Path(os.path.realpath(scenario))
+    folders = (folder for path in paths for folder in path.parents[:2])
+    return next((folder for folder in folders if (folder / "versions.json").exists()), None)

@@ -74,7 +74,7 @@ class Rounds:
         """Whether anything joins that gains (gains,) do not meet, and a round is left: the search then goes on."""
         if not (self._every or self._shares or self.problem.margins is not None):
             return False
-        joining = list[Joining]()
+        joining: list[Joining] = []
         nearer_loops, beyond = _harder_margins(self.problem, gains)
         if self._shares:  # each time on other trials, which those screened are not among
             tell("confirming on other trials")
@@ -83,8 +83,8 @@ class Rounds:
             tell("looking for the worst case")
             self.hardest = worst_case.hardest(self.problem, self._every, gains, self._screened(gains))
             if self.hardest.beyond and not self.hardest.unbounded:
-                kept = kept_by_every_trial(self.problem)
-                joining.append(Joining(np.asarray([self.hardest.trial]), kept, self.hardest.coordinates))
+                trial, counted = np.asarray([self.hardest.trial]), kept_by_every_trial(self.problem)
+                joining.append(Joining(trial, counted, self.hardest.coordinates))
         elif self._every:
             self._known = self._screened(gains)
             if np.any(self._known[1] > 1.0):
@@ -111,10 +111,10 @@ class Rounds:
     def _count(self, gains: np.ndarray) -> list[confirm.Count]:
         """Count, each time on other trials."""
         first = self.problem.averaged + worst_case.SCREENED
-        found = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
+        counts = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
         self._counted += 1
-        self._evaluate.rollouts += found[0].trials
-        return found
+        self._evaluate.rollouts += counts[0].trials
+        return counts
 
     def _confirmed(self, gains: np.ndarray) -> list[Joining]:
         """Trials that join since more of those counted break a limit than may."""
@@ -128,7 +128,8 @@ class Rounds:
 
     def _join(self, more: Joining) -> None:
         at = self._places[(self._joined + np.arange(more.trials.size)) % self._places.size]
-        self.problem, self._joined = _add(self.problem, at, more), self._joined + more.trials.size
+        self.problem = _add(self.problem, at, more)
+        self._joined += more.trials.size
 
 
 def _with_room(problem: Problem, places: int) -> Problem:

@@ -15,6 +15,7 @@ from tuning.search import gains as gain_names
 TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may fall behind its sample
 
 HALF = 0.5  # the lower bound of sign_width is at most this share of its upper one
+NEAR = 0.01  # share of its interval by which a gain is on a bound
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,11 @@ class Bounds:
         """Gains of shares of the intervals: 0 is the lower bound, 1 the upper one."""
         low, high = self._scaled()
         inner = low + (high - low) * share
-        found = jnp.where(self.logarithmic, jnp.exp(inner), inner)
+        gains = jnp.where(self.logarithmic, jnp.exp(inner), inner)
         if not self.hop:
-            return found
-        k, least = self._width, self._least_width(found)
-        return found.at[k].set(least * (self.upper[k] / least) ** share[k])
+            return gains
+        k, least = self._width, self._least_width(gains)
+        return gains.at[k].set(least * (self.upper[k] / least) ** share[k])
 
     def share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
@@ -67,12 +68,11 @@ class Bounds:
         least = self.hop / gains[np.asarray(observers)].min()
         return jnp.clip(least, self.lower[self._width], HALF * self.upper[self._width])
 
-    def at_bound(self, gains: np.ndarray, near: float = 0.01) -> dict[str, str]:
-        """Gains that ended within this share of the interval from a bound: name to "lower" or "upper"."""
-        sides = {name: "lower" if share < near else "upper"
-                 for name, share in zip(self.names, self.share(gains), strict=True)
-                 if not near <= share <= 1.0 - near}  # fmt: skip
-        return sides
+    def at_bound(self, gains: np.ndarray) -> dict[str, str]:
+        """Gains that ended within the share `NEAR` of their interval from a bound: name to "lower" or "upper"."""
+        shares = dict(zip(self.names, self.share(gains).tolist(), strict=True))
+        return {name: "lower" if share < NEAR else "upper" for name, share in shares.items()
+                if not NEAR <= share <= 1.0 - NEAR}  # fmt: skip
 
     def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
         """Gains by name with so many digits, none of them beyond its bounds; times stay on their samples."""

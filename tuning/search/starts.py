@@ -65,7 +65,10 @@ def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: i
         flown.append(evaluate.fly(problem, share[k : k + CALL]))
         tell(min(k + CALL, len(share)), len(share), np.nan, np.nan)
     apart = distances(share)
-    orders = [_by_merit(np.concatenate([merit(one, times) for one in flown])) for times in (1.0, STEEP)]
+    orders = []
+    for times in (1.0, STEEP):
+        merits = np.concatenate([merit(one, times) for one in flown])
+        orders.append([int(k) for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])])
     queue = [k for pair in zip(*orders, strict=True) for k in pair]
     return share[far_apart(queue, apart, count)]
 
@@ -86,10 +89,6 @@ def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
             if len(chosen) < count and k not in chosen and np.all(apart[k, chosen] >= distance):
                 chosen.append(k)
     return chosen
-
-
-def _by_merit(merits: np.ndarray) -> list[int]:
-    return [int(k) for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])]
 
 
 def merit(flown: Measured, times: float = 1.0) -> np.ndarray:

@@ -61,8 +61,8 @@ def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[s
     for k in range(count):
         points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
     flown = evaluate.fly(problem, points.reshape(-1, count))
-    found = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
-    gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in found)
+    arrays = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
+    gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
     nearest = np.asarray(problem.rows or ("",))[flown.nearest].reshape(count, ACROSS + 1)
     return {
         name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0], nearest[k].tolist())
@@ -121,7 +121,7 @@ def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[floa
 def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
     if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
         return None
-    found = stats.bootstrap(
+    bootstrap = stats.bootstrap(
         samples,
         statistic,
         n_resamples=RESAMPLED,
@@ -130,5 +130,5 @@ def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float
         paired=paired,
         rng=np.random.default_rng(0),
     )
-    low, high = found.confidence_interval
+    low, high = bootstrap.confidence_interval
     return (float(low), float(high)) if np.isfinite(low) and np.isfinite(high) else None

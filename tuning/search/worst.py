@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions.base import Coordinates
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement, over
 from tuning.search import flights
@@ -76,11 +77,17 @@ def hardest(
     """The worst trial for these gains inside the dispersions' support, by gradient ascent from the hardest drawn.
 
     Moved are initial attitude or state, initial rate and disturbance phase; true inertia and noise stay as drawn. A
-    normal dispersion, which has no bounds, is searched where `HELD` of it lies. screened: what `screen` found for them.
+    normal dispersion, which has no bounds, is searched where `HELD` of it lies.
+
+    Args:
+        problem: of the search.
+        requirements: whose limits it is to come nearest to.
+        gains: (gains,).
+        screened: what `screen` says of these; None: it is asked.
     """
     trials, ratio = screened or screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
-    names, limits = tuple(r.metric for r in requirements), np.asarray([r.limit for r in requirements])
+    limits = {r.metric: r.limit for r in requirements}
     fleet = problem.others(chosen)
     moved = flights.movable(problem.dispersion)
     charted = [_charted(problem, name, fleet.coordinates[name]) for name in moved]
@@ -88,7 +95,7 @@ def hardest(
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
     def look(y: np.ndarray) -> np.ndarray:
-        value, slope = climb(fleet, gains, y, watched(problem), dict(zip(names, limits, strict=True)))
+        value, slope = climb(fleet, gains, y, watched(problem), limits)
         better = value > best
         best[better], best_y[better] = value[better], y[better]
         return np.where(np.isfinite(slope), slope, 0.0)
@@ -104,20 +111,18 @@ def hardest(
     first = int(np.argmax(best))
     reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
     fleet_of_one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
-    metrics, code, _, values, _ = jax.tree.map(lambda v: v[0, 0], flights.fly(fleet_of_one, gains[None]))
-    reached = [
-        float(over(getattr(metrics, name), limit, at_least=False)) for name, limit in zip(names, limits, strict=True)
-    ]
-    ratios = [np.inf if np.isnan(ratio) else ratio for ratio in reached]  # it has no value: it never settles, say
-    worst = int(np.argmax(ratios))
+    flown = jax.tree.map(lambda v: v[0, 0], flights.fly(fleet_of_one, gains[None]))
+    ratios = {m: float(over(getattr(flown.metrics, m), limit, at_least=False)) for m, limit in limits.items()}
+    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # without a value: it never settles, say
+    worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
-        metric=names[worst],
+        metric=worst,
         ratio=ratios[worst],
         screened=float(ratio.max()),
-        status=rollout.STATUS[int(code)][0],
+        status=rollout.STATUS[int(flown.status)][0],
         trial=int(chosen[first]),
         coordinates={name: v[0].tolist() for name, v in reached_at.items()},
-        start={name: float(v) for name, v in values.items()},
+        start={name: float(v) for name, v in flown.drawn.items()},
         moved=moved,
     )
 
@@ -172,15 +177,15 @@ def climb(
     """
     coordinates, shifts = _moved_to(fleet, y)
     fleet, count, width = fleet._replace(coordinates=coordinates), y.shape[1], len(fleet.names)
-    columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()])
+    columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()], dtype=float)
     value, slopes = np.zeros(len(y)), list[np.ndarray]()
     for k in range(0, count, width):
         shift = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
         flown = jax.tree.map(
             lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, shift)
         )
-        found = jnp.asarray(over(flown.metrics[:, columns], limit, at_least=False)), jnp.asarray(flown.status[:, None])
-        ratios = np.asarray(judged(*found))
+        shares = jnp.asarray(over(flown.metrics[:, columns], limit, at_least=False))
+        ratios = np.asarray(judged(shares, jnp.asarray(flown.status[:, None])))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
         slope = np.take_along_axis(flown.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
         slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
@@ -194,25 +199,25 @@ def _filled(v: np.ndarray, width: int) -> np.ndarray:
 
 def _moved_to(fleet: Fleet, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Coordinates of free reals, and by what each real moves them, (cases, reals, numbers) of each that moves."""
-    moved = flights.movable(fleet.dispersion)
-    found, shifts = jax.tree.map(np.asarray, _moved(fleet.dispersion, dict(fleet.coordinates), y, moved))
-    return {**fleet.coordinates, **found}, shifts
+    names = flights.movable(fleet.dispersion)
+    moved, shifts = jax.tree.map(np.asarray, _moved(fleet.dispersion, dict(fleet.coordinates), y, names))
+    return {**fleet.coordinates, **moved}, shifts
 
 
-@programs.jit(static_argnames="moved", compiler_options=programs.QUICKLY)
-def _moved(dispersion, coordinates: Coordinates, y: jax.Array, moved: tuple[str, ...]) -> tuple[dict, dict]:
-    """Coordinates of free reals y (cases, reals), and their derivatives by each of them."""
+@programs.jit(static_argnames="names", compiler_options=programs.QUICKLY)
+def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names: tuple[str, ...]) -> tuple[dict, dict]:
+    """Coordinates of free reals y (cases, reals), those of these names, and their derivatives by each of them."""
 
     def of(y: jax.Array) -> Coordinates:
-        found, used = {}, 0
-        for name in moved:
+        moved, used = {}, 0
+        for name in names:
             count = coordinates[name].shape[1]
             part, used = y[used : used + count], used + count
             if dispersion.kinds[name].drawn == "uniform":
-                found[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
+                moved[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
             else:
-                found[name] = part * jnp.minimum(1.0, _farthest(count) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
-        return found
+                moved[name] = part * jnp.minimum(1.0, _farthest(count) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
+        return moved
 
     slopes = jax.vmap(jax.jacfwd(of))(y)
     return jax.vmap(of)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in slopes.items()}

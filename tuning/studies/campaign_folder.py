@@ -72,16 +72,16 @@ class Folder:
         digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
         if self.table is not None:
             digests[PLAN] = self.digests.get(PLAN) if self.made else self.planned.digest
-        more = {} if self.own is None else {"metrics": self.own}
-        known = {name: found for name, found in digests.items() if found is not None}
-        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **more, **known}
+        metrics = {} if self.own is None else {"metrics": self.own}
+        known = {name: digest for name, digest in digests.items() if digest is not None}
+        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **known}
 
     @property
     def versions(self) -> dict[str, Any]:
         """What its `versions.json` says."""
         names = None if self.own is None else self.own_names
-        told = {**self.identity, "trials": self.trials, "metrics_names": names, "plan": self.plan}
-        return store.versions(**{name: value for name, value in told.items() if value is not None})
+        entries = {**self.identity, "trials": self.trials, "metrics_names": names, "plan": self.plan}
+        return store.versions(**{name: value for name, value in entries.items() if value is not None})
 
     @cached_property
     def own_names(self) -> list[str]:
@@ -124,10 +124,10 @@ class Folder:
         assert self.table is not None
         assert self.ready is not None
         where = f"the plan {self.plan}"
-        found = plans.checked(self.table, self.ready.parts, where, self.own_names)
-        if self.made is not None and found.digest != self.digests.get(PLAN):
+        plan = plans.checked(self.table, self.ready.parts, where, self.own_names)
+        if self.made is not None and plan.digest != self.digests.get(PLAN):
             raise RefusedError(f"{self.path / TABLE} is not the plan that the campaign was begun with")
-        return found
+        return plan
 
     @cached_property
     def flights(self) -> Campaign:
@@ -141,7 +141,7 @@ class Folder:
     @cached_property
     def campaign(self) -> Campaign:
         """What is flown. Raises ScenarioError where the metrics of one's own are none, RefusedError without trust."""
-        own = self._own.own
+        own = self._own.own  # before `flights`: what it refuses comes first
         return replace(self.flights, own=own)
 
     @cached_property
@@ -153,12 +153,12 @@ class Folder:
             return Campaign(self.ready, self.seed)
         self._check_unchanged("--metrics")
         try:
-            found: Any = systems.item(self.own, OWN)
-            if not isinstance(found, Callable):
-                raise ValueError(f"it is a {type(found).__name__}; allowed is {OWN}")
-            made = Campaign(self.ready, self.seed, found)
-            made.own_names()
-            return made
+            metrics: Any = systems.item(self.own, OWN)
+            if not isinstance(metrics, Callable):
+                raise ValueError(f"it is a {type(metrics).__name__}; allowed is {OWN}")
+            campaign = Campaign(self.ready, self.seed, metrics)
+            campaign.own_names()
+            return campaign
         except ValueError as error:
             raise ScenarioError(f"--metrics is {self.own}: {error}") from None
 
@@ -187,8 +187,8 @@ def begin(wanted: Folder, force: bool) -> None:
     """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
     tables, path = parsing.dump(wanted.scenario), wanted.path
     if force and path.is_dir():
-        for kept in (wanted.rows, wanted.dry):
-            for file in kept.folder.glob("*.parquet"):
+        for rows_of in (wanted.rows, wanted.dry):
+            for file in rows_of.folder.glob("*.parquet"):
                 file.unlink()
         for name in (FLOOR, TABLE):
             (path / name).unlink(missing_ok=True)
@@ -222,12 +222,12 @@ def begin(wanted: Folder, force: bool) -> None:
 def opened(path: Path) -> Folder:
     """The campaign of a folder, of which nothing is run that it names; raises RefusedError where there is none."""
     try:
-        said = store.made(path)
-        if said.get("command", "montecarlo") != "montecarlo":
+        versions = store.read_versions(path)
+        if versions.get("command", "montecarlo") != "montecarlo":
             raise RefusedError(
-                f"{path} holds results of `ptsmc {said['command']}`, but must be one of `ptsmc montecarlo`"
+                f"{path} holds results of `ptsmc {versions['command']}`, but must be one of `ptsmc montecarlo`"
             )
-        made = msgspec.convert(said, Made, strict=True)
+        made = msgspec.convert(versions, Made, strict=True)
         if made.metrics is not None:
             systems.named(made.metrics, OWN)
         flown = scenario.read(path / "scenario.toml")
@@ -237,10 +237,20 @@ def opened(path: Path) -> Folder:
         raise
     except (ValueError, msgspec.ValidationError):
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
-    kept = {name: value for name, value in said.items() if name.endswith("_sha256") and isinstance(value, str)}
-    table = None if made.plan is None else plans.read(path / TABLE)
-    known = Folder(path, flown, made.seed, made.trials, made.metrics, made.precision, made, kept, trusted=False)
-    return replace(known, plan=made.plan, table=table)
+    digests = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
+    return Folder(
+        path=path,
+        scenario=flown,
+        seed=made.seed,
+        trials=made.trials,
+        own=made.metrics,
+        bits=made.precision,
+        made=made,
+        digests=digests,
+        trusted=False,
+        plan=made.plan,
+        table=None if made.plan is None else plans.read(path / TABLE),
+    )
 
 
 def _made(folder: Folder) -> Made:
@@ -267,9 +277,14 @@ def fly(
     elsewhere: Callable[[Folder, list[Wanted]], Iterator[tuple[Part, int]]] | None = None,
     trials: int | None = None,
 ) -> None:
-    """Fly what is missing of the first `trials` trials (all, if None).
+    """Fly what is missing; what is damaged is named, set aside and flown again.
 
-    What is damaged is named, set aside and flown again. elsewhere: flies parts on other machines.
+    Args:
+        folder: the campaign's.
+        shard: (i, n), the i-th of n shares of it.
+        report: is called as parts land.
+        elsewhere: flies parts on other machines; None: they are flown here.
+        trials: how many of the first trials; None: all of them.
     """
     trials = folder.trials if trials is None else trials
     parts, broken = folder.rows.parts()
@@ -281,8 +296,8 @@ def fly(
     if alone:  # others may be writing otherwise
         folder.rows.tidy(parts)
     wanted = flying.missing(parts, trials, shard)
-    made = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
-    flying.follow(made, flying.tally(parts, trials), report)
+    landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
+    flying.follow(landing, flying.tally(parts, trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
 
@@ -299,9 +314,9 @@ def find_floor(folder: Folder) -> None:
             first = [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
             looked_at = plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
         verdicts = margin_verdicts.over_trials(ready, folder.seed, looked_at)
-        judged = [{**msgspec.to_builtins(v), "met": v.met} for v in verdicts]
-        found = {"window_error": runs.floor(ready, folder.seed, first), "margins": judged}
-        store.write_json(folder.path / FLOOR, found)
+        floor = runs.floor(ready, folder.seed, first)
+        theory = {"window_error": floor, "margins": [verdict.in_summary() for verdict in verdicts]}
+        store.write_json(folder.path / FLOOR, theory)
 
 
 def floor_of(folder: Folder) -> float | None:
@@ -325,8 +340,8 @@ def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write what each trial flies with, without flying it."""
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)
-    made = flying.here(folder.campaign.draw, folder.dry, flying.missing(parts, folder.trials))
-    flying.follow(made, Tally(sum(part.count for part in parts), folder.trials, 0), report)
+    landing = flying.here(folder.campaign.draw, folder.dry, flying.missing(parts, folder.trials))
+    flying.follow(landing, Tally(sum(part.count for part in parts), folder.trials, 0), report)
 
 
 def settle(folder: Folder, trials: int) -> Folder:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import polars as pl
+from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
@@ -40,20 +40,21 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
     count = min(flying.PART, folder.trials)
     while True:
         fly_first(count)
-        widths = [high - low for low, high in (v["share_interval"] for v in judged(folder, first=count)[1])]
+        intervals = [verdict["share_interval"] for verdict in judged(folder, first=count)]
+        widths = [high - low for low, high in intervals]
         if count == folder.trials or all(w <= width for w in widths):
             return count
         count = min(2 * count, folder.trials)
 
 
-def judged(folder: Folder, first: int | None = None) -> tuple[list[Verdict], list[dict[str, Any]]]:
-    """Verdicts over the trials (the first so many), and what `summary.json` says of each; not of margins."""
+def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
+    """What `summary.json` says of each verdict over the trials (the first so many), but for margins."""
     wanted = scenario.requirements(folder.scenario)
     names = dict.fromkeys(name for r in wanted for name in (r.metric, r.timed) if name is not None)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
+    finished = flying.finished(frame)
     verdicts = flying.verdicts(wanted, frame)
-    ok = flying.finished(frame)
-    return verdicts, [_in_summary(v, r, _beyond(frame, r, ok)) for v, r in zip(verdicts, wanted, strict=True)]
+    return [_in_summary(v, r, _beyond(frame, r, finished)) for v, r in zip(verdicts, wanted, strict=True)]
 
 
 def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndarray:
@@ -65,7 +66,7 @@ def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndar
 
 def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
     within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
-    entry = {**msgspec.to_builtins(verdict), "met": verdict.met}
+    entry = verdict.in_summary()
     if beyond.size:  # a share of the time, of which runs are what is independent
         each = (1.0 + CONFIDENCE) / 2.0
         entry["share"] = 1.0 - beyond.mean()
@@ -84,7 +85,7 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
 def summarise(folder: Folder) -> dict[str, Any]:
     """What `summary.json` says."""
     parts = folder.whole_parts()
-    verdicts = [*judged(folder)[1], *margins_of(folder)]
+    verdicts = [*judged(folder), *margins_of(folder)]
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
     finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
@@ -92,19 +93,17 @@ def summarise(folder: Folder) -> dict[str, Any]:
         {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
     ]
-    found, drivers, ranked = {}, {}, dict[bytes, dict[str, tuple]]()
-    names = list(pl.read_parquet_schema(parts[0].path))
-    drawn = names[names.index("initial_angle") :]
-    own = folder.own_names
-    drawn = [name for name in drawn if name not in own]
+    quantiles, drivers = {}, {}
+    ranks: dict[bytes, dict[str, tuple]] = {}  # of the inputs, by the trials that they are ranked among
+    drawn = _drawn(folder, parts)
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
-    for name in (*scenario.catalogue(folder.scenario), *own):
+    for name in (*scenario.catalogue(folder.scenario), *folder.own_names):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
-        found[name] = _of_metric(values, finished)
-        driven = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
-        of = {key: inputs[key].to_numpy()[driven] for key in drawn}
-        known = ranked.setdefault(driven.tobytes(), {})  # by the trials
-        drivers[name] = statistics.drivers(of, values[:SEARCHED][driven], known) if driven.sum() > 1 else {}
+        quantiles[name] = _of_metric(values, finished)
+        known = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
+        of = {key: inputs[key].to_numpy()[known] for key in drawn}
+        ranked = ranks.setdefault(known.tobytes(), {})
+        drivers[name] = statistics.drivers(of, values[:SEARCHED][known], ranked) if known.sum() > 1 else {}
     done = int(head.height)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
@@ -120,16 +119,22 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "floor": floor_of(folder),
         "verdicts": verdicts,
         **_pointing(folder, parts, finished),
-        "quantiles": found,
+        "quantiles": quantiles,
         "drivers": drivers,
-        "cautions": [*cautions.of(folder.scenario), *_alike(found, done)],
+        "cautions": [*cautions.of(folder.scenario), *_alike(quantiles, done)],
     }
 
 
-def _alike(found: dict[str, Any], trials: int) -> list[str]:
+def _drawn(folder: Folder, parts: list[rows.Part]) -> list[str]:
+    """The columns that say what trials flew with: those from the initial angle on, but for metrics of one's own."""
+    names = list(pl.read_parquet_schema(parts[0].path))
+    return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
+
+
+def _alike(quantiles: dict[str, Any], trials: int) -> list[str]:
     """Whether every trial is the same flight, to round-off."""
-    known = [of for of in found.values() if "max" in of]
-    if trials < 2 or not known or any(abs(of["max"] - of["mean"]) > SAME * abs(of["max"]) for of in known):
+    known = [metric for metric in quantiles.values() if "max" in metric]
+    if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
     return [
         f"all {trials} trials are the same flight: nothing is drawn in them, neither by [dispersion] nor as noise of "
@@ -172,13 +177,13 @@ def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     return entry
 
 
-def write_summary(folder: Folder, found: dict[str, Any], figures: bool) -> None:
+def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> None:
     """Write the summary and the figures into the campaign's folder."""
 
     def fill(making: Path) -> None:
-        store.write_json(making / "summary.json", found)
+        store.write_json(making / "summary.json", summary)
         if figures:
-            style.save(figures_of(folder, found), making / "figures")
+            style.save(figures_of(folder, summary), making / "figures")
 
     store.write(folder.path, fill)
 
@@ -203,20 +208,19 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     metric goes with it over all trials that end, see `statistics.drivers`; None where so few trials do not show it.
     """
     parts = folder.whole_parts()
-    names = list(pl.read_parquet_schema(parts[0].path))
-    drawn = [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
+    drawn = _drawn(folder, parts)
     frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
     inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
     distinct = statistics.distinct({name: values for name, values in inputs.items() if np.ptp(values) > 0.0})
-    failed, told = ~flying.finished(frame), []
+    failed = ~flying.finished(frame)
+    explained: list[dict[str, Any]] = []
     for metric in metrics:
         values = frame[metric].fill_null(float("nan")).to_numpy()
         known = np.isfinite(values) & ~failed
-        driven = (
-            statistics.drivers({name: inputs[name][known] for name in distinct}, values[known]) if known.any() else {}
-        )
+        of = {name: inputs[name][known] for name in distinct}
+        drivers = statistics.drivers(of, values[known]) if known.any() else {}
         for at in statistics.most_extreme(values, failed, count):
-            told += [
+            explained += [
                 {
                     "metric": metric,
                     "trial": int(frame["trial"][int(at)]),
@@ -225,11 +229,11 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                     "drawn": float(inputs[name][at]),
                     "percentile": 100.0 * float(np.mean(inputs[name] <= inputs[name][at])),
                     "median": float(np.median(inputs[name])),
-                    **driven.get(name, {"rank_correlation": None, "first_order": None}),
+                    **drivers.get(name, {"rank_correlation": None, "first_order": None}),
                 }
                 for name in distinct
             ]
-    return told
+    return explained
 
 
 @dataclass(frozen=True)
@@ -243,18 +247,18 @@ class Replay:
 
 def replay(folder: Folder, trial: int) -> Replay:
     """A trial's row as the campaign flies it, and its run in full."""
-    made = folder.campaign
-    flown = trial if made.plan is None else made.plan.row(trial, folder.seed)
-    run, row = runs.fly(made.ready, folder.seed, flown), made.fly([trial])
-    there = [part for part in folder.rows.parts()[0] if part.first <= trial < part.end]
-    kept = pl.read_parquet(there[0].path).filter(pl.col("trial") == trial) if there else None
-    again = row.row(0, named=True)
+    campaign = folder.campaign
+    flown = trial if campaign.plan is None else campaign.plan.row(trial, folder.seed)
+    run, again = runs.fly(campaign.ready, folder.seed, flown), campaign.fly([trial]).row(0, named=True)
     rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
     if run.status != again["status"]:
         rounding = np.inf
-    if kept is None:
-        return Replay(run, None, rounding)
-    return Replay(run, max(_off(value, again[name]) for name, value in kept.row(0, named=True).items()), rounding)
+    off = None
+    for part in folder.rows.parts()[0]:
+        if part.first <= trial < part.end:
+            row = pl.read_parquet(part.path).filter(pl.col("trial") == trial).row(0, named=True)
+            off = max(_off(value, again[name]) for name, value in row.items())
+    return Replay(run, off, rounding)
 
 
 def _off(a: Any, b: Any) -> float:
@@ -265,30 +269,23 @@ def _off(a: Any, b: Any) -> float:
     return 0.0 if a == b or all(missing) else np.inf
 
 
-def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
+def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Figures of a campaign by name."""
     parts, kind = folder.whole_parts(), folder.scenario.plant.kind
     limits = {r.metric: r.limit for r in scenario.requirements(folder.scenario)}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
     finished = flying.finished(frame)
-    made: dict[str, Any] = {}
-    shown = np.arange(min(DRAWN, frame.height))
-    window = frame["window_error"].to_numpy()
+
+    def column(name: str, values: np.ndarray) -> plots.Column:
+        return plots.Column(catalogues.CATALOGUES[kind].get(name, ("",))[0], values, limits.get(name))
+
+    figures: dict[str, Figure] = {}
     if finished.any():
         if folder.ready is not None:  # its histories are not kept, but flown for it
-            flown = folder.flights
-            hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-            t, error = flying.history(flown, np.append(shown, frame["trial"][hardest]).astype(np.uint32))
-            made["fan"] = plots.fan(
-                t, error[:-1][finished[: shown.size]], (hardest, error[-1]), folder.scenario.controller.t_f, kind
-            )
-        units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
-        made["distributions"] = plots.distributions(
-            {
-                name: (units[name], np.where(finished, frame[name].to_numpy(), np.nan), limits.get(name))
-                for name in names
-            }
+            figures["fan"] = _fan(folder, frame, finished)
+        figures["distributions"] = plots.distributions(
+            {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
     outcome = frame["status"].to_numpy().astype(object)
     for metric, limit in limits.items():
@@ -296,7 +293,7 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
     bad, good = np.flatnonzero(outcome != "ok")[: POINTS // 2], np.flatnonzero(outcome == "ok")
     some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
-    made["torque_by_angle"] = plots.torque_by_angle(
+    figures["torque_by_angle"] = plots.torque_by_angle(
         frame["initial_angle"].to_numpy()[some],
         frame["peak_torque"].to_numpy()[some],
         outcome[some],
@@ -304,15 +301,24 @@ def figures_of(folder: Folder, found: dict[str, Any]) -> dict[str, Any]:
         limits.get("peak_torque"),
         kind,
     )
-    driving = sorted(found["drivers"].get("window_error", {}).items(), key=lambda item: -item[1]["first_order"])
-    varied = [name for name, _ in driving][:4]
-    if varied:
-        inputs = rows.read(parts, varied)[some]
-        units = {name: catalogues.CATALOGUES[kind].get(name, ("",))[0] for name in names}
-        made["inputs"] = plots.inputs(
-            {name: inputs[name].to_numpy() for name in varied},
-            {name: (units[name], frame[name].to_numpy()[some].astype(float), limits.get(name)) for name in names[:4]},
+    drivers = summary["drivers"].get("window_error", {})
+    strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
+    if strongest:
+        inputs = rows.read(parts, strongest)[some]
+        figures["inputs"] = plots.inputs(
+            {name: inputs[name].to_numpy() for name in strongest},
+            {name: column(name, frame[name].to_numpy()[some].astype(float)) for name in names[:4]},
             outcome[some],
             totals,
         )
-    return made
+    return figures
+
+
+def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:
+    """Errors over time of the first trials, and of that with the largest window error, flown again."""
+    shown, window = np.arange(min(DRAWN, frame.height)), frame["window_error"].to_numpy()
+    hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+    t, error = flying.history(folder.flights, np.append(shown, frame["trial"][hardest]).astype(np.uint32))
+    scenario = folder.scenario
+    worst = hardest, error[-1]
+    return plots.fan(t, error[:-1][finished[: shown.size]], worst, scenario.controller.t_f, scenario.plant.kind)

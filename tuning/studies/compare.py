@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from scipy import stats
 
@@ -25,10 +24,10 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.errors import UsageError
-from tuning.search import gains, own_parts, trust
+from tuning.search import gains, own_parts
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
-from tuning.search.progress import Report
+from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
 OURS = "prescribed_time"
@@ -99,10 +98,10 @@ class Rivals:
 
     def check(self) -> None:
         """Raise UsageError where a kind is not known, or a law of one's own is no name."""
-        known = laws()[1:]
+        others = laws()[1:]
         for kind in self.kinds or ():
-            if kind not in known:
-                raise UsageError(f"--against is {kind}, but must be one of {', '.join(known)}")
+            if kind not in others:
+                raise UsageError(f"--against is {kind}, but must be one of {', '.join(others)}")
         for where in self.own:
             try:
                 systems.named(where, systems.WHERE)
@@ -113,12 +112,12 @@ class Rivals:
     def named(self) -> dict[str, dict[str, str]]:
         """The law of the table [controller] of each, the paper's first, by what it is called."""
         kinds = laws() if self.kinds is None else [OURS, *self.kinds]
-        found = {kind: {"kind": kind} for kind in kinds}
+        tables = {kind: {"kind": kind} for kind in kinds}
         for where in self.own:
             place, _, name = where.rpartition(":")
             code = f"{os.path.realpath(place)}:{name}" if place.endswith(".py") else where
-            found[name if name not in found else f"own {name}"] = {"kind": "own", "code": code}
-        return found
+            tables[name if name not in tables else f"own {name}"] = {"kind": "own", "code": code}
+        return tables
 
     def identity(self) -> dict[str, Any]:
         """What `versions.json` knows these rivals by; nothing where they are all the kinds that there are."""
@@ -131,30 +130,29 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
     table, tune = scenario.controller, scenario.search
     common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
-    found = {}
-    for kind, law in rivals.named.items():
-        if law["kind"] != "own" and scenario.controller.kind == kind:
-            found[kind] = scenario
-        elif kind == OURS:
-            found[kind] = _posed(gains.papers(scenario), tune, same)
+    posed = {}
+    for name, law in rivals.named.items():
+        if law["kind"] != "own" and scenario.controller.kind == name:
+            posed[name] = scenario
+        elif name == OURS:
+            posed[name] = _posed(gains.papers(scenario), tune, same)
         else:
             fields = LAWS["spacecraft"][law["kind"]].__struct_fields__
-            kept = [key for key in ("sign_width",) if key in fields and hasattr(table, key)]
-            width = {key: getattr(table, key) for key in kept}
-            other = replace(scenario, tune=None, controller={**law, **common, **width})
-            found[kind] = _posed(other, tune, same)
-    return found
+            shared = [key for key in ("sign_width",) if key in fields and hasattr(table, key)]
+            width = {key: getattr(table, key) for key in shared}
+            posed[name] = _posed(replace(scenario, tune=None, controller={**law, **common, **width}), tune, same)
+    return posed
 
 
 def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """The contenders; raises ScenarioError where one cannot fly: before hours of search, not after."""
-    found = contenders(scenario, rivals)
-    for law, posed in found.items():
+    each = contenders(scenario, rivals)
+    for law, posed in each.items():
         try:
             study(posed)
         except ScenarioError as error:
             raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
-    return found
+    return each
 
 
 def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
@@ -170,17 +168,17 @@ def perturbed(flown: Scenario) -> dict[str, Scenario]:
     assert isinstance(flown, SpacecraftScenario)
     body, device = flown.spacecraft, flown.hardware
     inertia = np.asarray(body.inertia if body.true_inertia is None else body.true_inertia)
-    late = (getattr(device, "delay", None) or 0) + 1
+    delay = (getattr(device, "delay", None) or 0) + 1
     changes: list[dict[str, Any]] = [
         {"spacecraft__true_inertia": ((1.0 + OFF) * inertia).tolist()},
         {"spacecraft__true_inertia": ((1.0 - OFF) * inertia).tolist()},
-        {"hardware__delay": late},
+        {"hardware__delay": delay},
     ]
-    found = {}
+    others = {}
     for name, change in zip(UNTOLD, changes, strict=True):
         with contextlib.suppress(ScenarioError):
-            found[name] = replace(flown, **change)
-    return found
+            others[name] = replace(flown, **change)
+    return others
 
 
 def _with_more(one: Contender, fresh_seed: int) -> Contender:
@@ -199,30 +197,31 @@ def compare(
 ) -> Comparison:
     """Tune every law, and judge them and the paper's gains on trials that none of them saw.
 
-    rivals: the scenario under each law, as `that_fly` gives them; None: all of them.
+    Args:
+        scenario: what all of them fly.
+        seed: of the search; fresh trials have one that follows from it.
+        tell: is called after every step.
+        journal: of evaluations, from which an interrupted comparison goes on.
+        rivals: the scenario under each law, as `that_fly` gives them; None: all of them.
     """
     fresh_seed = judging.seed_of_judge(seed)
     rivals = that_fly(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
-    made = {}
+    contenders, interrupted = {}, False
     if "paper" in others:
         tell("the paper's gains: judging on fresh trials", 0, 0, np.nan, 0.0)
-        made["paper"] = _with_more(_papers(judging.as_flown(others["paper"]), fresh_seed), fresh_seed)
-    stopped = False
+        contenders["paper"] = _with_more(_papers(judging.as_flown(others["paper"]), fresh_seed), fresh_seed)
     for law, posed in rivals.items():
-
-        def report(what: str, *others: Any, law: str = law) -> None:
-            tell(f"{law}: {what}", *others)
-
+        report = headed(tell, law)
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)  # all on the same fresh trials
         fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
-        made[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
-        stopped = tuned.search.interrupted
-        if stopped:
+        contenders[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
+        interrupted = tuned.search.interrupted
+        if interrupted:
             break
         report("judging with another inertia and delay than it knows", 0, 0, np.nan, 0.0)
-        made[law] = _with_more(made[law], fresh_seed)
-    return Comparison(made, fresh_seed, stopped, refused)
+        contenders[law] = _with_more(contenders[law], fresh_seed)
+    return Comparison(contenders, fresh_seed, interrupted, refused)
 
 
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
@@ -237,7 +236,8 @@ def figures_of(contender: Contender) -> dict[str, Any]:
     trials = contender.trials
     rank: Any = stats.spearmanr
     angle, finished = trials.drawn["initial_angle"], trials.finished
-    settling, errors = np.asarray(trials.metrics.settling_time), np.asarray(trials.metrics.window_error)[finished]
+    error, interval = judging.window_error(trials)
+    settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
     times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
     spread = times.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(times) > 0.0
@@ -248,11 +248,11 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "at_bound": contender.at_bound,
         "met": contender.met,
         "counts": trials.counts(),
-        "window_error": float(trust.rms(errors)) if finished.any() else None,
+        "window_error": error,
         "floor": contender.floor,
-        "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
+        "window_error_interval": interval,
         **mean,
-        "largest_peak_torque": float(np.max(trials.metrics.peak_torque[finished])) if finished.any() else None,
+        "largest_peak_torque": _largest_peak(trials),
         "unsettled": int(trials.status.size - times.size),
         "settling_time": {str(q): _quantile(times_or_never, q) for q in (0.01, 0.5, 0.99)},
         # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
@@ -260,61 +260,66 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "settling_near_far": _near_far(angle, times_or_never) if spread else None,
         "margins": contender.margins,
         "untold": {name: _perturbed_figures(other) for name, other in contender.changed.items()},
-        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in contender.verdicts],
+        "verdicts": [verdict.in_summary() for verdict in contender.verdicts],
     }
 
 
 def _perturbed_figures(trials: Trials) -> dict[str, Any]:
     """What is said of trials with something that the law is not told of."""
-    done = trials.finished
-    errors, peaks = (np.asarray(v)[done] for v in (trials.metrics.window_error, trials.metrics.peak_torque))
+    error, interval = judging.window_error(trials)
     return {
-        "window_error": float(trust.rms(errors)) if done.any() else None,
-        "window_error_interval": trust.interval(errors, trust.rms) if errors.size > 1 else None,
-        "largest_peak_torque": float(np.max(peaks)) if done.any() else None,
+        "window_error": error,
+        "window_error_interval": interval,
+        "largest_peak_torque": _largest_peak(trials),
         "lost": int(np.count_nonzero(~trials.ok)),
     }
 
 
-def _quantile(late: np.ndarray, q: float) -> float | None:
+def _largest_peak(trials: Trials) -> float | None:
+    """The largest peak torque [N m] of the trials that were flown to the end; None: none was."""
+    return float(np.max(trials.metrics.peak_torque[trials.finished])) if trials.finished.any() else None
+
+
+def _quantile(times: np.ndarray, q: float) -> float | None:
     """A quantile of settling times [s], infinite where a trial never settles; None: never."""
-    found = value_at(np.sort(late), q)
-    return found if np.isfinite(found) else None
+    value = value_at(np.sort(times), q)
+    return value if np.isfinite(value) else None
 
 
-def _near_far(angle: np.ndarray, late: np.ndarray) -> tuple[float | None, float | None]:
+def _near_far(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float | None]:
     """Median settling times of the nearest and the farthest fifth of the starts [s]; see `_quantile`."""
     order = np.argsort(angle)
     fifth = max(1, angle.size // 5)
-    return _quantile(late[order[:fifth]], 0.5), _quantile(late[order[-fifth:]], 0.5)
+    return _quantile(times[order[:fifth]], 0.5), _quantile(times[order[-fifth:]], 0.5)
 
 
-def summary(made: Comparison) -> dict[str, Any]:
+def summary(comparison: Comparison) -> dict[str, Any]:
     """What `summary.json` says."""
-    first = next(iter(made.contenders.values()))
+    contenders = comparison.contenders
+    first = next(iter(contenders.values()))
     return {
-        "status": made.status,
-        "seed": made.fresh_seed,
+        "status": comparison.status,
+        "seed": comparison.fresh_seed,
         "trials": int(first.trials.status.size),
-        "paper_refused": made.paper_refused,
-        "judged_on": judging.judged_on(made.contenders.get(OURS, first).flown),
+        "paper_refused": comparison.paper_refused,
+        "judged_on": judging.judged_on(contenders.get(OURS, first).flown),
         "settling_angle": first.flown.loop.settling_angle,
-        "laws": {law: figures_of(one) for law, one in made.contenders.items()},
-        "cautions": list(dict.fromkeys(said for one in made.contenders.values() for said in cautions.of(one.flown))),
+        "laws": {law: figures_of(contender) for law, contender in contenders.items()},
+        "cautions": list(dict.fromkeys(text for one in contenders.values() for text in cautions.of(one.flown))),
     }
 
 
-def write(folder: Path, scenario: Scenario, made: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
+def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
     """Fill a result folder."""
-    said = summary(made)
+    said = summary(comparison)
     store.record(folder, parsing.dump(scenario), known_by, said)
     (folder / "scenarios").mkdir()
-    for law, one in made.contenders.items():
-        named = own_parts.carry(parsing.dump(one.flown), folder / "scenarios")
-        store.write_toml(folder / "scenarios" / f"{law}.toml", named)
+    for law, contender in comparison.contenders.items():
+        tables = own_parts.carry(parsing.dump(contender.flown), folder / "scenarios")
+        store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
     store.write_csv(folder / "compare.csv", *_rows(scenario, said))
     if figures:
-        style.save(dict(_figures(made)), folder / "figures")
+        style.save(dict(_figures(comparison)), folder / "figures")
 
 
 _SHARES = ("0.01", "0.5", "0.99")
@@ -342,15 +347,16 @@ def _rows(scenario: Scenario, summary: Mapping[str, Any]) -> tuple[list[str], li
     return head, [row(law, figures) for law, figures in summary["laws"].items()]
 
 
-def _figures(made: Comparison) -> Iterator[tuple[str, Any]]:
-    unit = catalogues.CATALOGUE["settling_time"][0]
-    sets = {law: one.trials for law, one in made.contenders.items()}
-    t_f = made.contenders[OURS].flown.controller.t_f
+def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
+    unit = catalogues.CATALOGUE["settling_time"].unit
+    sets = {law: contender.trials for law, contender in comparison.contenders.items()}
+    ours = comparison.contenders[OURS]
+    t_f = ours.flown.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
          for law, t in sets.items()}, t_f, unit,
     )  # fmt: skip
-    limit = next((v.limit for v in made.contenders[OURS].verdicts if v.metric == "peak_torque"), None)
+    limit = next((v.limit for v in ours.verdicts if v.metric == "peak_torque"), None)
     yield "tradeoff", study_plots.tradeoff(
         {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
          if t.finished.any()}, limit,

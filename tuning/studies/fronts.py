@@ -1,46 +1,29 @@
-"""What accuracy is set against: a kind is a study of its own, and a row."""
+"""What accuracy is set against: each kind of front is a study of its own."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ptsmc_jax.scenario.tables import Scenario
-from tuning.search.journal import Journal
-from tuning.search.progress import Report
 from tuning.studies import pareto, slew_times
 
-
-class Front(NamedTuple):
-    """A front to be looked for."""
-
-    known_by: dict[str, Any]  # see `store.begin`
-    trace: Callable[[Report, Journal], Any]  # looks for it
-    summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of what was found
-    write: Callable[[Path, Any, bool], None]  # fills a result folder with it, and with figures or not
+POINTS = 20  # limits on the torque, where nobody says how many
 
 
-def against_torque(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
-    """The front against the peak torque; raises ScenarioError where there is none to look for."""
-    pareto.check(scenario)
-    return _front(pareto, scenario, seed, points)
+def study_of(against: str, scenario: Scenario, points: int | None, times: tuple[float, ...]) -> tuple[Any, Any]:
+    """The module that looks for a front, and what is asked of it.
 
+    Such a module has `identity`, `trace`, `summary` and `write`.
 
-def against_time(scenario: Scenario, seed: int, points: int, times: tuple[float, ...]) -> Front:
-    """What a faster slew costs; times [s]: the usual ones if there are none. Raises ScenarioError if one cannot fly."""
+    Args:
+        against: what accuracy is set against, "torque" or "t_f".
+        scenario: of which.
+        points: limits on the torque to tune for; None: `POINTS`.
+        times: prescribed times to tune for [s]; empty: the usual ones.
+
+    Raises ScenarioError where there is no front to look for, or a time cannot be flown.
+    """
+    if against == "torque":
+        pareto.check(scenario)
+        return pareto, points or POINTS
     times = times or slew_times.usual_times(scenario)
     slew_times.check(scenario, times)
-    return _front(slew_times, scenario, seed, times)
-
-
-def _front(study: Any, scenario: Scenario, seed: int, asked: Any) -> Front:
-    """The front that a module of a study looks for; asked: how many points, or which times."""
-    known_by = study.identity(scenario, seed, asked)
-    return Front(
-        known_by,
-        lambda tell, journal: study.trace(scenario, seed, asked, tell, journal),
-        lambda found: study.summary(found, scenario),
-        lambda folder, found, figures: study.write(folder, scenario, found, figures, known_by),
-    )
-
-
-KINDS: dict[str, Callable[..., Front]] = {"torque": against_torque, "t_f": against_time}
+    return slew_times, times

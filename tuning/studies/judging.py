@@ -27,11 +27,11 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     And why the scenario cannot be flown with the paper's, which are then not among them.
     """
     try:
-        found, refused = {"paper": gains.papers(scenario)}, None
-        study(as_flown(found["paper"]))
+        paper = gains.papers(scenario)
+        study(as_flown(paper))
     except ScenarioError as error:
         return {"before": scenario}, str(error)
-    return found | ({"before": scenario} if gains.differ(scenario, found["paper"]) else {}), refused
+    return {"paper": paper} | ({"before": scenario} if gains.differ(scenario, paper) else {}), None
 
 
 def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
@@ -58,12 +58,18 @@ def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Ver
     return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
 
 
+def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | None]:
+    """RMS window error of the trials that were flown to the end, None if none was, and its interval."""
+    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+    return float(trust.rms(errors)) if errors.size else None, trust.interval(errors, trust.rms)
+
+
 def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, Any]:
     """What fresh trials say of gains: RMS window error with its interval, failures, and whether all limits are met."""
-    errors = np.asarray(trials.metrics.window_error)[trials.finished]
+    rms, interval = window_error(trials)
     return {
-        "rms": float(trust.rms(errors)) if errors.size else np.nan,
-        "interval": trust.interval(errors, trust.rms),
+        "rms": np.nan if rms is None else rms,
+        "interval": interval,
         "failures": int(np.sum(~trials.ok)),
         "meets": all(v.met for v in verdicts_of(scenario, trials, fresh_seed)) and bool(np.all(trials.ok)),
     }
@@ -75,6 +81,12 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     asked = scenario.requirements.get(name)
     share = (asked.share if isinstance(asked, Limit) else None) or 1.0
     return statistics.value_at(values, share) if values.size else np.nan
+
+
+def limit_of(name: str, scenario: Scenario) -> float | None:
+    """The limit that a scenario asks for a metric; None: none."""
+    asked = scenario.requirements.get(name)
+    return None if asked is None else asked.limit if isinstance(asked, Limit) else float(asked)
 
 
 def as_flown(scenario: Scenario) -> Scenario:

@@ -16,14 +16,12 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins, run_margins
+from tuning.errors import UsageError
+from tuning.search import trust
 
 PERIOD, DELTA = "loop.period", "controller.delta"
 WHOLE_NUMBERS = ("hardware.delay", "hardware.star_tracker_every")
 WIDE = 5.0  # axes that span more than this factor are spaced by factors
-
-
-class AxisError(ValueError):
-    """An axis that cannot be followed. Its text is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -67,22 +65,36 @@ class Cell:
     hold_radius: float = np.nan
 
 
+@dataclass(frozen=True)
+class Map:
+    """Two keys of a scenario, and what was flown of each pair of their values."""
+
+    scenario: Scenario
+    x: Axis
+    y: Axis
+    cells: list[Cell]  # row by row: the first has the first y
+
+    def grid(self, name: str) -> np.ndarray:
+        """A field of the cells as an array (y, x)."""
+        return np.array([getattr(cell, name) for cell in self.cells]).reshape(len(self.y.values), len(self.x.values))
+
+
 def axis(text: str, option: str) -> Axis:
     """An axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9, or of one number of several, KEY[0]=..
 
-    Raises AxisError.
+    Raises UsageError, which calls it by this option.
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
     wanted = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
     if len(parts) != 3 or key.count(".") != 1:
-        raise AxisError(wanted)
+        raise UsageError(wanted)
     try:
         low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
     except ValueError:
-        raise AxisError(wanted) from None
+        raise UsageError(wanted) from None
     if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
-        raise AxisError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
+        raise UsageError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
     wide = low > 0 and high > WIDE * low
     values = np.geomspace(low, high, count) if wide else np.linspace(low, high, count)
     if key in WHOLE_NUMBERS:
@@ -90,8 +102,16 @@ def axis(text: str, option: str) -> Axis:
     return Axis(key, tuple(float(f"{v:.6g}") for v in values))
 
 
-def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> list[Cell]:
-    """Fly the scenario's trials for every pair of values; tell(cells done, in all).
+def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
+    """Fly the scenario's trials for every pair of values.
+
+    Args:
+        scenario: what is flown.
+        x: the key across.
+        y: the key up.
+        seed: of the draws and the noise.
+        trials: of each pair; one where nothing is drawn.
+        tell: is called with the cells done, and in all.
 
     Raises ScenarioError where no pair at all is allowed.
     """
@@ -113,7 +133,7 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
     for k, ((a, b), one) in enumerate(zip(pairs, studies, strict=True)):
         cells.append(Cell(a, b, one) if isinstance(one, str) else _cell(a, b, one, common, seed, trials))
         tell(k + 1, len(pairs))
-    return cells
+    return Map(scenario, x, y, cells)
 
 
 def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
@@ -152,79 +172,75 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
     flown = montecarlo.run(common(ready.parts), ready.dispersion, seed, np.arange(count))
     done, counts = flown.finished, flown.counts()
     errors, peaks = flown.metrics.window_error[done], flown.metrics.peak_torque[done]
-    known: dict[str, float] = {}
+    figures: dict[str, float] = {}
     if done.any():
-        known = {
-            "window_error": float(np.sqrt(np.mean(errors**2))),
+        figures = {
+            "window_error": float(trust.rms(errors)),
             "peak_torque": float(np.mean(peaks)),
             "largest_peak_torque": float(peaks.max()),
         }
     parts = common(ready.parts)
     if ready.scenario.loop.mode == "sampled" and parts.controller.prescribed:
         ends = run_margins.at_ends(parts)
-        (at, radius), (hold, after) = ends["hand_over"], ends["hold"]
-        known |= {"radius": radius, "gain_margin": _factor(at), "delay_margin": float(at.delay.min())}
-        known |= {"hold_gain_margin": _factor(hold), "hold_delay_margin": float(hold.delay.min())}
-        known["hold_radius"] = after
-        read = parts.sensors is not None and hasattr(parts.sensors, "reading")
-        if read and parts.observer.linear and radius < 1.0:
+        for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
+            # the factor on the gain of the worst axis up to which the loop is stable; below 1 where it is not
+            figures[f"{prefix}gain_margin"] = float(10.0 ** (left.gain_up.min() / 20.0))
+            figures[f"{prefix}delay_margin"] = float(left.delay.min())
+            figures[f"{prefix}radius"] = radius
+        readable = parts.sensors is not None and hasattr(parts.sensors, "reading")
+        if readable and parts.observer.linear and figures["radius"] < 1.0:
             expected = covariance.noise(parts)
-            known |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
-    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **known)
-
-
-def _factor(found: margins.Margins) -> float:
-    """The factor on the gain of the worst axis up to which the loop is stable; below 1 where it is not."""
-    return float(10.0 ** (found.gain_up.min() / 20.0))
+            figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
+    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
 
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
     second_order = getattr(scenario.plant, "order", 2) == 2
-    papers = scenario.controller.prescribed
-    if {x.key, y.key} != {PERIOD, DELTA} or scenario.loop.mode != "sampled" or not second_order or not papers:
+    papers_loop = scenario.loop.mode == "sampled" and scenario.controller.prescribed
+    if {x.key, y.key} != {PERIOD, DELTA} or not (papers_loop and second_order):
         return {}
     eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
     implicit, border = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
-    late = {"a period": 1.0} | ({f"{delay} periods": float(delay)} if delay > 1 else {})
-    if implicit:  # without delay it has no border: where it would be is drawn
-        asked = {f"{border}, of explicit sampling only": (0.0, False)}
-        asked |= {f"with {how_long} of delay": (by, True) for how_long, by in late.items()}
-    else:
-        asked = {border: (0.0, False)}
-        asked |= {f"the same with {how_long} of delay": (by, False) for how_long, by in late.items()}
-    found = {}
-    for label, (by, backward) in asked.items():
-        how = {"anchored": anchored, "implicit": backward}
-        delta = np.array([borders.smallest_delta(eta, float(period), by, **how) for period in h])
-        found[label] = (h, delta) if x.key == PERIOD else (delta, h)
-    return found
+    # without delay implicit sampling has no border: where it would be is drawn
+    without = f"{border}, of explicit sampling only" if implicit else border
+    delayed = "with {} of delay" if implicit else "the same with {} of delay"
+    delays = {without: 0.0, delayed.format("a period"): 1.0}
+    if delay > 1:
+        delays[delayed.format(f"{delay} periods")] = float(delay)
+    drawn = {}
+    for label, periods in delays.items():
+        how = {"anchored": anchored, "implicit": implicit and periods > 0.0}
+        delta = np.array([borders.smallest_delta(eta, float(period), periods, **how) for period in h])
+        drawn[label] = (h, delta) if x.key == PERIOD else (delta, h)
+    return drawn
 
 
-def spillover(scenario: Scenario, x: Axis, y: Axis, cells: list[Cell]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the modes that the law does not know cost the loop its stability, by linear theory: label -> (x, y).
 
     The border between pairs with a pole inside and outside the unit circle, at the hand-over and in hold.
     """
-    if getattr(scenario, "flexible", None) is None:
+    if getattr(flown.scenario, "flexible", None) is None:
         return {}
-    across, up = (np.log(one.values) if one.logarithmic else np.asarray(one.values) for one in (x, y))
-    found = {}
+    axes = flown.x, flown.y
+    across, up = (np.log(one.values) if one.logarithmic else np.asarray(one.values) for one in axes)
+    drawn = {}
     for name, label in (("radius", "border by linear theory, at the hand-over"), ("hold_radius", "the same in hold")):
-        grid = np.array([getattr(cell, name) for cell in cells]).reshape(up.size, across.size)
+        grid = flown.grid(name)
         off = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(across, up, off).lines(margins.NEUTRAL)
         if pieces:
             points = np.concatenate([np.vstack([piece, [[np.nan, np.nan]]]) for piece in pieces])
-            ends = (np.exp(v) if one.logarithmic else v for one, v in zip((x, y), points.T, strict=True))
-            found[label] = tuple(ends)
-    return found
+            drawn[label] = tuple(np.exp(v) if one.logarithmic else v for one, v in zip(axes, points.T, strict=True))
+    return drawn
 
 
-def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell], seed: int, figures: bool) -> None:
+def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
     """Fill a result folder."""
+    scenario, x, y, cells = flown.scenario, flown.x, flown.y, flown.cells
     trials = max((cell.trials for cell in cells), default=0)
     made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **own.digests(scenario)}
     store.record(folder, parsing.dump(scenario), made_by)
@@ -233,20 +249,16 @@ def write(folder: Path, scenario: Scenario, x: Axis, y: Axis, cells: list[Cell],
     rows = [["" if value != value else value for value in row] for row in cells_of]
     store.write_csv(folder / "map.csv", [x.key, y.key, *fields], rows)
     if figures:
-        shape = (len(y.values), len(x.values))
-        grids = {
-            name: np.array([getattr(cell, name) for cell in cells]).reshape(shape)
-            for name in ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
-        }
+        names = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
+        grids = {name: flown.grid(name) for name in names}
         if not any(np.isfinite(grid).any() for grid in grids.values()):
             return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
-        lost = np.array([cell.failures + cell.missed > 0 for cell in cells]).reshape(shape)
-        made = study_plots.accuracy_map(
-            (x.key, x.values, x.logarithmic),
-            (y.key, y.values, y.logarithmic),
+        drawn = study_plots.accuracy_map(
+            study_plots.MapAxis(x.key, x.values, x.logarithmic),
+            study_plots.MapAxis(y.key, y.values, y.logarithmic),
             grids,
-            lost,
-            lines(scenario, x, y) | spillover(scenario, x, y, cells),
+            flown.grid("failures") + flown.grid("missed") > 0,
+            lines(scenario, x, y) | spillover(flown),
             scenario.plant.kind,
         )
-        style.save({"map": made}, folder / "figures")
+        style.save({"map": drawn}, folder / "figures")

@@ -6,7 +6,7 @@ SMC 1(3), 1971).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import cautions, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains, trust
 from tuning.search.cma_es import NEARBY
@@ -28,7 +28,7 @@ from tuning.search.descents import Descents
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
 from tuning.search.optimise import Search
-from tuning.search.progress import Report
+from tuning.search.progress import Report, headed
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing
 
@@ -94,24 +94,21 @@ def trace(
     """The front of a scenario's free gains, with so many steps of the ladder. Raises KeyboardInterrupt on Ctrl-C."""
     limited, own_limit = _limited(scenario)
     posed = posing.pose(limited, seed, journal)
-    ready, problem, evaluate, starts = posed.ready, posed.problem, posed.evaluate, limited.search.starts
+    problem, evaluate, starts = posed.problem, posed.evaluate, limited.search.starts
     beside, refused = judging.beside(limited)
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:
         return replace(problem, limits=jnp.asarray(problem.limits).at[at].set(limit))
 
-    def report_as(what: str) -> Report:
-        return lambda doing, *numbers: tell(f"{what}: {doing}", *numbers)
-
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
-    free = posed.search(under(OFF), posed.own, starts, loose, judged=False, report=report_as("most torque"))
-    _unless_interrupted(free)
+    report = headed(tell, "most torque")
+    free = uninterrupted(posed.search(under(OFF), posed.own, starts, loose, judged=False, report=report))
     problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
     tight = HARDLY * highest
-    least = posed.search(under(tight), posed.own, FEWER, (), judged=False, report=report_as("least torque"))
-    _unless_interrupted(least)
+    report = headed(tell, "least torque")
+    least = uninterrupted(posed.search(under(tight), posed.own, FEWER, (), judged=False, report=report))
     lowest = least.ended[at] * tight
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
@@ -120,13 +117,20 @@ def trace(
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
-    fixed = {}
+    others = {}
     for name, other in beside.items():
-        trials, values = judging.judge(other, fresh_seed, ready.requirements), gains.gains_of(study(other).parts)
-        fixed[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
-    count = next(iter(judged.values()))[1].status.size if judged else 0
-    floor = judging.floor_of(scenario, fresh_seed)
-    return Front(_marked(judged), fixed, refused, fresh_seed, count, floor, evaluate.rollouts, evaluate.gradients)
+        trials, values = judging.judge(other, fresh_seed, posed.ready.requirements), gains.gains_of(study(other).parts)
+        others[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
+    return Front(
+        points=_marked(judged),
+        others=others,
+        paper_refused=refused,
+        fresh_seed=fresh_seed,
+        trials=next(iter(judged.values()))[1].status.size if judged else 0,
+        floor=judging.floor_of(scenario, fresh_seed),
+        rollouts=evaluate.rollouts,
+        gradients=evaluate.gradients,
+    )
 
 
 def check(scenario: Scenario) -> None:
@@ -142,16 +146,17 @@ def check(scenario: Scenario) -> None:
 
 def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:
     """The scenario with a requirement on the peak torque, and its own limit, if there is one."""
-    known = scenario.requirements.get(TORQUE)
-    if known is None:
-        requirements = {**parsing.dump(scenario).get("requirements", {}), TORQUE: OFF}
-        return changed(scenario, requirements=requirements), None
-    return scenario, known.limit if isinstance(known, Limit) else float(known)
+    own_limit = judging.limit_of(TORQUE, scenario)
+    if own_limit is not None:
+        return scenario, own_limit
+    return changed(scenario, requirements={**parsing.dump(scenario).get("requirements", {}), TORQUE: OFF}), None
 
 
-def _unless_interrupted(found: Search) -> None:
-    if found.interrupted:
+def uninterrupted(outcome: Search) -> Search:
+    """The outcome of a search; raises KeyboardInterrupt where that was interrupted."""
+    if outcome.interrupted:
         raise KeyboardInterrupt
+    return outcome
 
 
 def climbed(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
@@ -163,10 +168,10 @@ def climbed(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Po
     rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
     for done, k in enumerate(rungs):
         tell("ladder", done, len(rungs), np.nan, 0.0)
-        found = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
-        if found is not None and (k not in best or found.f < best[k].f):
-            best[k] = found
-            known.append(found.share)
+        step = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
+        if step is not None and (k not in best or step.f < best[k].f):
+            best[k] = step
+            known.append(step.share)
     return best
 
 
@@ -236,13 +241,13 @@ def _beats(one: tuple[Point, Trials], other: tuple[Point, Trials]) -> bool:
 
     A point with more failed trials does not. One trial, where nothing is drawn, has no interval.
     """
-    (a, flown), (b, _) = one, other
+    (a, trials), (b, others) = one, other
     if a is b or a.failures > b.failures or not (a.peak <= b.peak and a.rms < b.rms):
         return False
-    both = one[1].finished & other[1].finished
-    errors = (np.asarray(pair[1].metrics.window_error)[both] for pair in (other, one))
-    interval = trust.ratio_interval(*errors)
-    return flown.status.size == 1 if interval is None else interval[0] > 1.0
+    both = trials.finished & others.finished
+    errors, error_of_others = (np.asarray(flown.metrics.window_error)[both] for flown in (trials, others))
+    interval = trust.ratio_interval(error_of_others, errors)
+    return trials.status.size == 1 if interval is None else interval[0] > 1.0
 
 
 def knee_of(points: np.ndarray) -> int:
@@ -254,16 +259,11 @@ def knee_of(points: np.ndarray) -> int:
 
 def identity(scenario: Scenario, seed: int, points: int) -> dict[str, Any]:
     """What `versions.json` knows a finished or interrupted front by."""
-    source = own.digests(scenario)
-    return {"command": "pareto", "seed": seed, "points": points, **source}
+    return {"command": "pareto", "seed": seed, "points": points, **own.digests(scenario)}
 
 
 def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
     """What `summary.json` says."""
-
-    def said(point: Point) -> dict[str, Any]:
-        return {name: getattr(point, name) for name in point.__dataclass_fields__}
-
     return {
         "status": front.status,
         "plant": scenario.plant.kind,
@@ -274,8 +274,8 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "floor": front.floor,
         "rollouts": front.rollouts,
         "gradients": front.gradients,
-        "points": [said(point) for point in front.points],
-        **{name: said(point) for name, point in front.others.items()},
+        "points": [asdict(point) for point in front.points],
+        **{name: asdict(point) for name, point in front.others.items()},
         "paper_refused": front.paper_refused,
         "cautions": cautions.of(scenario),
     }
@@ -294,8 +294,7 @@ def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_b
     ]  # fmt: skip
     store.write_csv(folder / "front.csv", header, rows)
     if figures:
-        known = scenario.requirements.get(TORQUE)
-        limit = None if known is None else _limited(scenario)[1]
-        units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name][0] for name in ("window_error", TORQUE))
-        drawn = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
-        style.save({"front": drawn}, folder / "figures")
+        limit = judging.limit_of(TORQUE, scenario)
+        units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name].unit for name in ("window_error", TORQUE))
+        figure = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
+        style.save({"front": figure}, folder / "figures")

@@ -1,9 +1,8 @@
 """The tuning problem of a scenario over its training trials, and what evaluates it."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,7 @@ from tuning.search import shares as gain_bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F, Problem
-from tuning.search.optimise import Search, search
+from tuning.search.optimise import Search, Settings, search
 from tuning.studies import judging
 
 DIGITS = 6  # of the gains handed over; what is judged is what is handed over
@@ -36,15 +35,24 @@ class Posed:
     seed: int
 
     def search(
-        self, problem: Problem, gains: np.ndarray, starts: int, asked: Sequence[Requirement] | None = None, **how: Any
+        self,
+        problem: Problem,
+        gains: np.ndarray,
+        starts: int,
+        asked: Sequence[Requirement] | None = None,
+        *,
+        judged: bool = True,
+        margin: float = 0.0,
+        **told: Callable,
     ) -> Search:
         """Look for the best gains of this problem from these gains, (gains,), and so many starts in all.
 
-        asked: what is kept, where it is other than the scenario asks for; how: see `optimise.search`.
+        asked: what is kept, where it is other than the scenario asks for; judged, margin: see `Settings`; told: what
+        `search` reports to, and prepares.
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
-        how = {"sloped": self.sloped, "robust": table.worst_case, **how}
-        return search(self.evaluate, problem, asked, gains, starts, table.steps, self.seed, **how)
+        settings = Settings(starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margin)
+        return search(self.evaluate, problem, asked, gains, settings, **told)
 
     def named(self, share: np.ndarray) -> dict[str, float]:
         """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
@@ -90,7 +98,7 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
     smallest_delta, delta = interval("delta", own.delta)
     smallest_t_f, t_f = interval("t_f", own.t_f)
     gain, largest_gain = interval("observer_gain", own.gain, own.largest_gain)
-    found = dataclasses.replace(
+    by_gains = dataclasses.replace(
         own,
         smallest_t_f=smallest_t_f,
         t_f=t_f,
@@ -102,7 +110,7 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
         sign_width=interval("sign_width", own.sign_width)[0],
         surface_rate=interval("surface_rate", own.surface_rate)[1],
     )
-    return dataclasses.replace(found, **farther)
+    return dataclasses.replace(by_gains, **farther)
 
 
 def _tail(table: tables.Tune, trials: int) -> int | None:

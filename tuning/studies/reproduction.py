@@ -34,57 +34,58 @@ def reproduce() -> Reproduction:
     return Reproduction(cases, claims.claims(cases), slips.slips(cases), remark_2.measure())
 
 
-def summary(made: Reproduction) -> dict[str, Any]:
+def summary(reproduction: Reproduction) -> dict[str, Any]:
     """What `summary.json` says."""
-    verdicts = [claim.verdict for claim in made.claims]
+    verdicts = [claim.verdict for claim in reproduction.claims]
     return {
-        "status": "ok" if made.ok else "failed",
+        "status": "ok" if reproduction.ok else "failed",
         "verdicts": {word: verdicts.count(word) for word in claims.VERDICTS},
-        "claims": [asdict(claim) for claim in made.claims],
-        "slips": [asdict(slip) for slip in made.slips],
+        "claims": [asdict(claim) for claim in reproduction.claims],
+        "slips": [asdict(slip) for slip in reproduction.slips],
         "observers": [
-            {key: value for key, value in asdict(one).items() if key not in ("t", "off")} for one in made.observers
+            {key: value for key, value in asdict(one).items() if key not in ("t", "off")}
+            for one in reproduction.observers
         ],
         "cases": {
             name: {"figures": claims.CASES[name][0], "status": run.status, **run.metrics}
-            for name, run in made.cases.items()
+            for name, run in reproduction.cases.items()
         },
     }
 
 
-def write(folder: Path, made: Reproduction, figures: bool) -> None:
+def write(folder: Path, reproduction: Reproduction, figures: bool) -> None:
     """Fill a result folder."""
     store.write_json(folder / "versions.json", store.versions("reproduce", 0))
-    store.write_json(folder / "summary.json", summary(made))
-    (folder / "claims.md").write_text(_markdown(made), encoding="utf-8")
+    store.write_json(folder / "summary.json", summary(reproduction))
+    (folder / "claims.md").write_text(_markdown(reproduction), encoding="utf-8")
     (folder / "scenarios").mkdir()
     for name, (_, _, tables) in claims.CASES.items():
         store.write_toml(folder / "scenarios" / f"{name}.toml", parsing.dump(from_tables(tables)))
     if figures:
-        style.save(_figures(made), folder / "figures")
+        style.save(_figures(reproduction), folder / "figures")
 
 
-def _figures(made: Reproduction) -> dict[str, Figure]:
-    found = {}
-    for name, run in made.cases.items():
+def _figures(reproduction: Reproduction) -> dict[str, Figure]:
+    figures = {}
+    for name, run in reproduction.cases.items():
         numbers, title, _ = claims.CASES[name]
         first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
         chain = not run.parts.plant.attitude
         parts = ("a", "b") if chain else ("", "")
         motion, label = (run_plots.states, "states") if chain else (run_plots.attitude, "attitude")
         heading = f"Fig. {first}{f' ({parts[0]})' if chain else ''}: {title}"
-        found[f"fig_{int(first):02}{parts[0]}_{label}"] = motion(run.parts, run.log, heading)
+        figures[f"fig_{int(first):02}{parts[0]}_{label}"] = motion(run.parts, run.log, heading)
         heading = f"Fig. {last}{f' ({parts[1]})' if chain else ''}: {title}"
         label = "control" if chain else "torque"
-        found[f"fig_{int(last):02}{parts[1]}_{label}"] = run_plots.torque(run.parts, run.log, title=heading)
-        found[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
-    found["remark_2_observers"] = run_plots.observers(made.observers)
-    return found
+        figures[f"fig_{int(last):02}{parts[1]}_{label}"] = run_plots.torque(run.parts, run.log, title=heading)
+        figures[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
+    figures["remark_2_observers"] = run_plots.observers(reproduction.observers)
+    return figures
 
 
-def _markdown(made: Reproduction) -> str:
-    claims = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in made.claims]
-    shown = [(s.where, s.paper, s.correct, s.shown) for s in made.slips]
+def _markdown(reproduction: Reproduction) -> str:
+    claims = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in reproduction.claims]
+    shown = [(s.where, s.paper, s.correct, s.shown) for s in reproduction.slips]
     return "\n".join(
         [
             "# The paper's claims beside what was measured",
@@ -97,7 +98,7 @@ def _markdown(made: Reproduction) -> str:
             "",
             "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
             "",
-            *_rows(*remark_2.rows(made.observers)),
+            *_rows(*remark_2.rows(reproduction.observers)),
             "",
         ]
     )

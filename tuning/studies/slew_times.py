@@ -5,7 +5,7 @@ what its neighbours found, down the ladder of times and up again, as the front a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,12 @@ from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import cautions, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from tuning.search import confirm, gains, trust
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
-from tuning.search.progress import Report
+from tuning.search.progress import Report, headed
 from tuning.studies import judging, pareto, posing
 
 # what a faster slew may cost: of those metrics that a scenario has, the largest of the fresh trials
@@ -92,39 +92,34 @@ def trace(
     scenario: Scenario,
     seed: int,
     times: Sequence[float],
-    tell: Report = lambda *told: None,
+    tell: Report = lambda *_: None,
     journal: Journal | None = None,
 ) -> Slews:
     """The best gains for each of these times [s]. Raises KeyboardInterrupt on Ctrl-C."""
     times = sorted(times)
     base = _at(scenario, times[0])
-    table = base.search
     posed = posing.pose(base, seed, journal, t_f=times[-1])
     ladder = [replace(posed.problem, parts=gains.with_gains(posed.problem.parts, {"t_f": t_f})) for t_f in times]
     shares = []
-    for k, what, starts in ((-1, "longest", table.starts), (0, "shortest", pareto.FEWER)):
-
-        def told(doing: str, *numbers: Any, what: str = what) -> None:
-            tell(f"{what} time: {doing}", *numbers)
-
-        outcome = posed.search(ladder[k], posed.own, starts, judged=False, report=told)
-        if outcome.interrupted:
-            raise KeyboardInterrupt
+    for k, heading, starts in ((-1, "longest time", base.search.starts), (0, "shortest time", pareto.FEWER)):
+        report = headed(tell, heading)
+        outcome = pareto.uninterrupted(posed.search(ladder[k], posed.own, starts, judged=False, report=report))
         shares.append(outcome.share)
         # the hardest trials that joined are asked for at every time
         ladder = [replace(outcome.problem, parts=one.parts) for one in ladder]
     best = pareto.climbed(ladder, shares, posed, tell)
-    fresh_seed, slews, count = judging.seed_of_judge(seed), [], 0
-    ready = study(judging.as_flown(base), reach=posing.reach(base, table, t_f=times[-1]))
+    fresh_seed, slews = judging.seed_of_judge(seed), []
+    ready = study(judging.as_flown(base), reach=posing.reach(base, base.search, t_f=times[-1]))
+    count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements)) if best else 0
     for done, k in enumerate(sorted(best)):
         tell("judging on fresh trials", done, len(best), np.nan, 0.0)
         named = posed.named(best[k].share)
-        parts = gains.with_gains(ready.parts, {**named, "t_f": times[k]})
-        count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements))
+        with_time = {**named, "t_f": times[k]}
+        parts = gains.with_gains(ready.parts, with_time)
         trials = montecarlo.run(parts, ready.dispersion, fresh_seed, np.arange(count))
-        tuned = gains.in_scenario(scenario, {**named, "t_f": times[k]})
+        tuned = gains.in_scenario(scenario, with_time)
         costs = {name: judging.largest(name, tuned, trials) for name in _costs(tuned)}
-        slews.append(Slew(times[k], dict(named), costs=costs, **judging.figures(tuned, trials, fresh_seed)))
+        slews.append(Slew(times[k], named, costs=costs, **judging.figures(tuned, trials, fresh_seed)))
     without = [t_f for k, t_f in enumerate(times) if k not in best]
     return Slews(slews, without, fresh_seed, count, posed.evaluate.rollouts, posed.evaluate.gradients)
 
@@ -142,38 +137,38 @@ def identity(scenario: Scenario, seed: int, times: Sequence[float]) -> dict[str,
     return {"command": "pareto", "seed": seed, "against": T_F, "times": listed, **own.digests(scenario)}
 
 
-def summary(found: Slews, scenario: Scenario) -> dict[str, Any]:
+def summary(traced: Slews, scenario: Scenario) -> dict[str, Any]:
     """What `summary.json` says."""
     return {
-        "status": found.status,
+        "status": traced.status,
         "against": T_F,
         "plant": scenario.plant.kind,
         "requirements": list(scenario.requirements),
-        "trials": found.trials,
-        "seed": found.fresh_seed,
+        "trials": traced.trials,
+        "seed": traced.fresh_seed,
         "interval_confidence": trust.CONFIDENCE,
-        "rollouts": found.rollouts,
-        "gradients": found.gradients,
-        "slews": [{name: getattr(slew, name) for name in slew.__dataclass_fields__} for slew in found.slews],
-        "without": found.without,
+        "rollouts": traced.rollouts,
+        "gradients": traced.gradients,
+        "slews": [asdict(slew) for slew in traced.slews],
+        "without": traced.without,
         "cautions": cautions.of(scenario),
     }
 
 
-def write(folder: Path, scenario: Scenario, found: Slews, figures: bool, known_by: dict[str, Any]) -> None:
+def write(folder: Path, scenario: Scenario, traced: Slews, figures: bool, known_by: dict[str, Any]) -> None:
     """Fill a result folder."""
-    store.record(folder, parsing.dump(scenario), known_by, summary(found, scenario))
+    store.record(folder, parsing.dump(scenario), known_by, summary(traced, scenario))
     names, costs = gains.named(scenario), _costs(scenario)
     header = ["t_f", *names, "rms_window_error", "rms_low", "rms_high", *costs, "failures", "meets"]
     rows = [
         [slew.t_f, *(slew.gains[name] for name in names), slew.rms, *(slew.interval or ("", "")),
          *(slew.costs[name] for name in costs), slew.failures, int(slew.meets)]
-        for slew in found.slews
+        for slew in traced.slews
     ]  # fmt: skip
     store.write_csv(folder / "slew_times.csv", header, rows)
-    if figures and found.slews:
-        entries = catalogues.CATALOGUES[scenario.plant.kind]
-        limits = {name: value.limit if isinstance(value, Limit) else float(value)
-                  for name, value in scenario.requirements.items() if name in (*costs, "window_error")}  # fmt: skip
-        units = {name: entries[name].unit for name in ("window_error", *costs)}
-        style.save({"slew_times": study_plots.slew_times(found.slews, units, limits)}, folder / "figures")
+    if figures and traced.slews:
+        shown = ("window_error", *costs)
+        units = {name: catalogues.CATALOGUES[scenario.plant.kind][name].unit for name in shown}
+        limits = {name: judging.limit_of(name, scenario) for name in shown}
+        limits = {name: limit for name, limit in limits.items() if limit is not None}
+        style.save({"slew_times": study_plots.slew_times(traced.slews, units, limits)}, folder / "figures")

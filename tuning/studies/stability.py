@@ -42,25 +42,26 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if ready.scenario.loop.mode != "sampled":
         return None
-    found, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
-    if np.isnan(found.modulus[-1]).any():
+    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
+    if np.isnan(left.modulus[-1]).any():
         return None
     swing = rest.swing(ready.parts, history)
     if swing is not None:
-        found = rest.none_left(found, hold)
-    places = {"before": ~hold, "hold": hold}
-    each = {where: _worst(jax.tree.map(lambda v, rows=rows: v[rows], found)) for where, rows in places.items()
-            if rows.any()}  # fmt: skip
-    return each if swing is None else each | {"hold": {**each["hold"], **_swing(ready.scenario, swing)}}
+        left = rest.none_left(left, hold)
+    each = {}
+    for where, rows in (("before", ~hold), ("hold", hold)):
+        if rows.any():
+            there = jax.tree.map(lambda v, rows=rows: v[rows], left)
+            least = {name: _number(value) for name, value in there.worst().items()}
+            each[where] = {"stable": bool(there.stable.all()), **least}
+    if swing is not None:
+        each["hold"] |= _swing(ready.scenario, swing)
+    return each
 
 
 def _swing(scenario: Scenario, swing: Swing) -> dict[str, Any]:
     unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
     return {"swing": {**swing._asdict(), "unit": unit}}
-
-
-def _worst(found: margins.Margins) -> dict[str, Any]:
-    return {"stable": bool(found.stable.all()), **{name: _number(v) for name, v in found.worst().items()}}
 
 
 def _number(value: Any) -> float | None:
@@ -81,8 +82,8 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     inputs, seen = names(ready)
     (_, hold), before = course.hold, course.before
 
-    def table(found: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
-        return {label: {name: _number(getattr(found, name)[k]) for name in fields} for k, label in enumerate(labels)}
+    def table(left: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
+        return {label: {name: _number(getattr(left, name)[k]) for name in fields} for k, label in enumerate(labels)}
 
     t_f = float(ready.parts.controller.t_f)
     exact = getattr(ready.scenario.controller, "sign_width", None) == 0.0
@@ -133,9 +134,9 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
 
         loop, hold = course.hold
         w, seen = margins.responses(loop)
-        made = {
+        drawn = {
             "nichols": margin_plots.nichols(seen, inputs),
             "sensitivity": margin_plots.sensitivity(w, seen, inputs),
             "margins": margin_plots.over_time(t_f - course.t[:-1], course.before, hold),
         }
-        style.save(made, folder / "figures")
+        style.save(drawn, folder / "figures")

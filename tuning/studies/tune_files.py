@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ptsmc_jax.campaigns import store
@@ -54,10 +53,17 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     """What `summary.json` says."""
     kind, search = tuning.tuned.plant.kind, tuning.search
     groups = {
-        name: {"gains": tuning.judged_gains[name], "floor": tuning.floors[name], **statistics(trials, kind)}
+        name: {
+            "seed": tuning.fresh_seed,
+            "gains": tuning.judged_gains[name],
+            "floor": tuning.floors[name],
+            **statistics(trials, kind),
+        }
         for name, trials in tuning.fresh.items()
     }
-    checked = None if tuning.check is None else asdict(tuning.check)
+    hardest = None
+    if search.hardest is not None:
+        hardest = asdict(search.hardest) | {"unbounded": search.hardest.unbounded, "beyond": search.hardest.beyond}
     return {
         "status": tuning.status,
         "plant": kind,
@@ -67,12 +73,12 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         **_accuracy_gain(tuning.fresh),
         "interval_confidence": trust.CONFIDENCE,
         "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
-        "fresh": {"seed": tuning.fresh_seed, **groups["tuned"]},
-        **{name: {"seed": tuning.fresh_seed, **group} for name, group in groups.items() if name != "tuned"},
+        "fresh": groups["tuned"],
+        **{name: group for name, group in groups.items() if name != "tuned"},
         "paper_refused": tuning.paper_refused,
         "paper_is": gain_names.paper_is(tuning.tuned),
-        "shortest_t_f": None if tuning.shortest is None else msgspec.to_builtins(tuning.shortest),
-        "verdicts": [{**msgspec.to_builtins(v), "met": v.met} for v in tuning.verdicts],
+        "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
+        "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
         "judged_on": judged_on(tuning.tuned),
         "cautions": cautions.of(tuning.tuned),
         "search": {
@@ -82,18 +88,13 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "steps": len(search.history),
             "rounds_with_harder_trials": search.rounds,
             "margin": search.margin,
-            "earlier": [asdict(one) for one in tuning.earlier],
+            "earlier": [asdict(earlier) for earlier in tuning.earlier],
             "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in search.counts
             ],
             "worst_case": tuning.tuned.search.worst_case,
-            "hardest": None
-            if search.hardest is None
-            else {
-                **asdict(search.hardest),
-                **{name: getattr(search.hardest, name) for name in ("unbounded", "beyond")},
-            },
+            "hardest": hardest,
             "trials": np.asarray(search.problem.trials).tolist(),
             "averaged": search.problem.averaged,
             "rollouts": tuning.rollouts,
@@ -102,7 +103,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "seconds_by_step": search.seconds,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
-        "differential_evolution": checked,
+        "differential_evolution": None if tuning.check is None else asdict(tuning.check),
     }
 
 
@@ -118,10 +119,10 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
     }
 
 
-def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
+def _trust(trust: Trust, tuning: Tuning) -> dict[str, Any]:
     loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
     influence = {}
-    for name, profile in believed.profiles.items():
+    for name, profile in trust.profiles.items():
         if profile.flat:
             influence[name] = "none"
         elif name not in tuning.at_bound:
@@ -131,15 +132,15 @@ def _trust(believed: Trust, tuning: Tuning) -> dict[str, Any]:
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
-            known = free_gains.border(tuning.tuned, gain, side, bound)
-            influence[name] = known or _beyond(tuning.beyond.get(name), bound)
-    slopes = believed.slope_error
+            border = free_gains.border(tuning.tuned, gain, side, bound)
+            influence[name] = border or _beyond(tuning.beyond.get(name), bound)
+    slopes = trust.slope_error
     return {
         "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
-        "sensitivities": believed.sensitivities,
-        "margins": believed.margins,
-        "profiles": {name: asdict(profile) for name, profile in believed.profiles.items()},
+        "sensitivities": trust.sensitivities,
+        "margins": trust.margins,
+        "profiles": {name: asdict(profile) for name, profile in trust.profiles.items()},
     }
 
 
@@ -178,8 +179,7 @@ def _paths(history: Sequence[Step]) -> list[list[Step]]:
 
 def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
     """What `versions.json` knows a finished or interrupted tuning by."""
-    source = own.digests(scenario)
-    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **source}
+    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **own.digests(scenario)}
 
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
         figures["profiles"] = study_plots.profiles(
             {
-                name: (units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
+                name: study_plots.Profile(units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
             goal,

@@ -128,10 +128,16 @@ def tune(
     """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw.
 
     Where these break a limit that the search kept, it goes on from the gains it found with more distance from the
-    limits, and is judged on others. tries: searches, at most.
+    limits, and is judged on others.
 
-    journal: of evaluations, from which an interrupted run goes on; globally: compare with differential evolution;
-    trusted: find out what makes the result believable too.
+    Args:
+        scenario: what is tuned.
+        seed: of training trials and search; fresh trials have one that follows from it.
+        report: is called after every step.
+        journal: of evaluations, from which an interrupted run goes on.
+        globally: compare with differential evolution.
+        trusted: find out what makes the result believable too.
+        tries: searches, at most.
     """
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
@@ -150,11 +156,12 @@ def tune(
         name: judging.judge(other, judged.seed, posed.ready.requirements) for name, other in others.items()
     }
     shortest = _shortest(posed, judged)
-    believed, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
+    trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
     if trusted and not outcome.interrupted:
         report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, 0.0)
-        believed = _trust(posed, judged)
-        beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not believed.profiles[name].flat})
+        trust_in_it = _trust(posed, judged)
+        profiles = trust_in_it.profiles
+        beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not profiles[name].flat})
     return Tuning(
         tuned=judged.scenario,
         gains=judged.gains,
@@ -170,7 +177,7 @@ def tune(
         floors={name: judging.floor_of(one, judged.seed) for name, one in candidates.items()},
         verdicts=judged.verdicts,
         shortest=shortest,
-        trust=believed,
+        trust=trust_in_it,
         beyond=beyond,
         check=check,
         rollouts=rollouts,
