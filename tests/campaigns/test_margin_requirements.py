@@ -75,6 +75,22 @@ def test_of_many_loops_the_smallest_margin_counts_and_one_without_a_value_breaks
     assert not asked.verdict(np.array([50.0, np.nan]), np.array([True, False])).met
 
 
+@pytest.mark.parametrize(
+    ("dispersion", "differ"),
+    [
+        ({"attitude": {}}, True),
+        ({"rate": {}}, True),
+        ({"inertia": {}}, True),
+        ({"reference": {}}, True),
+        ({"disturbance_phase": {}}, False),
+        ({"attitude_noise": {"kind": "relative_normal"}}, False),
+    ],
+)
+def test_loops_differ_where_what_they_hang_on_is_drawn(dispersion, differ):
+    made = scenario.from_tables({**BODY, "dispersion": dispersion})
+    assert margin_verdicts.differ(scenario.study(made).dispersion) == differ
+
+
 @programs.jit
 def drawn_parts(parts, dispersion, seed, trials):
     return jax.vmap(lambda trial: dispersion.apply(parts, seed, trial))(trials)
