@@ -11,6 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.theory import run_margins
 from tuning.errors import UsageError
 from tuning.studies import mapping
 
@@ -22,6 +23,7 @@ dispersion.attitude = { kind = "axis_angle", min_deg = 20.0, max_deg = 60.0 }
 """
 CHAIN = """
 plant = { kind = "chain", x0 = [1.0, 0.0] }
+observer = { kind = "nonlinear", gain = [10.0] }
 loop = { mode = "sampled", period = 0.1, t_end = 7.0, clock = "flight" }
 controller = { t_f = 5.0, delta = 0.5 }
 hardware.state_noise = [2e-5, 1e-6]
@@ -77,9 +79,15 @@ def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped)
             trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
             np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
             np.testing.assert_allclose(cell.largest_peak_torque, trials.metrics.peak_torque.max(), rtol=1e-9)
+            for name, (left, radius) in zip(("", "hold_"), run_margins.at_ends(alone.parts).values(), strict=True):
+                np.testing.assert_allclose(getattr(cell, f"{name}radius"), radius, rtol=1e-9)
+                np.testing.assert_allclose(getattr(cell, f"{name}delay_margin"), left.delay.min(), rtol=1e-6)
+                factor = 10.0 ** (left.gain_up.min() / 20.0)
+                np.testing.assert_allclose(getattr(cell, f"{name}gain_margin"), factor, rtol=1e-6)
         if cell.status == "flown":
             assert (cell.trials, cell.failures) == (6, 0)
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
+    assert any(cell.radius < 1.0 for cell in cells)
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
 from tuning.output import sentences
-from tuning.studies import slew_times
+from tuning.studies import judging, slew_times
 
 
 def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
@@ -28,7 +28,17 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert (fast["t_f"], slow["t_f"]) == (4.0, 8.0)
     assert fast["peak_rate"] / slow["peak_rate"] == pytest.approx(2.0, rel=0.3)
     assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
-    # the same trials, flown by the scenario with that time and those gains
+    # each time's gains are at least as good at it as the other time's, on the very trials
+    for own, other in ((fast, slow), (slow, fast)):
+        end = {"controller__t_f": own["t_f"], "loop__t_end": own["t_f"] + 1.5}
+        flown = scenario.replace(scenario.read(tmp_path / "c.toml"), **end)
+        errors = []
+        for gains in (own, other):
+            known = scenario.replace(flown, controller__eta=gains["eta"], controller__delta=gains["delta"])
+            trials = judging.judge(known, judging.seed_of_judge(0), [])
+            errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
+        np.testing.assert_allclose(own["rms_window_error"], errors[0], rtol=1e-9)
+        assert errors[0] < errors[1]
     told = json.loads((tmp_path / "cost" / "summary.json").read_text())
     assert [slew["t_f"] for slew in told["slews"]] == [4.0, 8.0]
     assert told["slews"][0]["rms"] == fast["rms_window_error"]
