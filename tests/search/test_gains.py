@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.devices import attitude_filter
 from ptsmc_jax.scenario import free_gains, from_tables, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -63,7 +62,7 @@ def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
     scenario, ready = wide()
     moved = gains.with_gains(ready.parts, OTHERS[name])
     changed = study(gains.in_scenario(scenario, OTHERS[name]))
-    one, other = (montecarlo.run(parts, ready.dispersion, 3, np.arange(4)).metrics for parts in (moved, changed.parts))
+    one, other = (rollout.simulate_jit(parts, np.uint32(3), np.uint32(1)).metrics for parts in (moved, changed.parts))
     for metric in ("window_error", "peak_torque", "effort", "hold_error"):
         np.testing.assert_allclose(getattr(one, metric), getattr(other, metric), rtol=1e-9, err_msg=metric)
     for parts in (moved, changed.parts):
