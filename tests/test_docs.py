@@ -137,7 +137,9 @@ def test_names_in_the_text_exist(path):
 CODED = [page for page in WRITTEN if blocks(page, "python")]
 
 
-@pytest.mark.parametrize("path", short(CODED, [page for page in CODED if page.name != "python.md"]), ids=page_name)
+@pytest.mark.parametrize(
+    "path", short(CODED, [page for page in CODED if page.name not in ("python.md", "export.md")]), ids=page_name
+)
 def test_code_in_the_text_runs(path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did

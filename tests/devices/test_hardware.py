@@ -113,31 +113,24 @@ def with_device(device, t_end=23.0, **changes):
 
 
 def test_perfect_actuators_change_nothing():
-    plain = fly(with_device(None), 1, 2)
-    through = fly(with_device(actuators.Actuators()), 1, 2)
-    for a, b in zip(plain.metrics, through.metrics, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("delay", short([1, 3], [3]))
-def test_commands_arrive_whole_periods_later(delay):
-    log = fly(with_device(actuators.Actuators(delay=delay)), 1, 2).log
-    np.testing.assert_array_equal(log.u[:delay], np.zeros((delay, 3)))
-    np.testing.assert_array_equal(log.u[delay:-1], log.commanded[: -1 - delay])
+    """They fly by the very program that flies without any."""
+    one, other = (str(jax.make_jaxpr(rollout.simulate)(with_device(d))) for d in (None, actuators.Actuators()))
+    assert one == other
 
 
 @pytest.mark.parametrize("step", [0.01, 0.03])
-def test_limits_and_steps_as_delivered(step):
+def test_limits_and_steps_as_delivered_whole_periods_later(step):
     """The step next to what is cut off at 0.11 N m may lie beyond it."""
-    device = actuators.Actuators(torque_limit=vector(0.11), step=vector(step))
+    device = actuators.Actuators(torque_limit=vector(0.11), step=vector(step), delay=3)
     result = fly(with_device(device, t_end=120.0), 1, 2)
     log = result.log
+    np.testing.assert_array_equal(log.u[:3], np.zeros((3, 3)))
     expected = np.clip(np.round(np.clip(log.commanded, -0.11, 0.11) / step) * step, -0.11, 0.11)
-    np.testing.assert_allclose(log.u[:-1], expected[:-1], atol=1e-15)
+    np.testing.assert_allclose(log.u[3:-1], expected[:-4], atol=1e-15)
     assert float(result.metrics.peak_torque) > 0.11
     np.testing.assert_allclose(result.metrics.peak_torque_delivered, 0.11)
-    beyond = np.any(np.abs(log.commanded[:-1]) > 0.11, axis=1)
-    np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[beyond]) / 120.0, rtol=1e-9)
+    beyond = np.any(np.abs(log.commanded[:-4]) > 0.11, axis=1)
+    np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[3:][beyond]) / 120.0, rtol=1e-9)
 
 
 def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
@@ -431,7 +424,7 @@ def test_gradients_are_finite_at_the_corners():
 
 
 def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
-    device = actuators.Actuators(torque_limit=vector(0.1), step=vector(1e-3))
+    device = actuators.Actuators(torque_limit=vector(0.1), step=vector(1e-3), delay=3)
     result = fly(with_device(device, t_end=120.0))
     assert int(result.status) == rollout.MISSED
     assert result.bad_time == 20.0

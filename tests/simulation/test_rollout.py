@@ -7,10 +7,22 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.plants import rigid_body, second_order
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout, sampled
-from tests.helpers import FULL_INERTIA, REFERENCE, errors_along, finer, fly, parts, short, vector, with_controller
+from tests.helpers import (
+    FULL_INERTIA,
+    REFERENCE,
+    chain_parts,
+    errors_along,
+    finer,
+    fly,
+    parts,
+    short,
+    vector,
+    with_controller,
+)
 
 # 20 s before the hand-over and 11 s after it
 TIGHT = clock.anchored(0.25, 30.0, 20.0, 11.0)
@@ -109,20 +121,20 @@ def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution():
 
 
 def test_order_of_convergence_is_four():
-    run = parts(30.0, 3.0, 0.5, sign_width=1e-2)
-    fine = run.clock
-    assert isinstance(fine, clock.Graded)
+    """Of the whole loop, for a chain with an observer of a sinusoid."""
+    wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 0.7, 0.3, 0.0)))
+    model = integrator_chain.chain(2)
+    observer = nonlinear.NonlinearObserver(model, vector([2.0]), vector(0.035), vector(0.02))
 
-    def final(grid: clock.Graded) -> np.ndarray:
-        log = fly(replace(run, clock=grid)).log
-        return np.concatenate([log.x.q[-1], log.x.w[-1]])
+    def final(scale: int) -> np.ndarray:
+        run = chain_parts([1.0, 0.2], 10.0, delta=0.5, sign_width=0.5, disturbance=wave, observer=observer,
+                          steps=(20 * scale, 10 * scale))  # fmt: skip
+        log = fly(run).log
+        return np.append(log.x[-1], log.d_hat[-1])
 
-    def coarse(scale: int) -> clock.Graded:
-        return replace(fine, before=20 * scale, after=10 * scale, max_step=vector(3.0 / scale))
-
-    truth = final(fine)
-    sizes = np.array([4, 8])
-    errors = np.array([np.abs(final(coarse(int(n))) - truth).max() for n in sizes])
+    truth = final(64)
+    sizes = np.array([4, 8, 16])
+    errors = np.array([np.abs(final(int(n)) - truth).max() for n in sizes])
     assert errors[-1] > 1e-13  # still truncation, not rounding
     slope = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
     assert 3.7 < slope < 4.5

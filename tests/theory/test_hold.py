@@ -47,13 +47,19 @@ def exact(run, t):
     return jax.vmap(component, out_axes=1)(solutions.starts(run))
 
 
+LAWS = {
+    "additive": prescribed_time.PrescribedTime,
+    "multiplicative": prescribed_time.PrescribedTimeMultiplicative,
+    "chain of order 2": 2,
+    "chain of order 3": 3,
+}
+
+
 @pytest.mark.parametrize(("c", "k"), short(RATES, RATES[:1]))
-@pytest.mark.parametrize(
-    "law", [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative, 2, 3],
-    ids=["additive", "multiplicative", "chain of order 2", "chain of order 3"],
-)  # fmt: skip
+@pytest.mark.parametrize("law", short(LAWS, list(LAWS)[1:]))
 def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
     """From t = 0 on in closed form. RK4 leaves below 1e-11: its steps are an eighth of the default grid's."""
+    law = LAWS[law]
     run = flown(law, c, k)
     result = fly(run)
     after = result.log.t >= 8.0
@@ -90,7 +96,7 @@ def test_surface_of_a_chain_at_another_rate_has_its_poles_times_that():
 
 
 def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
-    """RMS of the error over the window, from rest at the paper's attitude: also where the two rates are the same."""
+    """RMS of a chain's error over the window: also where the two rates are the same."""
     late = np.linspace(10.0, 11.0, 401)
 
     def expected(run, c):
@@ -104,7 +110,7 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
 
     sloped = jax.jit(lambda run, c: jax.jvp(lambda c: measured(run, c), (c,), (jnp.ones_like(c),)))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
-        run, at, h = flown(prescribed_time.PrescribedTime, c, k), vector(c), 1e-3
+        run, at, h = flown(2, c, k), vector(c), 1e-3
         forward = float(sloped(run, at)[1])
         # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)

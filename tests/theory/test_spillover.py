@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.theory import covariance, linear, margins, run_margins
+from ptsmc_jax.theory import covariance, linear, margins
 from tests.helpers import fly
 
 # one mode about x that a late loop of some bandwidth drives; no noise, no switching term, small angles: it is linear
@@ -23,14 +23,11 @@ SPILLS = {
 
 
 def test_margins_see_the_mode_and_sensors_see_the_body_alone():
-    parts = scenario.study(
-        scenario.from_tables({**SPILLS, "controller": {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}})
-    ).parts
-    course = run_margins.along(parts)
-    loop, hold = course.hold
+    loop = in_hold(parts_of(controller={**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}))
     assert loop.seen.shape[1] == 6
-    assert course.at_sensors.gain_up.shape == (6,)
-    assert hold.gain_up[0] < hold.gain_up[1] - 3.0  # the mode rings about x
+    assert jax.eval_shape(lambda loop: margins.of(loop, sensors=True), loop).gain_up.shape == (6,)
+    found = margins.of_each(jax.tree.map(lambda v: v[None], loop))
+    assert found.gain_up[0, 0] < found.gain_up[0, 1] - 3.0  # the mode rings about x
 
 
 def test_noise_and_random_walk_by_linear_covariance_are_those_of_flown_trials():
