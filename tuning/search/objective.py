@@ -27,46 +27,37 @@ DRAWN = 128  # trials whose coordinates are drawn in one call
 
 
 @pytree
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rules:
-    """The part of a `Problem` that metrics are judged by."""
-
-    limits: Leaf
-    among: Leaf
-    counted: Leaf
-    averaged: int = field(metadata={"static": True})
-    names: tuple[str, ...] = field(metadata={"static": True})
-    may_break: tuple[int | None, ...] = field(metadata={"static": True})
-    goal: str = field(metadata={"static": True})
-    tail: int | None = field(metadata={"static": True})
-    torque_weight: float = field(metadata={"static": True})
-
-
-@pytree
-@dataclass(frozen=True)
-class Problem:
-    """A tuning problem. The first `averaged` trials count in the objective.
+    """What metrics of the training trials are judged by. The first `averaged` trials count in the objective.
 
     A limit on every trial is one on each trial that is `counted`. A limit on a share of the trials is one on each of
     those that are `among` its own, but for the `may_break` that are farthest beyond it, and on each that is `counted`.
     """
+
+    limits: Leaf  # (requirements,) in the metrics' units
+    among: Leaf  # (requirements, trials) bool: trials of which a share must keep a limit
+    counted: Leaf  # (requirements, trials) bool: trials that must keep it by themselves
+    averaged: int = field(metadata={"static": True})
+    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
+    # of those that are among, how many may break each limit; None: it is one on every trial
+    may_break: tuple[int | None, ...] = field(metadata={"static": True})
+    goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
+    tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
+    torque_weight: float = field(default=0.0, metadata={"static": True})
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Problem(Rules):
+    """A tuning problem: its rules, and what flies."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Leaf  # uint32
     trials: Leaf  # (trials,) uint32, that name the noise
     coordinates: Coordinates  # of what is drawn, arrays over the trials first
-    limits: Leaf  # (requirements,) in the metrics' units
-    among: Leaf  # (requirements, trials) bool: trials of which a share must keep a limit
-    counted: Leaf  # (requirements, trials) bool: trials that must keep it by themselves
-    averaged: int = field(metadata={"static": True})
-    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
-    # of those that are among, how many may break each limit; None: it is one on every trial
-    may_break: tuple[int | None, ...] = field(metadata={"static": True})
-    goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
-    tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
-    torque_weight: float = field(default=0.0, metadata={"static": True})
     margins: Asked | None = None  # of the loop; their rows stand after those of the requirements, see `Evaluator`
 
     @property

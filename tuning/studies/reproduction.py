@@ -70,14 +70,13 @@ def _figures(reproduction: Reproduction) -> dict[str, Figure]:
     for name, run in reproduction.cases.items():
         numbers, title, _ = claims.CASES[name]
         first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
-        chain = not run.parts.plant.attitude
-        parts = ("a", "b") if chain else ("", "")
-        motion, label = (run_plots.states, "states") if chain else (run_plots.attitude, "attitude")
-        heading = f"Fig. {first}{f' ({parts[0]})' if chain else ''}: {title}"
-        figures[f"fig_{int(first):02}{parts[0]}_{label}"] = motion(run.parts, run.log, heading)
-        heading = f"Fig. {last}{f' ({parts[1]})' if chain else ''}: {title}"
-        label = "control" if chain else "torque"
-        figures[f"fig_{int(last):02}{parts[1]}_{label}"] = run_plots.torque(run.parts, run.log, title=heading)
+        if run.parts.plant.attitude:
+            drawn = (first, "", "attitude", run_plots.attitude), (last, "", "torque", run_plots.torque)
+        else:
+            drawn = (first, "a", "states", run_plots.states), (last, "b", "control", run_plots.torque)
+        for number, letter, label, draw in drawn:
+            heading = f"Fig. {number}{f' ({letter})' if letter else ''}: {title}"
+            figures[f"fig_{int(number):02}{letter}_{label}"] = draw(run.parts, run.log, title=heading)
         figures[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
     figures["remark_2_observers"] = run_plots.observers(reproduction.observers)
     return figures
