@@ -91,8 +91,20 @@ def _square_error(square: Array, interval: Interval, errors: Errors, criteria: C
     return square + integral_in_window(interval.t, interval.t_next, (g0, g1, g2), criteria)
 
 
-def _hold_error(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
-    return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, guards.norm(errors.end)), largest)
+def _largest_in_hold(at_end: Callable[[Interval, Errors], Array], at_t_f: Callable[[Arrival], Array]) -> Metric:
+    """The largest value at t_f and at the ends of intervals after it."""
+
+    def update(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+        return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, at_end(interval, errors)), largest)
+
+    return Metric(
+        update_after_t_f=update, value=lambda largest, run, criteria: jnp.maximum(largest, at_t_f(run.arrival))
+    )
+
+
+def _rms_in_window(update: Callable[[Array, Interval, Errors, Criteria], Array]) -> Metric:
+    """Root of the mean over the window of the square that `update` integrates."""
+    return Metric(update_after_t_f=update, value=lambda square, run, criteria: guards.sqrt(square / criteria.window))
 
 
 def _variation(variation: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
@@ -113,10 +125,6 @@ def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: C
     start, end = interval.start.angle, interval.end.angle
     squares = (start * start, (0.5 * (start + end)) ** 2, end * end)
     return square + integral_in_window(interval.t, interval.t_next, squares, criteria)
-
-
-def _hold_angle(largest: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
-    return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(largest, interval.end.angle), largest)
 
 
 def _residual_modal(largest: Array, interval: Interval, criteria: Criteria) -> Array:
@@ -199,19 +207,12 @@ _PEAK_MODAL = _peak(lambda interval: interval.end.modal_amplitude, lambda start:
 METRICS = {
     "terminal_error": Metric(value=lambda memory, run, criteria: guards.norm(run.arrival.error)),
     "terminal_angle": Metric(value=lambda memory, run, criteria: run.arrival.angle),
-    "window_error": Metric(
-        update_after_t_f=_square_error, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
+    "window_error": _rms_in_window(_square_error),
+    "hold_error": _largest_in_hold(
+        lambda interval, errors: guards.norm(errors.end), lambda arrival: guards.norm(arrival.error)
     ),
-    "hold_error": Metric(
-        update_after_t_f=_hold_error,
-        value=lambda largest, run, criteria: jnp.maximum(largest, guards.norm(run.arrival.error)),
-    ),
-    "window_angle": Metric(
-        update_after_t_f=_square_angle, value=lambda square, run, criteria: guards.sqrt(square / criteria.window)
-    ),
-    "hold_angle": Metric(
-        update_after_t_f=_hold_angle, value=lambda largest, run, criteria: jnp.maximum(largest, run.arrival.angle)
-    ),
+    "window_angle": _rms_in_window(_square_angle),
+    "hold_angle": _largest_in_hold(lambda interval, errors: interval.end.angle, lambda arrival: arrival.angle),
     "peak_torque": _peak(lambda interval: _largest_of(interval.torques.commanded)),
     "peak_torque_delivered": _peak(lambda interval: _largest_of(interval.torques.delivered)),
     "saturated": Metric(
