@@ -12,6 +12,7 @@ from ptsmc_jax.campaigns import campaign
 from tests.helpers import SHORT_CHAIN, same, short
 from tests.output.pages import checked
 from tuning.output import sentences
+from tuning.studies import campaign_summary
 
 FOLDER = "out/montecarlo-s"
 MANY = 70  # trials, so many that the program of hundreds flies them
@@ -89,6 +90,10 @@ def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown):
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
     assert "CAUTION: all 250 trials are the same flight: nothing is drawn" in said
+
+
+def test_trials_that_all_fail_are_not_said_to_be_the_same():
+    assert campaign_summary._alike({"window_error": {"without_value": 5}}, 5) == []
 
 
 def test_more_trials_add_to_what_is_there(command, flown):
