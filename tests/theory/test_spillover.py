@@ -31,13 +31,13 @@ def test_margins_see_the_mode_and_sensors_see_the_body_alone():
 
 
 def test_noise_and_random_walk_by_linear_covariance_are_those_of_flown_trials():
-    """Either of them is a good part of it, behind a delay of a period."""
+    """Either of them is a good part of it, behind a delay of two periods."""
     from ptsmc_jax.campaigns import montecarlo
 
     tables = {
         **SPILLS,
         "controller": {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2},
-        "hardware": {"attitude_noise": 1e-4, "rate_noise": 1e-4, "delay": 1},
+        "hardware": {"attitude_noise": 1e-4, "rate_noise": 1e-4, "delay": 2},
         "disturbance": {"kind": "random_walk", "density": [3e-4] * 3},
         "loop": {"mode": "sampled", "period": 0.2, "t_end": 12.0, "window": 4.0},
         "initial": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
