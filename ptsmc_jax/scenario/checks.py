@@ -1,8 +1,6 @@
-"""What single keys of a scenario cannot tell: defaults that depend on other keys, keys against each other."""
+"""What single keys of a scenario cannot tell: keys against each other."""
 
 import math
-
-import msgspec
 
 from ptsmc_jax.scenario import errors, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -11,25 +9,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
-USUAL_WINDOW = 1.0  # [s]
 SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
-
-
-def resolve(scenario: Scenario) -> Scenario:
-    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds.
-
-    Raises ScenarioError where the body is none, from whose inertia some follow.
-    """
-    scenario.check_body()
-    loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
-    window = loop.window
-    if window is None:
-        window = max(USUAL_WINDOW, loop.period) if loop.mode == "sampled" else USUAL_WINDOW
-    t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
-    loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
-    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)
-    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario, m))
-    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario, m)).resolved()
 
 
 def check(scenario: Scenario) -> None:

@@ -9,6 +9,8 @@ import msgspec
 from ptsmc_jax.scenario import checks, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
+USUAL_WINDOW = 1.0  # [s]
+
 
 def read(path: str | Path) -> Scenario:
     """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
@@ -20,11 +22,28 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
 
     run: code of one's own may be run, without which its keys and gains are not known, and not checked: see `complete`.
     """
-    scenario = checks.resolve(parsing.parse(raw, run=run))
+    scenario = resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
     if scenario.tune is not None and not own.waits(scenario):
         scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
     return msgspec.structs.replace(scenario, defaulted=parsing.not_said(raw, parsing.dump(scenario)))
+
+
+def resolve(scenario: Scenario) -> Scenario:
+    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds.
+
+    Raises ScenarioError where the body is none, from whose inertia some follow.
+    """
+    scenario.check_body()
+    loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
+    window = loop.window
+    if window is None:
+        window = max(USUAL_WINDOW, loop.period) if loop.mode == "sampled" else USUAL_WINDOW
+    t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
+    loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
+    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)
+    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario, m))
+    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario, m)).resolved()
 
 
 def complete(scenario: Scenario) -> Scenario:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax import scenario
-from ptsmc_jax.scenario import checks, errors, free_gains, keys, layouts, parsing
+from ptsmc_jax.scenario import errors, free_gains, keys, layouts, parsing, reading
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario, Tune
@@ -188,7 +188,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
     # a system stands in a file that its user has yet to write: it cannot be checked
-    resolved = checks.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
+    resolved = reading.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
     return "\n".join(_File(said, resolved).lines()) + "\n"
 
 
