@@ -133,15 +133,18 @@ def _charted(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
 
 
+def _places(coordinates: Coordinates, names: tuple[str, ...]) -> dict[str, slice]:
+    """Where the free reals of each of these names stand, one after the other."""
+    counts = [coordinates[name].shape[1] for name in names]
+    ends = np.cumsum(counts, dtype=int).tolist()
+    return {name: slice(end - count, end) for name, count, end in zip(names, counts, ends, strict=True)}
+
+
 def _normal(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
     """Where among the free reals the normal numbers of each kind stand, and how far they are searched."""
-    blocks, used = [], 0
-    for name in moved:
-        count = problem.coordinates[name].shape[-1]
-        if problem.dispersion.kinds[name].drawn != "uniform":
-            blocks.append((slice(used, used + count), _farthest(count)))
-        used += count
-    return blocks
+    places, kinds = _places(problem.coordinates, moved), problem.dispersion.kinds
+    return [(place, _farthest(place.stop - place.start))
+            for name, place in places.items() if kinds[name].drawn != "uniform"]  # fmt: skip
 
 
 def _farthest(count: int) -> float:
@@ -209,14 +212,13 @@ def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names
     """Coordinates of free reals y (cases, reals), those of these names, and their derivatives by each of them."""
 
     def of(y: jax.Array) -> Coordinates:
-        moved, used = {}, 0
-        for name in names:
-            count = coordinates[name].shape[1]
-            part, used = y[used : used + count], used + count
+        moved = {}
+        for name, place in _places(coordinates, names).items():
+            part = y[place]
             if dispersion.kinds[name].drawn == "uniform":
                 moved[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
             else:
-                moved[name] = part * jnp.minimum(1.0, _farthest(count) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
+                moved[name] = part * jnp.minimum(1.0, _farthest(part.size) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
         return moved
 
     slopes = jax.vmap(jax.jacfwd(of))(y)
