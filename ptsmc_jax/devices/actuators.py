@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.reaction_wheels import Wheels
-from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
@@ -53,7 +53,7 @@ class AppliedTorque(NamedTuple):
         if self.slope is not None:
             u = u + self.slope * (s - self.dt / 2)
             impulse = impulse + self.slope * (s * (s - self.dt) / 2)
-        return u if self.stored is None else u - jnp.cross(w, self.stored - impulse)
+        return u if self.stored is None else u - attitude.cross(w, self.stored - impulse)
 
     @property
     def middle(self) -> Array | None:
@@ -142,7 +142,7 @@ class Actuators:
         limited = jnp.any(target != due)
         if self.wheels is not None:
             assert state.h is not None
-            target = self._allocation(self.wheels, t) @ (target + jnp.cross(w, self.wheels.axes @ state.h))
+            target = self._allocation(self.wheels, t) @ (target + attitude.cross(w, self.wheels.axes @ state.h))
         if self.step is not None:
             target = quantise(target, self.step)
             if self.torque_limit is not None and self.wheels is None:  # a step may lie beyond it

@@ -55,7 +55,7 @@ class AttitudeFilter:
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
         a, b = w - old.bias, w_next - old.bias  # rates of the body
-        turn = dt / 2 * (a + b) + dt * dt / 12 * jnp.cross(a, b)
+        turn = dt / 2 * (a + b) + dt * dt / 12 * attitude.cross(a, b)
         return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
 
     def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:

@@ -141,7 +141,7 @@ class ErrorQuaternion(ErrorMotion):
         to_body = attitude.conjugate(q_e)
         w_f = attitude.rotate(to_body, target.w)
         w_e = x.w - w_f
-        return RelativeMotion(q_e, w_e, attitude.rotate(to_body, target.w_dot) - jnp.cross(w_e, w_f))
+        return RelativeMotion(q_e, w_e, attitude.rotate(to_body, target.w_dot) - attitude.cross(w_e, w_f))
 
     def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
         """The vector part v [-] and its derivative [1/s]."""

@@ -36,6 +36,7 @@ def _word(value: WholeNumber) -> Array:
     return jnp.asarray(value).astype(jnp.uint32)
 
 
+@jax.jit
 def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
     """The two words [-] of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
     schedule = (key.a, key.b, key.a ^ key.b ^ jnp.uint32(0x1BD11BDA))
@@ -86,6 +87,7 @@ def _pairs(key: Key, sample: WholeNumber, count: int) -> tuple[Word, Word]:
     return jax.lax.map(lambda block: threefry(key, (sample, block)), blocks)
 
 
+@jax.jit
 def _unit(word: Array) -> Array:
     """The number between 0 and 1 that a word stands for."""
     kind = jnp.result_type(float)
@@ -98,6 +100,7 @@ def _uniform(a: Word, b: Word) -> tuple[Array, Array]:
     return _unit(a), _unit(b)
 
 
+@jax.jit
 def _normal(a: Word, b: Word) -> tuple[Array, Array]:
     """The two standard normal numbers of two words."""
     radius = jnp.sqrt(-2.0 * elementary.log(_unit(a)))

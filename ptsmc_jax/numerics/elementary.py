@@ -63,6 +63,7 @@ def _log_jvp(primals: tuple, tangents: tuple) -> tuple:
     return log(*primals), tangents[0] / primals[0]
 
 
+@jax.jit
 def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """cos(2 pi u) and sin(2 pi u) for u from 0 to 1; XLA's own in float32."""
     if u.dtype != jnp.float64:

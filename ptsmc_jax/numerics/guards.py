@@ -32,6 +32,7 @@ def _sqrt_jvp(primals: tuple, tangents: tuple) -> tuple:
     return root, jnp.where(at_zero, 0.0, tangents[0] * 0.5 / jnp.where(at_zero, 1.0, root))
 
 
+@jax.jit
 def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
     """2-norm over all entries (Frobenius norm of a matrix), in the units of x; its gradient at x = 0 is set to 0."""
     return sqrt(jnp.sum(x * x))

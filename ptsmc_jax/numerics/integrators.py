@@ -52,8 +52,9 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
     small = x * 2.0**-doublings
     top = one / float(factorial(order + _TERMS))
-    for k in range(_TERMS - 1, -1, -1):
-        top = one / float(factorial(order + k)) + small @ top
+    # a loop, which is compiled once, not once for each term
+    terms = jnp.asarray([1.0 / factorial(order + k) for k in range(_TERMS - 1, -1, -1)], x.dtype)
+    top, _ = jax.lax.scan(lambda top, term: (term * one + small @ top, None), top, terms)
     phi = [top]
     for k in range(order - 1, -1, -1):
         phi.insert(0, one / factorial(k) + small @ phi[0])

@@ -23,6 +23,7 @@ def determinant(a: Float[Array, "n n"]) -> Float[Array, ""]:
     return jnp.where(jnp.isfinite(product), product, 0.0)  # a column without a pivot
 
 
+@jax.jit
 def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
     """a^-1 b, and the determinant of a."""
     n = a.shape[0]
@@ -50,6 +51,7 @@ def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
 SWEEPS = 8  # over all pairs of axes: they converge quadratically, to all digits in 5 or 6
 
 
+@jax.jit
 def smallest_eigenvalue(a: Float[Array, "n n"]) -> Float[Array, ""]:
     """Smallest eigenvalue of a small symmetric matrix, in its unit, by Jacobi's rotations.
 

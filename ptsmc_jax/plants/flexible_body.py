@@ -54,7 +54,7 @@ class FlexibleSpacecraft(Spacecraft):
 
     def generalised_force(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
         """(J - D'D) w' without the disturbance [N m]."""
-        return u - jnp.cross(x.w, self.momentum(x)) + self.coupling.T @ self.force(x.modes)
+        return u - attitude.cross(x.w, self.momentum(x)) + self.coupling.T @ self.force(x.modes)
 
     def rate(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
         """Time derivative of the state under torque and disturbance [N m]."""

@@ -33,7 +33,7 @@ class Spacecraft(Plant):
 
     def gyroscopic(self, w: Float[Array, "3"]) -> Float[Array, "3"]:
         """The torque w x J w [N m]."""
-        return jnp.cross(w, self.inertia @ w)
+        return attitude.cross(w, self.inertia @ w)
 
     def velocity(self, x: AttitudeState) -> Float[Array, "3"]:
         """The rate w [rad/s]; of a derivative, w' [rad/s^2]."""

@@ -89,7 +89,7 @@ class GravityGradient(Disturbance):
         along = self.rate * t + self.phase
         radial = jnp.stack([jnp.cos(along), jnp.sin(along), jnp.zeros_like(along)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
-        return 3.0 * self.rate**2 * jnp.cross(c, self.inertia @ c)
+        return 3.0 * self.rate**2 * attitude.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
         """The gravity gradient on another body [kg m^2]."""

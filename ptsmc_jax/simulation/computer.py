@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Bound
@@ -69,10 +69,9 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
     lengths = ticks.t_next - ticks.t
     length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
     partial_before = jnp.concatenate([jnp.zeros(1), ticks.noise_weight[:-1]]) < 1.0
-    # the observer's matrix for a whole period and for the partial first one, outside the loop
-    matrix = parts.observer.update_matrix(parts.period)
+    # the observer's matrix for a whole period and for the partial first one, outside the loop, by one piece of code
     first_length = jnp.sum(jnp.where(ticks.noise_weight < 1.0, lengths, 0.0))
-    first_matrix = parts.observer.update_matrix(first_length)
+    matrix, first_matrix = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
 
     def period_of(tick: tuple) -> Period:
         now, dt_before, partial = tick
@@ -108,7 +107,7 @@ def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tup
     assert computer.applied is not None
     torque, stored = computer.applied
     if stored is not None:  # w x h of the wheels, by the mean rate
-        torque = torque - jnp.cross((model.velocity(computer.seen) + model.velocity(seen)) / 2, stored)
+        torque = torque - attitude.cross((model.velocity(computer.seen) + model.velocity(seen)) / 2, stored)
     impulse = model.unexplained_impulse(period.now.t, computer.seen, seen, torque, dt)
     memory = observer.update(period.matrix, computer.observer, impulse, period.now.t, dt)
     memory = guards.select(dt > 0.0, memory, computer.observer)

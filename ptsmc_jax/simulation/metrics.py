@@ -81,8 +81,8 @@ def unbounded(values: Metrics, begun: Running) -> Array:
     """
 
     def any_nan(memory: Any) -> Array:
-        return jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(memory)]))
+        return jnp.any(jnp.isnan(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(memory)])))
 
     ends = {name: value for name, value in values._asdict().items() if not METRICS[name].may_lack}
-    lacking = {name: any_nan(begun.memories[name]) for name in ends}
-    return jnp.any(jnp.stack([jnp.isinf(v) | (jnp.isnan(v) & ~lacking[name]) for name, v in ends.items()]))
+    end, lacking = jnp.stack(list(ends.values())), jnp.stack([any_nan(begun.memories[name]) for name in ends])
+    return jnp.any(jnp.isinf(end) | (jnp.isnan(end) & ~lacking))

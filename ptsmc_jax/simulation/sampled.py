@@ -100,8 +100,8 @@ class _Loop(NamedTuple):
     actuators: Actuators
     k2: Bound
     period_of: Callable[[tuple], Period]
-    walk_key: draws.Key
-    jitter_key: draws.Key
+    walk_key: draws.Key | None
+    jitter_key: draws.Key | None
 
     def offset(self, t: Scalar, sample: Array) -> Array | None:
         """How much later than t a sample comes [s]; the first one and the end of the run are not moved."""
@@ -164,7 +164,9 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     parts, actuators = run.parts, run.parts.effective_actuators
     k2 = parts.observer.error_bound()
     periods, period_of, first_period = schedule(parts, run.ticks)
-    loop = _Loop(run, software, actuators, k2, period_of, walk_stream(seed, trial), jitter_stream(seed, trial))
+    walk_key = None if parts.walk_rate is None else walk_stream(seed, trial)
+    jitter_key = None if parts.jitter is None else jitter_stream(seed, trial)
+    loop = _Loop(run, software, actuators, k2, period_of, walk_key, jitter_key)
     actuator_state = actuators.begin(parts.plant.inputs)
     state = run_state.begin(run, actuator_state.h)
     first = state.snapshot
