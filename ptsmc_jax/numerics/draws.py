@@ -8,6 +8,7 @@ Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror, Shaw, SC11, 2011) on plain u
 
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -61,8 +62,8 @@ def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
 
 def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list[Key]:
     """Keys [-] of several streams of a trial, each as `stream` gives it: less code to compile than one by one."""
-    labels = jnp.asarray([_label(name) for name in names], dtype=jnp.uint32)
-    keys = jax.lax.map(lambda label: _key(seed, trial, label), labels)
+    seed, trial = _word(seed), _word(trial)
+    keys = jax.lax.map(lambda label: _key(seed, trial, label), np.array([_label(name) for name in names], np.uint32))
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
 
 
@@ -77,14 +78,6 @@ def _key(seed: WholeNumber, trial: WholeNumber, label: Word) -> Key:
 def derive(seed: int, name: str) -> int:
     """Another seed, from 0 to 2^32 - 1, that follows from this one and a name (concrete, for whole studies)."""
     return int(stream(seed, 0, name).a)
-
-
-def _pairs(key: Key, sample: WholeNumber, count: int) -> tuple[Word, Word]:
-    """The words of `count` numbers, two a block: (blocks,) each."""
-    blocks = jnp.arange((count + 1) // 2, dtype=jnp.uint32)
-    sample = _word(sample)
-    # a loop over the blocks: the same work, but less code to compile
-    return jax.lax.map(lambda block: threefry(key, (sample, block)), blocks)
 
 
 @jax.jit
@@ -117,6 +110,14 @@ def _interleaved(pairs: tuple[Array, Array], count: int) -> Array:
     return jnp.stack(pairs, axis=1).reshape(-1)[:count]
 
 
+@partial(jax.jit, static_argnames=("distribution", "count"))
+def _numbers(distribution: Distribution, key: Key, sample: Word, count: int) -> Array:
+    """`count` numbers of a stream's sample, by a loop over blocks of two: the same work, but less code to compile."""
+    blocks = np.arange((count + 1) // 2, dtype=np.uint32)
+    words = jax.lax.map(lambda block: threefry(key, (sample, block)), blocks)
+    return _interleaved(DISTRIBUTIONS[distribution](*words), count)
+
+
 def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
     """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits).
 
@@ -124,12 +125,12 @@ def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {c
     >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
     True
     """
-    return _interleaved(_uniform(*_pairs(key, sample, count)), count)
+    return _numbers("uniform", key, _word(sample), count)
 
 
 def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
     """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
-    return _interleaved(_normal(*_pairs(key, sample, count)), count)
+    return _numbers("normal", key, _word(sample), count)
 
 
 def several(
@@ -140,14 +141,21 @@ def several(
     counts: how many, by the stream's name. All of them by one loop, over blocks of two numbers: the same work, but a
     fraction of the code to compile.
     """
-    blocks = [(_label(name), block) for name, count in counts.items() for block in range((count + 1) // 2)]
+    return _several(_word(seed), _word(trial), distribution, tuple(counts.items()))
+
+
+@partial(jax.jit, static_argnames=("distribution", "counts"))
+def _several(
+    seed: Word, trial: Word, distribution: Distribution, counts: tuple[tuple[str, int], ...]
+) -> dict[str, Array]:
+    blocks = [(_label(name), block) for name, count in counts for block in range((count + 1) // 2)]
 
     def pair(row: Word) -> tuple[Array, Array]:
         return DISTRIBUTIONS[distribution](*threefry(_key(seed, trial, row[0]), (jnp.uint32(0), row[1])))
 
     first, second = jax.lax.map(pair, jnp.asarray(blocks, dtype=jnp.uint32).reshape(-1, 2))
     numbers, start = {}, 0
-    for name, count in counts.items():
+    for name, count in counts:
         end = start + (count + 1) // 2
         numbers[name] = _interleaved((first[start:end], second[start:end]), count)
         start = end

@@ -20,17 +20,18 @@ REAL = 1e-2  # share of the real part below which the imaginary one counts as no
 MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
 
 
-def grid(opening: Opening, h: Any) -> Float[Array, " points"]:
-    """Frequencies [rad/s] for a period h [s], graded toward 0 and toward the Nyquist frequency, and around every pole.
+def poles_of(opening: Opening) -> Complex[Array, "loops n"]:
+    """Poles [-] of the closed loop, at which the sensitivity may peak, then of those with an axis open, where L may."""
+    m = opening.c.shape[0]
+    closed = jnp.asarray(np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0))
+    return jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), closed)
 
-    Of the closed loop, at which the sensitivity may have a peak, and of those with one axis open, at which its L may.
-    """
+
+def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
+    """Frequencies [rad/s] for a period h [s], graded toward 0 and the Nyquist frequency, and around poles."""
     low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
     high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
     base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
-    m = opening.c.shape[0]
-    closed = np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0)  # all of them, and all but one
-    poles = jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), jnp.asarray(closed))
     upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # of pairs one; real ones need no more
     poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
     damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
@@ -89,19 +90,23 @@ def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -
     return L, jnp.einsum("nkp,nmp->pkm", y, x)
 
 
+@jax.jit
 def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
-    """L of one axis with the others closed: 1 + L is det(I + L) over that of the others, a Schur complement."""
-    m = response.shape[0]
-    others = jnp.arange(m) != axis
-    back = jnp.where(others[:, None] & others[None, :], response, 0.0) + jnp.eye(m)
-    column, row = jnp.where(others, response[:, axis], 0.0), jnp.where(others, response[axis], 0.0)
-    return response[axis, axis] - row @ jnp.linalg.solve(back, column)
+    """L of one axis with the others closed, one after the other: each takes its row and its column off the rest."""
+    each = jnp.eye(response.shape[0])
+
+    def closed(L: Array, other: Array) -> tuple[Array, None]:
+        column, row = L @ other, other @ L
+        back = jnp.where(other @ each[axis] > 0.0, 0.0, 1.0 / (1.0 + row @ other))
+        return L - back * column[:, None] * row[None], None
+
+    return each[axis] @ jax.lax.scan(closed, response, each)[0] @ each[axis]
 
 
 def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
-    """The same of all axes and many points, from the sensitivity S = (I + L)^-1: 1 + L_k = 1 / S_kk."""
-    s = jnp.linalg.inv(response + jnp.eye(response.shape[1])[None])
-    return 1.0 / jnp.diagonal(s, axis1=1, axis2=2) - 1.0
+    """The same of all axes at many points."""
+    axes = jnp.arange(response.shape[1])
+    return jax.vmap(jax.vmap(one_axis, (None, 0)), (0, None))(response, axes)
 
 
 class Brackets(NamedTuple):

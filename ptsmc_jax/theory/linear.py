@@ -268,8 +268,7 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
     Of a star tracker that is slower than the loop means over its interval.
     """
     several = _interval(parts, indices)
-    loops = jax.tree.map(jnp.asarray, opened_in(parts, run, several.reshape(-1)).loop)
-    return _means(loops, several.shape)
+    return _means(opened_in(parts, run, several.reshape(-1)).loop, several.shape)
 
 
 def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:

@@ -89,9 +89,10 @@ def _spectrum(loop: Loop, sensors: bool) -> _Spectrum:
     loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
     opening = linear.at_sensors(loop) if sensors else linear.at_input(loop)
     fixed, h = jax.lax.stop_gradient((opening, loop.period))
-    quick, w = crossings.in_triangles(opening), crossings.grid(fixed, h)
+    poles = crossings.poles_of(fixed)
+    quick, w = crossings.in_triangles(opening), crossings.grid(poles, h)
     each = crossings.each_axis(quick.response(jnp.exp(1j * w * h))[0])
-    stable = finite & (jnp.max(jnp.abs(jnp.linalg.eigvals(fixed.closed()))) < 1.0 + NEUTRAL)
+    stable = finite & (jnp.max(jnp.abs(poles[0])) < 1.0 + NEUTRAL)
     return _Spectrum(finite, loop, opening, quick, stable, w, each.T)
 
 
@@ -201,7 +202,9 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
     def step(x: Array) -> Array:
-        by = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(off)(x)), off(x))
+        (a, b), (c, d) = jax.lax.stop_gradient(jax.jacfwd(off)(x))
+        far = off(x)
+        by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
         return jnp.clip(by, -0.5 - 0.1 * jnp.abs(x), 0.5 + 0.1 * jnp.abs(x))
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -256,7 +259,7 @@ def together(loop: Loop) -> dict[str, float]:
 def _responses(loop: Loop) -> tuple[Array, Array, Array]:
     """Frequencies, L (points, m, m) and that of each axis with the others closed (points, m)."""
     opening = linear.at_input(loop)
-    w = crossings.grid(opening, loop.period)
+    w = crossings.grid(crossings.poles_of(opening), loop.period)
     seen, _ = crossings.in_triangles(opening).response(jnp.exp(1j * w * loop.period))
     return w, seen, crossings.each_axis(seen)
 
