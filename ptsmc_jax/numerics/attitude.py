@@ -18,7 +18,7 @@ Vector = Float[Array, "3"]
 
 @jax.jit
 def cross(a: Vector, b: Vector) -> Vector:
-    """The product a x b, in half as many operations as `jnp.cross` makes: fewer to compile."""
+    """Cross product a x b [unit of a times unit of b], by half as many operations as `jnp.cross`: fewer to compile."""
 
     def turned(v: Vector) -> Vector:
         return jnp.concatenate([v[1:], v[:1]])

@@ -100,13 +100,13 @@ class _Loop(NamedTuple):
     actuators: Actuators
     k2: Bound
     period_of: Callable[[tuple], Period]
-    walk_key: draws.Key | None
-    jitter_key: draws.Key | None
+    walk_key: draws.Key | None  # None: no walk
+    jitter_key: draws.Key | None  # None: samples come at their times
 
     def offset(self, t: Scalar, sample: Array) -> Array | None:
         """How much later than t a sample comes [s]; the first one and the end of the run are not moved."""
         parts = self.run.parts
-        if parts.jitter is None:
+        if self.jitter_key is None:
             return None
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
@@ -130,6 +130,7 @@ class _Loop(NamedTuple):
             drive = drive._replace(c=decision.channels)
         walk = hardware.walk
         if walk is not None:
+            assert self.walk_key is not None
             walk = walk + parts.walk_rate * dt * draws.normals(self.walk_key, parts.plant.inputs, now.sample)
         torques = period_torques(actuators, drive, decision.u, dt)
         row = None

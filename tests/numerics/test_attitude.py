@@ -25,6 +25,11 @@ def skew(v):
 # products
 
 
+def test_cross_is_numpys():
+    # two products and their difference
+    np.testing.assert_allclose(jax.vmap(attitude.cross)(vector(W), vector(W_DOT)), np.cross(W, W_DOT), atol=16 * EPS)
+
+
 def test_multiply_composes_rotations_as_their_matrices():
     got = Rotation.from_quat(np.asarray(each(vector(P), vector(Q))))
     # products of numbers up to 1, a dozen roundings
