@@ -14,6 +14,7 @@ from ptsmc_jax import formulas, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import disturbances
@@ -399,6 +400,11 @@ def test_random_walk_grows_like_the_square_root_of_time():
     limit = 5 / np.sqrt(512 * 99)
     assert np.abs(np.corrcoef(steps[:, 1:, 0].ravel(), steps[:, :-1, 0].ravel())[0, 1]) < limit
     assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
+    # by hand, from the stream that is documented
+    ticks, key = run.clock.ticks(run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
+    normals = jax.vmap(lambda sample: draws.normals(key, 3, sample))(ticks.sample)
+    grown = jnp.cumsum(run.walk_rate * (ticks.t_next - ticks.t)[:, None] * normals, axis=0)
+    np.testing.assert_allclose(d[7, :-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))
 
 
 def test_gradients_are_finite_at_the_corners():
