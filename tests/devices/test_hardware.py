@@ -402,8 +402,8 @@ def test_random_walk_grows_like_the_square_root_of_time():
     assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
     # by hand, from the stream that is documented
     ticks, key = run.clock.ticks(run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
-    normals = jax.vmap(lambda sample: draws.normals(key, 3, sample))(ticks.sample)
-    grown = jnp.cumsum(run.walk_rate * (ticks.t_next - ticks.t)[:, None] * normals, axis=0)
+    steps = jax.vmap(lambda now: run.walk_rate * (now.t_next - now.t) * draws.normals(key, 3, now.sample))(ticks)
+    grown = jnp.cumsum(steps, axis=0)
     np.testing.assert_allclose(d[7, :-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))
 
 
