@@ -28,7 +28,7 @@ def poles_of(opening: Opening) -> Complex[Array, "loops n"]:
 
 
 def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
-    """Frequencies [rad/s] for a period h [s], graded toward 0 and the Nyquist frequency, and around poles."""
+    """Frequencies [rad/s] for a period h [s], graded toward 0 and the Nyquist frequency, and around `poles_of`."""
     low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
     high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
     base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
@@ -92,7 +92,10 @@ def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -
 
 @jax.jit
 def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
-    """L of one axis with the others closed, one after the other: each takes its row and its column off the rest."""
+    """L of one axis with the others closed one after the other: each takes what goes around it off the rest.
+
+    A loop over the axes, which compiles in a fraction of what a solution of equations takes.
+    """
     each = jnp.eye(response.shape[0])
 
     def closed(L: Array, other: Array) -> tuple[Array, None]:
