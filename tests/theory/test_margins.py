@@ -53,6 +53,17 @@ def test_the_loop_of_one_axis_is_the_ratio_of_determinants(m):
     np.testing.assert_allclose(crossings.each_axis(jnp.asarray(L)), expected, rtol=1e-11)
 
 
+def test_the_grid_has_points_at_a_resonance_that_only_an_open_axis_shows():
+    """Two oscillators that their feedback damps: with its axis open each swings as if there were none."""
+    size, h = 1.0 - 1e-5, 0.1
+    turns = [size * np.array([[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]]) for at in (0.7, 1.3)]
+    a, b = np.kron([[1.0, 0.0], [0.0, 0.0]], turns[0]) + np.kron([[0.0, 0.0], [0.0, 1.0]], turns[1]), np.eye(4)[:, ::2]
+    opening = linear.Opening(jnp.asarray(a), jnp.asarray(b), jnp.asarray(-0.3 * b.T))
+    w = np.asarray(crossings.grid(crossings.poles_of(opening), h))
+    for at in (0.7, 1.3):  # of `AROUND`, the nearest is 0.3 of the damping away, 1e-5 rad a period
+        assert np.abs(w * h - at).min() < 0.4e-5
+
+
 GAINS = [(1.0, 0.05, 1.0, 0), (6.0, 0.02, 1.0, 0), (3.0, 0.05, 2.0, 1), (2.0, 0.1, 0.5, 2), (10.0, 0.05, 1.0, 0)]
 
 
