@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax.configure import configure
 from tests.tree import QUICKLY, ROOT, modules
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads wait for work by turning around
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which inherit it: threads that wait take a core
 # most programs of tests fly once: what optimising saves is less than what it takes; not so in processes of their own
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}"
 configure(devices=2)

@@ -2,7 +2,7 @@
 
 q = [q1, q2, q3, q4] = [v, q4], scalar last, Hamilton product, body relative to inertial: the paper's and SciPy's order.
 T(q) = q4 I + [v]x, v' = T(q) w / 2, q4' = -v.w / 2 with the body rate w in body axes [rad/s]: (1), (3).
-Jitted, so that programs that call them many times trace them once.
+What takes several operations is jitted, so that a program that calls it many times traces it once.
 """
 
 import jax

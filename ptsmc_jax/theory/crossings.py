@@ -97,13 +97,14 @@ def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
     A loop over the axes, which compiles in a fraction of what a solution of equations takes.
     """
     each = jnp.eye(response.shape[0])
+    own = each[axis]
 
     def closed(L: Array, other: Array) -> tuple[Array, None]:
         column, row = L @ other, other @ L
-        back = jnp.where(other @ each[axis] > 0.0, 0.0, 1.0 / (1.0 + row @ other))
+        back = jnp.where(other @ own > 0.0, 0.0, 1.0 / (1.0 + row @ other))
         return L - back * column[:, None] * row[None], None
 
-    return each[axis] @ jax.lax.scan(closed, response, each)[0] @ each[axis]
+    return own @ jax.lax.scan(closed, response, each)[0] @ own
 
 
 def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
