@@ -131,11 +131,11 @@ def known(eqn: Any) -> list | None:
     return [np.zeros(out.shape, out.dtype)] if eqn.invars[0].val == 0 and small(out.shape) else None
 
 
-def apply(eqn: Any, values: Sequence) -> list[Lane] | None:
+def apply(eqn: Any, values: Sequence, alike: "Alike") -> list[Lane] | None:
     """The outputs of a primitive with at least one lane among its operands; None where they must stay dense."""
     rule = _RULES[eqn.primitive.name]
     if all(small(v.aval.shape) for v in (*eqn.invars, *eqn.outvars)):
-        return rule(eqn, values)
+        return rule(eqn, values, alike)
     return None
 
 
@@ -144,18 +144,35 @@ def covers(name: str) -> bool:
     return name in _RULES
 
 
-def _alike(parts: Sequence) -> list:
-    """Components spread over the trials if any of them differs from trial to trial, over directions likewise."""
-    shapes = [np.shape(part) for part in parts]
-    shape = joined(shapes)
-    return [part if own == shape else _spread(part, own, shape) for part, own in zip(parts, shapes, strict=True)]
+class Alike:
+    """Components spread over the trials if any of them differs from trial to trial, over directions likewise.
+
+    Each is spread once, for all equations of a body: a trace would be an eighth longer else.
+    """
+
+    def __init__(self) -> None:
+        self._spread: dict[Any, tuple[Any, Any]] = {}  # with the component, whose identity must not be another's
+
+    def __call__(self, parts: Sequence) -> list:
+        """Components that an equation takes together, all of the same shape."""
+        shapes = [np.shape(part) for part in parts]
+        shape = joined(shapes)
+        return [part if own == shape else self._over(part, own, shape) for part, own in zip(parts, shapes, strict=True)]
+
+    def _over(self, part: Any, own: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+        key = shape, _identity(part)
+        if key not in self._spread:
+            self._spread[key] = part, lax.broadcast_in_dim(part, shape, range(len(shape) - len(own), len(shape)))
+        return self._spread[key][1]
 
 
-def _spread(part: Any, own: tuple[int, ...], shape: tuple[int, ...]) -> Any:
-    return lax.broadcast_in_dim(part, shape, range(len(shape) - len(own), len(shape)))
+def _identity(part: Any) -> Any:
+    """What tells components apart: a known number its value, whatever else itself."""
+    known = isinstance(part, np.generic | np.ndarray) and not np.ndim(part)
+    return (part.dtype, part.tobytes()) if known else id(part)
 
 
-def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
+def _elementwise(eqn: Any, values: Sequence, alike: Alike) -> list[Lane]:
     shape = eqn.outvars[0].aval.shape
     parts, size = [parts_of(value) for value in values], math.prod(shape)
     flat = [p.reshape(-1) if p.size == size else np.broadcast_to(p, shape).reshape(-1) for p in parts]
@@ -164,7 +181,7 @@ def _elementwise(eqn: Any, values: Sequence) -> list[Lane]:
 
     def item(entry: tuple) -> Any:
         found = simpler(*entry) if simpler is not None else None
-        return eqn.primitive.bind(*_alike(entry), **params) if found is None else found
+        return eqn.primitive.bind(*alike(entry), **params) if found is None else found
 
     return [Lane(shape, object_array(shape, map(item, zip(*flat, strict=True))))]
 
@@ -191,52 +208,27 @@ _WITH_ZERO: dict[str, Callable] = {
 }
 
 
-def _bitcast(eqn: Any, values: Sequence) -> list[Lane] | None:
+def _bitcast(eqn: Any, values: Sequence, alike: Alike) -> list[Lane] | None:
     sizes = [v.aval.dtype.itemsize for v in (eqn.invars[0], eqn.outvars[0])]
-    return _elementwise(eqn, values) if sizes[0] == sizes[1] else None
+    return _elementwise(eqn, values, alike) if sizes[0] == sizes[1] else None
 
 
-def _structural(eqn: Any, values: Sequence) -> list[Lane]:
+def _structural(eqn: Any, values: Sequence, alike: Alike) -> list[Lane]:
     """Move the components as the primitive moves the entries of an array."""
-    shape, params = eqn.outvars[0].aval.shape, eqn.params
-    parts = [parts_of(value) for value in values]
-    match eqn.primitive.name:
-        case "reshape" | "squeeze" | "expand_dims" if params.get("dimensions") is None or len(shape) < 2:
-            moved = parts[0].reshape(shape)
-        case "broadcast_in_dim":
-            spread = [1] * len(shape)
-            for axis, size in zip(params["broadcast_dimensions"], parts[0].shape, strict=True):
-                spread[axis] = size
-            moved = np.broadcast_to(parts[0].reshape(spread), shape)
-        case "slice":
-            steps = params["strides"] or (1,) * len(shape)
-            moved = parts[0][tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
-        case "concatenate":
-            moved = np.concatenate(parts, params["dimension"])
-        case "stack":
-            moved = np.stack(parts, params["axis"])
-        case "transpose":
-            moved = parts[0].transpose(params["permutation"])
-        case _:
-            return _renumbered(eqn, values)
-    return [Lane(shape, moved)]
-
-
-def _renumbered(eqn: Any, values: Sequence) -> list[Lane]:
     return [Lane(moved.shape, moved) for moved in picked(eqn, list(map(parts_of, values)))]
 
 
-def _reduction(eqn: Any, values: Sequence) -> list[Lane]:
+def _reduction(eqn: Any, values: Sequence, alike: Alike) -> list[Lane]:
     operation = _REDUCTIONS[eqn.primitive.name]
-    found = reduced(eqn, values[0].parts, lambda row: _fold(operation, row))
+    found = reduced(eqn, values[0].parts, lambda row: _fold(operation, row, alike))
     return [Lane(found.shape, found)]
 
 
-def _fold(operation: Callable, items: Iterable) -> Any:
-    return reduce(lambda a, b: operation(*_alike([a, b])), items)
+def _fold(operation: Callable, items: Iterable, alike: Alike) -> Any:
+    return reduce(lambda a, b: operation(*alike([a, b])), items)
 
 
-def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
+def _contraction(eqn: Any, values: Sequence, alike: Alike) -> list[Lane] | None:
     kind = eqn.outvars[0].aval.dtype
     if jnp.issubdtype(kind, bool):
         return None
@@ -253,27 +245,54 @@ def _contraction(eqn: Any, values: Sequence) -> list[Lane] | None:
     def inner(row: np.ndarray, column: np.ndarray) -> Any:
         pairs = list(zip(row, column, strict=True))
         some = [pair for pair in pairs if not (skip and any(map(zero, pair)))]
-        return _fold(lax.add, [lax.mul(*_alike(pair)) for pair in some]) if some else kind.type(0)
+        return _fold(lax.add, [lax.mul(*alike(pair)) for pair in some], alike) if some else kind.type(0)
 
     left, right = (operand(value, v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True))
     found = contracted(eqn, left, right, inner)
     return [Lane(found.shape, found)]
 
 
-def _cumulative(eqn: Any, values: Sequence) -> list[Lane]:
+def _cumulative(eqn: Any, values: Sequence, alike: Alike) -> list[Lane]:
     operation = _CUMULATIVE[eqn.primitive.name]
-    return [Lane(values[0].shape, cumulated(eqn, values[0].parts, lambda *pair: operation(*_alike(pair))))]
+    return [Lane(values[0].shape, cumulated(eqn, values[0].parts, lambda *pair: operation(*alike(pair))))]
 
 
 # How primitives move the entries of object arrays, whatever these are: `onboard.translate` has expressions in them.
 
 
 def picked(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What a primitive that only moves entries makes of these: it is applied to their numbers."""
+    """What a primitive that only moves entries makes of these."""
+    shape, params, first = eqn.outvars[0].aval.shape, eqn.params, arrays[0]
+    match eqn.primitive.name:
+        case "reshape" | "squeeze" | "expand_dims" if params.get("dimensions") is None or len(shape) < 2:
+            return [first.reshape(shape)]
+        case "broadcast_in_dim":
+            spread = [1] * len(shape)
+            for axis, size in zip(params["broadcast_dimensions"], first.shape, strict=True):
+                spread[axis] = size
+            return [np.broadcast_to(first.reshape(spread), shape)]
+        case "slice":
+            steps = params["strides"] or (1,) * len(shape)
+            return [first[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
+        case "concatenate":
+            return [np.concatenate(arrays, params["dimension"])]
+        case "stack":
+            return [np.stack(arrays, params["axis"])]
+        case "transpose":
+            return [first.transpose(params["permutation"])]
+        case "rev":
+            return [np.flip(first, params["dimensions"])]
+        case "split":
+            return np.split(first, list(itertools.accumulate(params["sizes"]))[:-1], params["axis"])
+    return _by_number(eqn, arrays)
+
+
+def _by_number(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The same of any such primitive, which is applied to the entries' numbers."""
     entries = [entry for array in arrays for entry in array.flat]
     firsts = itertools.accumulate((array.size for array in arrays), initial=0)
     with jax.ensure_compile_time_eval():
-        numbers = [jnp.arange(first, first + array.size, dtype=np.int32).reshape(array.shape)
+        numbers = [np.arange(first, first + array.size, dtype=np.int32).reshape(array.shape)
                    for first, array in zip(firsts, arrays, strict=False)]  # fmt: skip
         outputs = [np.asarray(chosen) for chosen in bind(eqn, numbers)]
     return [object_array(out.shape, (entries[k] for k in out.flat)) for out in outputs]
@@ -332,14 +351,15 @@ _STRUCTURAL = """broadcast_in_dim concatenate expand_dims pad reshape rev slice 
 # An index that differs from trial to trial wants whole arrays.
 _INDEXING = """argmax argmin dynamic_slice dynamic_update_slice gather scatter scatter-add scatter-mul scatter-min
     scatter-max sort top_k""".split()
-_RULES: dict[str, Callable[[Any, Sequence], list[Lane] | None]] = {
+_RULES: dict[str, Callable[[Any, Sequence, Alike], list[Lane] | None]] = {
     **dict.fromkeys(_ELEMENTWISE, _elementwise),
     **dict.fromkeys(_STRUCTURAL, _structural),
     **dict.fromkeys(_REDUCTIONS, _reduction),
     **dict.fromkeys(_CUMULATIVE, _cumulative),
-    **dict.fromkeys(_INDEXING, lambda eqn, values: None),
-    "optimization_barrier": lambda eqn, values: None,
-    "reshard": lambda eqn, values: [Lane(eqn.outvars[0].aval.shape, parts_of(values[0]))],  # on one device: itself
+    **dict.fromkeys(_INDEXING, lambda eqn, values, alike: None),
+    "optimization_barrier": lambda eqn, values, alike: None,
+    # on one device: itself
+    "reshard": lambda eqn, values, alike: [Lane(eqn.outvars[0].aval.shape, parts_of(values[0]))],
     "bitcast_convert_type": _bitcast,
     "dot_general": _contraction,
 }

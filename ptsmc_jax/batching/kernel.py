@@ -211,7 +211,8 @@ class _Inside:
         if name == "iota":
             with jax.ensure_compile_time_eval():
                 return [_constant(components.bind(eqn, [])[0])]
-        made = components.apply(eqn, values) if components.covers(name) else None
+        # spread anew for each equation: what is kept takes registers
+        made = components.apply(eqn, values, components.Alike()) if components.covers(name) else None
         if made is not None:
             return made
         raise NotImplementedError(f"a kernel has no rule for the primitive `{name}`{lanes.place(eqn)}")

@@ -158,6 +158,11 @@ class _Lanes:
     def __init__(self, trials: int, strict: bool, directions: int = 0):
         self.trials, self.directions, self.strict = trials, directions, strict
         self.leads = ((), (trials,), (directions, 1), (directions, trials))  # by what differs
+        self.alike = components.Alike()
+
+    def inside(self) -> "_Lanes":
+        """The same in a function that JAX traces by itself: what is computed there belongs to it alone."""
+        return _Lanes(self.trials, self.strict, self.directions)
 
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
@@ -196,7 +201,7 @@ class _Lanes:
         if every == DIRECTION:  # equal in all trials: there is nothing to gain by components
             return self.densely(eqn, values)
         if components.covers(name):
-            results = components.apply(eqn, values)
+            results = components.apply(eqn, values, self.alike)
             if results is not None:
                 for lane in results:
                     lane.differs = every
@@ -255,7 +260,7 @@ class _Lanes:
             return tuple(components.entries(dense, 1 + len(lead)).flat)
 
         def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
-            results = self.evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
+            results = self.inside().evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
             return state.pack(results[:carried]), out.pack(results[carried:])
 
         last, ys = lax.scan(
@@ -295,11 +300,11 @@ class _Lanes:
         state = _Packed(body.jaxpr.outvars, differs, self.leads)
 
         def going(carry: tuple) -> Any:
-            (test_value,) = self.evaluate(test, [*test_consts, *state.unpack(carry)])
+            (test_value,) = self.inside().evaluate(test, [*test_consts, *state.unpack(carry)])
             return dense_of(test_value, self.leads[each]) if each else test_value
 
         def step(carry: tuple) -> tuple:
-            after = state.pack(self.evaluate(body, [*body_consts, *state.unpack(carry)]))
+            after = state.pack(self.inside().evaluate(body, [*body_consts, *state.unpack(carry)]))
             if not each:
                 return after
             on = going(carry)
@@ -323,7 +328,7 @@ class _Lanes:
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
         differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
         results = _Packed(eqn.outvars, differs, self.leads)
-        cases = [lambda branch=branch: results.pack(self.evaluate(branch, operands)) for branch in branches]
+        cases = [lambda branch=branch: results.pack(self.inside().evaluate(branch, operands)) for branch in branches]
         if agree:
             return results.unpack(lax.switch(plain(index), cases))
         which = index.dense(self.leads[index.differs])
@@ -344,7 +349,7 @@ class _Lanes:
 
         @jax.custom_jvp
         def function(packed: tuple) -> tuple:
-            return gives.pack(self.evaluate(eqn.params["call_jaxpr"], takes.unpack(packed)))
+            return gives.pack(self.inside().evaluate(eqn.params["call_jaxpr"], takes.unpack(packed)))
 
         @function.defjvp
         def derivative(primals: tuple, tangents: tuple) -> tuple:
@@ -357,7 +362,7 @@ class _Lanes:
 
             traced = jax.make_jaxpr(both)(avals, [avals[k] for k in smooth])
             slopes = takes.unpack(tangents[0])
-            results = self.evaluate(traced, [*takes.unpack(primals[0]), *(slopes[k] for k in smooth)])
+            results = self.inside().evaluate(traced, [*takes.unpack(primals[0]), *(slopes[k] for k in smooth)])
             half = len(results) // 2
             return gives.pack(results[:half]), gives.pack(results[half:])
 
