@@ -33,11 +33,13 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     return jnp.append(v, p[3] * q[3] - jnp.dot(p[:3], q[:3]))
 
 
+@jax.jit
 def conjugate(q: Quaternion) -> Quaternion:
     """Inverse of a unit quaternion."""
     return jnp.append(-q[:3], q[3])
 
 
+@jax.jit
 def normalise(q: Quaternion) -> Quaternion:
     """The unit quaternion q / |q| [-]."""
     return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division, not four
@@ -51,6 +53,7 @@ def rotate(q: Quaternion, y: Vector) -> Vector:
     return (1.0 - 2.0 * jnp.dot(v, v)) * y + 2.0 * (jnp.dot(v, y) * v + s * cross(v, y))
 
 
+@jax.jit
 def t_matrix(q: Quaternion) -> Float[Array, "3 3"]:
     """T(q) of (3) [-]."""
     x, y, z, s = q
@@ -80,6 +83,7 @@ def vector_rates(q: Quaternion, w: Vector, w_dot: Vector) -> tuple[Vector, Vecto
     return first, second
 
 
+@jax.jit
 def from_vector_part(v: Vector, side: Float[Array, ""]) -> tuple[Quaternion, Float[Array, ""]]:
     """Unit quaternion with this vector part [-] and a scalar of the sign of `side` (0: positive), and 1 - |v|^2.
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 Scalar = Float[Array, ""]
 
 
+@jax.jit
 def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array, "..."]:
     """tanh(s / width), the boundary-layer form of sign(s) [-]; where width is 0, the exact sign.
 
@@ -38,6 +39,7 @@ def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
     return sqrt(jnp.sum(x * x))
 
 
+@jax.jit
 def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
     """sign(x) |x|^(1/2) as x / (x^2 + width^2)^(1/4), whose slope at 0 is width^(-1/2); where width is 0, exact.
 
@@ -48,6 +50,7 @@ def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
     return jnp.where(at_zero, 0.0, x / jnp.sqrt(jnp.sqrt(jnp.where(at_zero, 1.0, square))))
 
 
+@jax.jit
 def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
     """sign(x) |x|^power, power > 0; its slopes at 0, infinite for a power below 1, are set to 0."""
     at_zero = x == 0.0

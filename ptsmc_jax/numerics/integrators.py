@@ -1,6 +1,7 @@
 """Integrators: Runge and Kutta's of order 4, plain and exponential, and the phi functions of the latter."""
 
 from collections.abc import Callable
+from functools import partial
 from math import factorial
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ _DOUBLINGS = 40  # at most: enough for norms up to 2^39
 _USUAL_DOUBLINGS = 4  # enough for norms up to 8, which few matrices exceed
 
 
+@partial(jax.jit, static_argnames="order")
 def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = None) -> list[Float[Array, "n n"]]:
     """[phi_0(x), .., phi_order(x)] of a matrix [-]: phi_0(x) = e^x, phi_k(x) = (phi_(k-1)(x) - I/(k-1)!) / x.
 

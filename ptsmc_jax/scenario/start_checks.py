@@ -42,7 +42,7 @@ def reference(scenario: Any, parts: Parts) -> None:
     if not parts.controller.additive:
         return
     grid = np.linspace(0.0, float(parts.t_end), 4001)
-    held = np.asarray(_scalar_part(parts, grid))
+    held = np.asarray(_scalar_part(parts.reference, grid))
     worst = int(np.argmin(np.abs(held)))
     crosses = np.any(np.sign(held) != np.sign(held[0]))
     if crosses or abs(held[worst]) < SINGULAR_CLEARANCE:
@@ -55,9 +55,9 @@ def reference(scenario: Any, parts: Parts) -> None:
 
 
 @programs.jit
-def _scalar_part(parts: Parts, times: Array) -> Array:
-    """q_f4 of the reference at these times (times,) [s]."""
-    return jax.vmap(lambda time: parts.reference(time).q[3])(times)
+def _scalar_part(reference: Any, times: Array) -> Array:
+    """q_f4 of a reference at these times (times,) [s]."""
+    return jax.vmap(lambda time: reference(time).q[3])(times)
 
 
 def attitude(scenario: Any, parts: Parts) -> None:

@@ -183,7 +183,7 @@ def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
 
 def _fastest_of_system(setup: Setup, visited: tuple) -> float:
     """Fastest rate of a system of one's own along its run [rad/s]: of its modes, and of what time does to it."""
-    jacobians, (acceleration, change) = _rates_of_system(setup, visited)
+    jacobians, (acceleration, change) = _rates_of_system(solutions.bare(setup), visited)
     matrices = np.asarray(jacobians)
     modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
     size, quick = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, change))

@@ -78,7 +78,7 @@ def pooled(floors: Iterable[Floor]) -> float | None:
 
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
     """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays."""
-    ticks = jax.tree.map(np.asarray, _ticks(parts))
+    ticks = jax.tree.map(np.asarray, _ticks(parts.clock, parts.controller.t_f, parts.controller.delta))
     lengths = ticks.t_next - ticks.t
     least = 1e-9 * float(np.max(lengths))
     at_starts = np.append(np.diff(np.asarray(log.t)) > least, True)
@@ -87,8 +87,8 @@ def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
 
 
 @programs.jit
-def _ticks(parts: Parts) -> Any:
-    return parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
+    return clock.ticks(t_f, delta)
 
 
 @programs.jit

@@ -26,6 +26,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import ActuatorState
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
@@ -288,17 +289,17 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
-def whole(parts: Parts, run: Nominal) -> Array:
-    """Which periods of a run are whole ones, (periods,) bool; of times in [s]."""
-    ticks = run.period.now
-    return ticks.t_next - ticks.t > (1.0 - 1e-6) * parts.period
+def whole(ticks: Ticks, period: Any) -> Any:
+    """Which periods of a run are whole ones, (periods,) bool; of times in [s], NumPy's or JAX's."""
+    return ticks.t_next - ticks.t > (1.0 - 1e-6) * period
 
 
 def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
     ticks = run.period.now
-    ruled = ticks.hold if hold else ~parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
-    return np.flatnonzero(np.asarray(whole(parts, run) & ruled))
+    in_hold = ticks.hold if hold else parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
+    long_enough = whole(jax.tree.map(np.asarray, ticks), np.asarray(parts.period))
+    return np.flatnonzero(long_enough & (np.asarray(in_hold) == hold))
 
 
 def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:

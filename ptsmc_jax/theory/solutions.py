@@ -41,6 +41,12 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
     return jnp.stack(centre), jnp.stack(half)
 
 
+def bare(parts: Setup) -> Setup:
+    """The parts without what the exact motion does not hang on: one program is for all clocks and devices."""
+    names = "plant", "disturbance", "reference", "controller", "initial", "t_end", "window", "settling_angle"
+    return Setup(**{name: getattr(parts, name) for name in names}, observer=None, sensors=None)
+
+
 def starts(parts: Setup) -> Float[Array, "m n"]:
     """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
     law, target = parts.controller, parts.reference(jnp.zeros_like(parts.t_end))
@@ -49,7 +55,7 @@ def starts(parts: Setup) -> Float[Array, "m n"]:
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
-    error, s = _exact_sizes(parts, jnp.asarray(t))
+    error, s = _exact_sizes(bare(parts), jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
 
@@ -72,12 +78,16 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     return parts.plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
 
 
-@programs.jit(static_argnames="points")
 def visited(parts: Setup, points: int = 64) -> tuple[Array, Any]:
     """Targets and states of a second-order run, (2 points,) each: along the exact motion, then on the target.
 
     States in the states' own units; half of the times close in on the hand-over.
     """
+    return _visited(bare(parts), points)
+
+
+@programs.jit(static_argnames="points")
+def _visited(parts: Setup, points: int) -> tuple[Array, Any]:
     law, share = parts.controller, jnp.linspace(0.0, 1.0, points)
     none = jnp.zeros(parts.plant.inputs)
 
@@ -94,12 +104,16 @@ def visited(parts: Setup, points: int = 64) -> tuple[Array, Any]:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
-@programs.jit(static_argnames="points")
 def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
     """Times before the hand-over [s], (points,), inputs (points, m) and clearance (points,) along the exact motion.
 
     See `exact_input`.
     """
+    return _exact_path(bare(parts), points)
+
+
+@programs.jit(static_argnames="points")
+def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
     u, clearance = jax.vmap(lambda time: exact_input(parts, time))(t)
