@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +36,9 @@ class Rules:
     those that are `among` its own, but for the `may_break` that are farthest beyond it, and on each that is `counted`.
     """
 
-    limits: Leaf  # (requirements,) in the metrics' units
-    among: Leaf  # (requirements, trials) bool: trials of which a share must keep a limit
-    counted: Leaf  # (requirements, trials) bool: trials that must keep it by themselves
+    limits: Leaf | np.ndarray  # (requirements,) in the metrics' units
+    among: Leaf | np.ndarray  # (requirements, trials) bool: trials of which a share must keep a limit
+    counted: Leaf | np.ndarray  # (requirements, trials) bool: trials that must keep it by themselves
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     # of those that are among, how many may break each limit; None: it is one on every trial
@@ -50,13 +51,13 @@ class Rules:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Problem(Rules):
-    """A tuning problem: its rules, and what flies."""
+    """A tuning problem: its rules, and what flies. What is over trials is NumPy's: rounds put it together anew."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Leaf  # uint32
-    trials: Leaf  # (trials,) uint32, that name the noise
-    coordinates: Coordinates  # of what is drawn, arrays over the trials first
+    trials: Leaf | np.ndarray  # (trials,) uint32, that name the noise
+    coordinates: dict[str, Any]  # of what is drawn, arrays over the trials first
     metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
     margins: Asked | None = None  # of the loop; their rows stand after those of the requirements, see `Evaluator`
 
@@ -78,7 +79,7 @@ class Problem(Rules):
 
     def others(self, trials: np.ndarray) -> Fleet:
         """What is flown with other trials of its seed."""
-        coordinates = jax.tree.map(np.asarray, coordinates_of(self.dispersion, int(self.seed), trials))
+        coordinates = coordinates_of(self.dispersion, int(self.seed), trials)
         return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 
     def tightened(self, factor: float) -> "Problem":
@@ -115,11 +116,11 @@ def problem(
         parts=parts,
         dispersion=dispersion,
         seed=jnp.uint32(seed),
-        trials=jnp.zeros(0, dtype=jnp.uint32),
+        trials=np.zeros(0, dtype=np.uint32),
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
-        limits=jnp.asarray([r.limit for r in requirements], dtype=float),
-        among=jnp.zeros((len(requirements), 0), dtype=bool),
-        counted=jnp.zeros((len(requirements), 0), dtype=bool),
+        limits=np.asarray([r.limit for r in requirements], dtype=float),
+        among=np.zeros((len(requirements), 0), dtype=bool),
+        counted=np.zeros((len(requirements), 0), dtype=bool),
         averaged=len(trials),
         names=names,
         metrics=tuple(r.metric for r in requirements),
@@ -130,14 +131,14 @@ def problem(
     return replace(posed, among=~posed.counted, **others)
 
 
-def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> Coordinates:
+def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
     """Coordinates of these trials, arrays over the trials first; drawn so many at a time, by one program."""
     numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // DRAWN)) * DRAWN)
     calls = [
         montecarlo.coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
         for k in range(0, numbers.size, DRAWN)
     ]
-    return jax.tree.map(lambda *many: jnp.concatenate(many)[: len(trials)], *calls)
+    return jax.tree.map(lambda *many: np.concatenate(many)[: len(trials)], *calls)
 
 
 def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None = None) -> Problem:
@@ -149,10 +150,10 @@ def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None
     rows = np.asarray(kept_by_every_trial(problem) if counted is None else counted, dtype=bool)
     return replace(
         problem,
-        trials=jnp.concatenate([problem.trials, jnp.asarray(trials, dtype=jnp.uint32)]),
-        among=jnp.pad(problem.among, [(0, 0), (0, len(trials))]),
-        counted=jnp.concatenate([problem.counted, jnp.tile(rows[:, None], (1, len(trials)))], axis=1),
-        coordinates={name: jnp.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
+        trials=np.concatenate([problem.trials, np.asarray(trials, dtype=np.uint32)]),
+        among=np.pad(problem.among, [(0, 0), (0, len(trials))]),
+        counted=np.concatenate([problem.counted, np.tile(rows[:, None], (1, len(trials)))], axis=1),
+        coordinates={name: np.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
     )
 
 

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.numerics.pytrees import Leaf
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, margin_rows
 from tuning.search import worst as worst_case
@@ -148,7 +149,7 @@ def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]
 def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
     """The problem with more trials, in these places."""
     placed = _placed(problem, at, more.trials, more.coordinates)
-    return replace(placed, counted=placed.counted.at[:, at].set(jnp.asarray(more.counted)[:, None]))
+    return replace(placed, counted=_with(placed.counted, np.s_[:, at], more.counted[:, None]))
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
@@ -158,8 +159,8 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
         problem = _placed(problem, at, band)
         problem = replace(
             problem,
-            among=problem.among.at[row, at].set(True),
-            counted=problem.counted.at[row, : problem.averaged].set(False),
+            among=_with(problem.among, np.s_[row, at], True),
+            counted=_with(problem.counted, np.s_[row, : problem.averaged], False),
         )
     return problem
 
@@ -171,12 +172,19 @@ def _placed(
     if coordinates is None:
         own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
-        own = {name: jnp.asarray(v)[None] for name, v in coordinates.items()}
+        own = {name: np.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
-        trials=problem.trials.at[at].set(jnp.asarray(trials, dtype=jnp.uint32)),
-        coordinates={name: v.at[at].set(own[name]) for name, v in problem.coordinates.items()},
+        trials=_with(problem.trials, at, trials),
+        coordinates={name: _with(v, at, own[name]) for name, v in problem.coordinates.items()},
     )
+
+
+def _with(array: Leaf | np.ndarray, at: Any, values: Any) -> np.ndarray:
+    """A copy with other values there."""
+    changed = np.array(array)
+    changed[at] = values
+    return changed
 
 
 def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
