@@ -33,7 +33,7 @@ class Profile(NamedTuple):
 class MapAxis(NamedTuple):
     """One of the two keys of a map, and the values that it takes."""
 
-    key: str
+    label: str  # the key and its unit
     values: Sequence[float]
     logarithmic: bool
 
@@ -315,8 +315,8 @@ def accuracy_map(
         axes.remove()
     for k, axes in enumerate(many[: len(drawn)]):  # numbers on the outer axes, below a gap too
         axes.tick_params(labelbottom=k + 2 >= len(drawn), labelleft=k % 2 == 0)
-    figure.supxlabel(x.key)
-    figure.supylabel(y.key)
+    figure.supxlabel(x.label)
+    figure.supylabel(y.label)
     handles, labels = many[0].get_legend_handles_labels()
     if np.any(lost):
         handles.append(matplotlib.lines.Line2D([], [], color="0.4", marker="x", ls=""))

@@ -9,6 +9,7 @@ import sys
 import time
 
 import numpy as np
+import polars as pl
 import pytest
 
 from ptsmc_jax import scenario
@@ -566,6 +567,8 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     read = checked(tmp_path / "out" / "map-c")
     assert again in read.text
     assert "linear_torque [u]" in read.text
+    cells = pl.read_csv(tmp_path / "out" / "map-c" / "map.csv")
+    assert cells["linear_window_error"].is_between(0.0, cells["window_error"], closed="none").all()  # of noise alone
     assert "gain_margin [" not in read.text  # a factor
     first = out.splitlines()[0]
     assert first.startswith("the smallest RMS window error is ")

@@ -111,14 +111,15 @@ def test_a_front_says_its_ends_and_a_faster_slew_the_shortest_that_will_do():
               {"rms": 5e-4, "peak": 0.3, "knee": True, "dominated": False},
               {"rms": 9e-4, "peak": 0.4, "knee": False, "dominated": True},
               {"rms": 4e-4, "peak": 0.5, "knee": False, "dominated": False}]  # fmt: skip
-    (said,) = search_sentences.along_the_front({"points": points})
+    (said,) = search_sentences.along_the_front({"points": points, "plant": "spacecraft"})
     assert said == (
-        "from an RMS window error of 0.001 at 0.2 to 0.0004 at 0.5 of largest peak torque; the knee is 0.0005 at 0.3"
+        "from an RMS window error of 0.001 at 0.2 N m to 0.0004 at 0.5 N m of largest peak torque; "
+        "the knee is 0.0005 at 0.3 N m"
     )
     slews = [{"t_f": t_f, "rms": 1e-3 / t_f, "meets": t_f > 4.0} for t_f in (4.0, 5.0, 8.0)]
-    (said,) = search_sentences.fastest({"slews": slews, "requirements": ["peak_torque"]})
-    assert said == "the shortest of them is t_f = 5 s, with an RMS window error of 0.0002"
-    assert not list(search_sentences.fastest({"slews": slews[:1], "requirements": ["peak_torque"]}))
+    (said,) = search_sentences.fastest({"slews": slews, "requirements": ["peak_torque"], "plant": "chain"})
+    assert said == "the shortest of them is t_f = 5 s, with an RMS window error of 0.0002 x1"
+    assert not list(search_sentences.fastest({"slews": slews[:1], "requirements": ["peak_torque"], "plant": "chain"}))
 
 
 @pytest.mark.parametrize(("status", "asked", "mood"), [

@@ -53,6 +53,14 @@ def test_axes(text, values):
     np.testing.assert_allclose(mapping.axis(text, "--x").values, values)
 
 
+def test_axes_have_the_units_of_their_keys():
+    loaded = scenario.from_tables(tomllib.loads(SHORT))
+    shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}
+    for key, unit in shown.items():
+        assert mapping._label(loaded, key) == f"{key} {unit}"
+    assert mapping._label(loaded, "controller.eta") == "controller.eta"
+
+
 @pytest.mark.parametrize(
     "text", ["", "delta=1:2:3", "controller.delta", "controller.delta=1:2", "controller.delta=2:1:3", "a.b=1:2:1",
              "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3"]

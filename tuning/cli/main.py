@@ -139,7 +139,7 @@ def map_(
         flown = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
     store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
     if not quiet:
-        terminal.grid(flown.cells, (across.key, up.key), folder)
+        terminal.grid(flown.cells, (across.key, up.key), loaded.plant.kind, folder)
     return 0
 
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ptsmc_jax.simulation.catalogues import CATALOGUES
+
 Summary = dict[str, Any]
 
 
@@ -13,6 +15,16 @@ class Table:
 
     head: tuple[str, ...]
     rows: list[tuple[str, ...]]
+
+
+def valued(value: float, metric: str, kind: str) -> str:
+    """A metric of this kind of plant to three digits, with its unit where it has one.
+
+    >>> valued(0.2813, "peak_torque", "spacecraft"), valued(3.1e-5, "window_error", "spacecraft")
+    ('0.281 N m', '3.1e-05')
+    """
+    unit = CATALOGUES[kind][metric].unit
+    return f"{value:.3g}" if unit == "-" else f"{value:.3g} {unit}"
 
 
 def digits(value: float | None, form: str, none: str = "-") -> str:

@@ -329,7 +329,7 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
     head = tuple(sentences.with_unit(name, result.kind) for name in rows[0])
     table = cells.Table(head, [tuple(map(cells.short, row)) for row in rows[1:]])
     pairs = [dict(zip(("x", "y", *rows[0][2:]), map(cells.number, row), strict=True)) for row in rows[1:]]
-    first, *others = sentences.grid(pairs, (rows[0][0], rows[0][1]))
+    first, *others = sentences.grid(pairs, (rows[0][0], rows[0][1]), result.kind)
     heading = Heading("calm", first[0].upper() + first[1:], others)
     return heading, [Section("Pairs", [_table(table, page_captions.MAP)])]
 

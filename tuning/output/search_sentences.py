@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 from tuning.output import margin_sentences
-from tuning.output.cells import Summary, lost
+from tuning.output.cells import Summary, lost, valued
 
 AGREE = 0.01  # slopes off from differences by more than this share say little
 
@@ -151,10 +151,16 @@ def shortest(summary: Summary) -> Iterator[str]:
 
 def along_the_front(summary: Summary) -> Iterator[str]:
     """What the least torque, the most, and the knee give."""
+
+    def said(point: Summary) -> str:
+        rms, peak = (valued(point[key], name, summary["plant"])
+                     for key, name in (("rms", "window_error"), ("peak", "peak_torque")))  # fmt: skip
+        return f"{rms} at {peak}"
+
     kept = sorted((p for p in summary["points"] if not p["dominated"] and p["rms"]), key=lambda p: p["peak"])
     if len(kept) > 1:
-        ends = (f"{p['rms']:.3g} at {p['peak']:.3g}" for p in (kept[0], kept[-1]))
-        knee = next((f"; the knee is {p['rms']:.3g} at {p['peak']:.3g}" for p in kept if p["knee"]), "")
+        ends = map(said, (kept[0], kept[-1]))
+        knee = next((f"; the knee is {said(p)}" for p in kept if p["knee"]), "")
         yield f"from an RMS window error of {' to '.join(ends)} of largest peak torque{knee}"
 
 
@@ -162,4 +168,5 @@ def fastest(summary: Summary) -> Iterator[str]:
     """The shortest of the prescribed times whose gains meet every requirement."""
     shortest = min((slew for slew in summary["slews"] if slew["meets"]), key=lambda slew: slew["t_f"], default=None)
     if shortest is not None and summary["requirements"]:
-        yield f"the shortest of them is t_f = {shortest['t_f']:g} s, with an RMS window error of {shortest['rms']:.3g}"
+        error = valued(shortest["rms"], "window_error", summary["plant"])
+        yield f"the shortest of them is t_f = {shortest['t_f']:g} s, with an RMS window error of {error}"

@@ -6,7 +6,7 @@ from typing import Any
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 from tuning.output import pointing_sentences
-from tuning.output.cells import Summary, Table, digits, lost
+from tuning.output.cells import Summary, Table, digits, lost, valued
 
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
@@ -52,16 +52,20 @@ def with_unit(name: str, kind: str) -> str:
     return name if unit == "-" else f"{name} [{unit}]"
 
 
-def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str]) -> Iterator[str]:
-    """What was flown over two keys, across and up; pairs: a map's rows by column, x and y those of the keys."""
+def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], kind: str) -> Iterator[str]:
+    """What was flown over two keys, across and up; pairs: a map's rows by column, x and y those of the keys.
+
+    kind: of the plant.
+    """
     flown = [pair for pair in pairs if pair["status"] == "flown"]
     with_error = [pair for pair in flown if pair["window_error"] == pair["window_error"]]  # not NaN
     if with_error:
         best = min(with_error, key=lambda pair: (pair["failures"], pair["window_error"]))
         where = f"{keys[0]} = {best['x']:.4g} and {keys[1]} = {best['y']:.4g}"
         failed = f", where {best['failures']:.0f} trials failed" if best["failures"] else ""
-        peak = f"where the mean peak of the input is {best['peak_torque']:.3g}"
-        yield f"the smallest RMS window error is {best['window_error']:.3g}, at {where}, {peak}{failed}"
+        error, peak = (valued(best[name], name, kind) for name in ("window_error", "peak_torque"))
+        beside = f"where the mean peak of the input is {peak}{failed}"
+        yield f"the smallest RMS window error is {error}, at {where}, {beside}"
     yield f"{len(flown)} of {len(pairs)} pairs flown, {sum(pair['failures'] > 0 for pair in flown)} with failed trials"
 
 

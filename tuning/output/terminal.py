@@ -42,9 +42,9 @@ def reproduction(summary: dict[str, Any], folder: Path) -> None:
     say("claims.md says why, and gives the slips as printed", f"results in {folder}")
 
 
-def grid(cells: "list[Cell]", keys: tuple[str, str], folder: Path) -> None:
-    """What was flown over two keys, across and up."""
-    say(*sentences.grid([asdict(cell) for cell in cells], keys), f"results in {folder}")
+def grid(cells: "list[Cell]", keys: tuple[str, str], kind: str, folder: Path) -> None:
+    """What was flown over two keys, across and up; kind: of the plant."""
+    say(*sentences.grid([asdict(cell) for cell in cells], keys, kind), f"results in {folder}")
 
 
 def margins(summary: dict[str, Any], folder: Path) -> None:

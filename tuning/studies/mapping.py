@@ -10,7 +10,7 @@ from contourpy import contour_generator
 
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import Study, errors, own, parsing, study
+from ptsmc_jax.scenario import Study, errors, keys, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -188,7 +188,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             figures[f"{prefix}delay_margin"] = float(left.delay.min())
             figures[f"{prefix}radius"] = radius
         readable = parts.sensors is not None and hasattr(parts.sensors, "reading")
-        if readable and parts.observer.linear and figures["radius"] < 1.0:
+        if readable and parts.observer.linear and figures["radius"] < 1.0 + margins.NEUTRAL:
             expected = covariance.noise(parts)
             figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
@@ -238,6 +238,14 @@ def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return drawn
 
 
+def _label(scenario: Scenario, key: str) -> str:
+    """A key with its unit, as it stands in the documentation of its table."""
+    table, _, name = key.partition(".")
+    known = keys.of(type(getattr(scenario, table)))
+    unit = next((one.unit for one in known if one.name == name.partition("[")[0]), "")
+    return f"{key} [{unit}]" if unit else key
+
+
 def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
     """Fill a result folder."""
     scenario, x, y, cells = flown.scenario, flown.x, flown.y, flown.cells
@@ -253,9 +261,10 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
         grids = {name: flown.grid(name) for name in names}
         if not any(np.isfinite(grid).any() for grid in grids.values()):
             return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
+        across, up = (study_plots.MapAxis(_label(scenario, one.key), one.values, one.logarithmic) for one in (x, y))
         drawn = study_plots.accuracy_map(
-            study_plots.MapAxis(x.key, x.values, x.logarithmic),
-            study_plots.MapAxis(y.key, y.values, y.logarithmic),
+            across,
+            up,
             grids,
             flown.grid("failures") + flown.grid("missed") > 0,
             lines(scenario, x, y) | spillover(flown),
