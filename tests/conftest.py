@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -22,15 +23,10 @@ jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# modules that name shapes. Not what walks through programs, equation by equation: it took longer to check every call
-# than to compile. Nor folders, whose names would stand for all modules in them
-UNCHECKED = {f"ptsmc_jax.batching.{name}" for name in ("lanes", "components", "kernel")}
-UNCHECKED |= {f"ptsmc_jax.onboard.{name}" for name in ("control", "expressions", "printing", "rules", "translate")}
-checked = [
-    name
-    for name, path in modules().items()
-    if name not in UNCHECKED and path.name != "__init__.py" and "from jaxtyping import" in path.read_text()
-]
+# modules that name shapes: a function inside another is decorated anew whenever that one is called. Not folders, whose
+# names would stand for all modules in them
+SHAPES = re.compile(r"\b(Float|Int|Bool|Complex)\[")
+checked = [name for name, path in modules().items() if path.name != "__init__.py" and SHAPES.search(path.read_text())]
 hook = jaxtyping.install_import_hook(checked, "beartype.beartype")
 # rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
 CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
@@ -38,7 +34,7 @@ CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studie
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)
 
-MANY = 25_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
+MANY = 40_000  # mappings of memory; Linux allows a process 65 530, and a compiled program takes some 130
 
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
@@ -89,7 +85,9 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
+        gc.unfreeze()
         gc.collect()
+    gc.freeze()  # programs live on: no collection is to walk through them again
 
 
 @pytest.fixture

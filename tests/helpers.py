@@ -105,6 +105,7 @@ def inputs_along(run: Parts, t: Any) -> Any:
     return jax.vmap(lambda time: solutions.exact_input(run, time)[0])(t)
 
 
+ticks_of = jax.jit(lambda timing, t_f, delta: timing.ticks(t_f, delta))
 errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, None)))
 
 

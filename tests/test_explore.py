@@ -15,7 +15,9 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT, SHORT_CHAIN
 
-TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
+TABLES, CHAIN = (
+    {name: table for name, table in tomllib.loads(text).items() if name != "tune"} for text in (SHORT, SHORT_CHAIN)
+)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +82,7 @@ def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(f
 
 
 def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():
-    turned = scenario.from_tables({"initial": {"rotvec_deg": [180.0, 0.0, 0.0]}, "dispersion": {"attitude": {}}})
+    turned = scenario.from_tables({**TABLES, "initial": {"rotvec_deg": [180.0, 0.0, 0.0]}})
     with pytest.raises(ScenarioError, match="q4 = 0"):
         ptsmc_jax.simulate(turned)
     assert ptsmc_jax.simulate(turned, trial=0).status in ("ok", "missed")
@@ -132,7 +134,7 @@ def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
     assert (tmp_path / "a.html").read_text().startswith("<!doctype html>")
     with pytest.raises(ValueError, match="at least 2"):
         flight.animate(frames=1)
-    chain = ptsmc_jax.simulate(scenario.from_tables({"plant": {"kind": "chain"}}))
+    chain = ptsmc_jax.simulate(scenario.from_tables(CHAIN))
     with pytest.raises(ValueError, match="only a spacecraft"):
         chain.animate()
     assert "x2" in chain.to_polars().columns

@@ -12,7 +12,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
-from tests.helpers import SHORT, same, short
+from tests.helpers import SHORT, SHORT_CHAIN, same, short
 
 TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
 
@@ -169,12 +169,13 @@ def overshoot(result, parts):
     return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.has_length)}
 
 
-def test_metrics_of_ones_own_stand_in_the_rows(flown):
-    made, frame = flown
+def test_metrics_of_ones_own_stand_in_the_rows():
+    tables = {name: table for name, table in tomllib.loads(SHORT_CHAIN).items() if name != "tune"}
+    made = campaign.Campaign(scenario.study(scenario.from_tables(tables)), 3)
     own = replace(made, own=overshoot)
     assert own.own_names() == ["overshoot", "rows"]
     more = own.fly(range(100))
-    same(more.drop("overshoot", "rows"), frame[:100])
+    same(more.drop("overshoot", "rows"), made.fly(range(100)))
     log = runs.fly(made.ready, 3, 42).log
     after = np.linalg.norm(log.error, axis=1)[log.t > 5.0].max()
     assert more["overshoot"][42] == pytest.approx(after, rel=1e-12)

@@ -16,7 +16,7 @@ from tests.helpers import QUICKLY, ROOT, SHORT_CHAIN, same
 
 PTSMC = [sys.executable, "-c", "from tuning.cli.main import main; main()"]
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
-PARTS, TRIALS = 5, 5 * 4096 - 1000
+PARTS, TRIALS = 4, 4 * 4096 - 1000
 # as long as it takes to be killed in
 SLOW = SHORT_CHAIN.replace("t_f = 5.0", "t_f = 15.0").replace("t_end = 6.5", "t_end = 20.0")
 

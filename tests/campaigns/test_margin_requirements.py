@@ -98,7 +98,7 @@ def drawn_parts(parts, dispersion, seed, trials):
 
 def all_of(parts, dispersion, seed, count):
     """Each margin of each of the first trials' loops, (count, times): by the program of a single run, one by one."""
-    drawn = drawn_parts(parts, dispersion, jnp.uint32(seed), jnp.arange(24, dtype=jnp.uint32))
+    drawn = drawn_parts(parts, dispersion, jnp.uint32(seed), jnp.arange(12, dtype=jnp.uint32))
     each = [run_margins.judged_jit(jax.tree.map(lambda v, k=k: v[k], drawn))[0].each() for k in range(count)]
     return {name: np.stack([farthest(name, one[name], 1) for one in each]) for name in each[0]}
 
@@ -188,7 +188,7 @@ FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # 
 @pytest.mark.parametrize("changes", short(FACTORS, FACTORS[2:]))
 def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, changes, monkeypatch):
     """As by judging all of them; the nominal loop is not the worst. Lines are off by less than half of `OFF`."""
-    posed, count = drawn, 24
+    posed, count = drawn, 12
     gains = dict(zip(posed.problem.names, posed.own * np.asarray(changes), strict=True))
     parts, dispersion = with_gains(posed.problem.parts, gains), posed.ready.dispersion
     every = all_of(parts, dispersion, 3, count)

@@ -19,7 +19,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues, rollout, sampled
-from tests.helpers import FULL_INERTIA, fly, parts, short, vector, with_controller
+from tests.helpers import FULL_INERTIA, fly, parts, short, ticks_of, vector, with_controller
 
 PYRAMID = formulas.pyramid()
 
@@ -401,7 +401,7 @@ def test_random_walk_grows_like_the_square_root_of_time():
     assert np.abs(np.corrcoef(steps[:, 1:, 0].ravel(), steps[:, :-1, 0].ravel())[0, 1]) < limit
     assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
     # by hand, from the stream that is documented
-    ticks, key = run.clock.ticks(run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
+    ticks, key = ticks_of(run.clock, run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
     steps = jax.vmap(lambda now: run.walk_rate * (now.t_next - now.t) * draws.normals(key, 3, now.sample))(ticks)
     grown = jnp.cumsum(steps, axis=0)
     np.testing.assert_allclose(d[7, :-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))

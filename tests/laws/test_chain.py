@@ -109,7 +109,7 @@ def test_motion_on_the_surface_is_stable_as_its_matrix_is(n):
 EXACT = [(2, 5.0), (3, 30.0), (5, 0.7), (3, 5.0), (4, 5.0), (5, 5.0)]
 
 
-@pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[1:3]))
+@pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[2:3]))
 def test_chain_meets_the_exact_solution(n, t_f):
     """Exact solution 2 to 1e-9 of the largest state: what the default grid promises."""
     rng = np.random.default_rng(n)
@@ -130,7 +130,7 @@ def motion(run, t):
     return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 
 
-@pytest.mark.parametrize("n", short([2, 3, 4], [2, 3]))
+@pytest.mark.parametrize("n", short([2, 3, 4], [3]))
 def test_slopes_are_those_of_theory(n):
     """Noise-free: s falls with slope eta + n - 2 in the time to go, the error with eta, its logarithm taken out."""
     eta, t_f, delta = n + 1.2, 5.0, 5e-4

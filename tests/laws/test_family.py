@@ -23,7 +23,7 @@ from ptsmc_jax.scenario import systems
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from tests import helpers
-from tests.helpers import FULL_INERTIA, ROOT, vector
+from tests.helpers import FULL_INERTIA, ROOT, ticks_of, vector
 
 T_F, DELTA = 5.0, 0.5
 GAINS: dict[str, dict[str, float]] = {
@@ -388,7 +388,7 @@ def test_a_profile_begins_with_the_first_measured_error_and_stays(soft):
     law = made("time_base_pd", delta=0.495, **({"k_p": 1e-13, "k_d": 1e-13} if soft else {}))  # half a first period
     run = chain_run(law, START, noise=0.05)
     log = flown(run, 3, rollout.MISSED if soft else rollout.OK)
-    ticks = run.clock.ticks(law.t_f, law.delta)
+    ticks = ticks_of(run.clock, law.t_f, law.delta)
     first = int(np.argmax(np.asarray(ticks.t_next > ticks.t)))
     assert first > 500  # periods of no length come before, each with a measurement of its own
     assert 0.4 < float(ticks.noise_weight[first]) < 0.6

@@ -300,7 +300,10 @@ def one(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(
     return second_order.system(1, F, H, G, D)
 
 
-@pytest.mark.parametrize("system", [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)])
+FAST = [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)]
+
+
+@pytest.mark.parametrize("system", short(FAST, FAST[1:]))
 def test_steps_follow_the_modes_of_a_fast_plant(system):
     loop = {"loop": {"mode": "sampled", "period": 0.05}, "controller": {"delta": 0.3, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **loop).parts

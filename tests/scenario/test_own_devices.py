@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
 from scenarios.own_parts import LateStarTracker
-from tests.helpers import FIRST_FLIGHT, SHORT
+from tests.helpers import FIRST_FLIGHT, SHORT, ticks_of
 from tuning.search import gains
 from tuning.studies import stability
 
@@ -99,7 +99,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     log = rollout.simulate_jit(parts, 3, 7, record=True).log
     kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
-    ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+    ticks = ticks_of(parts.clock, parts.controller.t_f, parts.controller.delta)
     sample = np.asarray(ticks.sample)[np.asarray(ticks.t_next > ticks.t)]
     key = draws.stream(np.uint32(3), np.uint32(7), OWN_NOISE)
     noise = np.asarray(jax.jit(jax.vmap(lambda k: draws.normals(key, 2, k)))(sample[1:]))

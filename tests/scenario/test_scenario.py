@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.timing import reach_of
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import clock
-from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, vector
+from tests.helpers import FIRST_FLIGHT, PAPER_ATTITUDE, ticks_of, vector
 from tests.scenario.bad_scenarios import BAD, ONE_KEY, SAMPLED, check_sentence
 
 
@@ -306,7 +306,7 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
     parts = study(scenario, reach=reach_of(scenario, t_f=35.0, delta=4.0)).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
-        ticks = parts.clock.ticks(vector(t_f), vector(delta))
+        ticks = ticks_of(parts.clock, vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
 
@@ -319,7 +319,7 @@ def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_en
             tomllib.loads(SAMPLED + f"loop.clock = '{mode}'\nloop.period = {period}\ncontroller.delta = 0.4")
         )
         parts = study(scenario, reach=reach_of(scenario, smallest_period=0.02, period=0.2)).parts
-        ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
+        ticks = ticks_of(parts.clock, parts.controller.t_f, parts.controller.delta)
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         lasts = np.asarray(ticks.t_next - ticks.t)
         assert np.median(lasts[lasts > 1e-9]) == pytest.approx(period, rel=1e-9)

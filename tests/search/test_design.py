@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
-from tests.helpers import vector
+from tests.helpers import ticks_of, vector
 from tuning.search import design
 from tuning.search.gains import with_gains
 
@@ -112,7 +112,7 @@ def test_only_t_f_and_what_follows_it_is_changed():
     back = replace(with_gains(moved, {"t_f": 20.0}), initial=parts.initial)
     assert float(back.t_end) == float(parts.t_end)
     np.testing.assert_array_equal(
-        back.clock.ticks(vector(20.0), vector(1.0)).t, parts.clock.ticks(vector(20.0), vector(1.0)).t
+        ticks_of(back.clock, vector(20.0), vector(1.0)).t, ticks_of(parts.clock, vector(20.0), vector(1.0)).t
     )
 
 

@@ -5,9 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ptsmc_jax.simulation import clock
-from tests.helpers import vector
-
-ticks_of = jax.jit(lambda grid, t_f, delta: grid.ticks(t_f, delta))
+from tests.helpers import ticks_of, vector
 
 
 @settings(max_examples=60, deadline=None)

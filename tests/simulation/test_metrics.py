@@ -8,7 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from ptsmc_jax.simulation import catalogues, metrics
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
-from tests.helpers import fly, parts, vector
+from tests.helpers import fly, parts, short, vector
 
 
 def flown(**changes):
@@ -18,7 +18,7 @@ def flown(**changes):
     return run, result.metrics, jax.tree.map(lambda rows: rows[log.has_length], log)
 
 
-@pytest.fixture(scope="module", params=["continuous", "sampled", "flight"])
+@pytest.fixture(scope="module", params=short(["continuous", "sampled", "flight"], ["continuous", "sampled"]))
 def run(request):
     noisy = {"period": 0.05, "noise": (2e-4, 1e-5)}
     return flown(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
