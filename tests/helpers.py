@@ -111,7 +111,7 @@ errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, Non
 
 def vector(*values: Any) -> Any:
     """A float64 array."""
-    return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float))
+    return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float), dtype=float)
 
 
 def parts(

@@ -38,7 +38,7 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """
     if not asked:
         return []
-    left, hold, history = run_margins.judged_jit(parts)
+    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(parts))
     if rest.swing(parts, history) is not None:
         left = rest.none_left(left, hold)
     return _verdicts(asked, left.worst())

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -89,7 +88,7 @@ def fly(ready: Study, seed: int = 0, trial: int | Row | None = None, software: S
 
 def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = OURS) -> Run:
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
-    key, number = jnp.uint32(row.seed), jnp.uint32(row.trial)
+    key, number = np.uint32(row.seed), np.uint32(row.trial)
     about = trial if isinstance(trial, Row) else number
     parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
     result = jax.tree.map(np.asarray, rollout.simulate_jit(parts, key, number, record=True, software=software))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.formulas import wheel_axes
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, pytree, vector
 
 
 @pytree
@@ -34,8 +34,8 @@ def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_li
     """
     unit = wheel_axes(axes)
     start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
-    limits = (None if v is None else jnp.asarray(float(v)) for v in (torque_limit, momentum_limit))
-    return Wheels(jnp.asarray(unit.T), jnp.asarray(np.linalg.pinv(unit.T)), jnp.asarray(start), *limits)
+    limits = (None if v is None else vector(v) for v in (torque_limit, momentum_limit))
+    return Wheels(vector(unit.T), vector(np.linalg.pinv(unit.T)), vector(start), *limits)
 
 
 def spare_allocations(device: Wheels) -> Float[Array, "n n 3"]:

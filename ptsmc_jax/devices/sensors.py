@@ -265,7 +265,7 @@ class Sensors(Sensor):
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
         start, star_every = None, 1
         if self.filter is not None:
-            root, star_every = np.asarray(self.filter.spread[-1]), self.every
+            root, star_every = np.asarray(self.filter.spread)[-1], self.every
             start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root @ root.T, one)
         rows, slopes = np.block([[one, zero, zero], [zero, one, one]]), np.block([[zero, one, zero], [zero] * 3])
         noise, every = np.repeat([star, gyro], 3), np.repeat([star_every if self.own_times is None else 0, 1], 3)

@@ -33,7 +33,7 @@ class Key(NamedTuple):
 
 def _word(value: WholeNumber) -> Array:
     if isinstance(value, int):
-        return jnp.asarray(np.uint32(value & 0xFFFFFFFF))
+        return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
     return jnp.asarray(value).astype(jnp.uint32)
 
 

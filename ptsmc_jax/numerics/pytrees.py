@@ -88,5 +88,5 @@ def gain(
 
 
 def vector(values: Any) -> Array:
-    """Numbers, of any shape, as a leaf of the parts."""
-    return jnp.asarray(np.asarray(values, dtype=float))
+    """Numbers, of any shape, as a leaf of the parts; with its type said, no program is compiled to copy it."""
+    return jnp.asarray(np.asarray(values, dtype=float), dtype=float)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.formulas import check_inertia
 from ptsmc_jax.numerics import attitude, guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 from ptsmc_jax.plants.base import Plant
 
 
@@ -97,4 +97,4 @@ def spacecraft(inertia: object) -> Spacecraft:
         tensor = jnp.diag(inertia) if inertia.shape == (3,) else inertia
         return Spacecraft(tensor, matrices.solve(tensor, jnp.eye(3)))
     tensor = check_inertia(inertia)
-    return Spacecraft(jnp.asarray(tensor), jnp.asarray(np.linalg.inv(tensor)))
+    return Spacecraft(vector(tensor), vector(np.linalg.inv(tensor)))

@@ -206,7 +206,7 @@ def system(
     if not definite:
         raise ValueError(f"inertia must be a symmetric, positive definite ({n}, {n}) matrix")
     functions = as_pytree(F), as_pytree(H), as_pytree(G), as_pytree(D)
-    fields = *functions, jnp.asarray(scale), jnp.asarray(np.linalg.inv(scale))
+    fields = *functions, jnp.asarray(scale, dtype=float), jnp.asarray(np.linalg.inv(scale), dtype=float)
     return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
 
 

@@ -63,7 +63,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
     table = scenario.dispersion
     if table is None:
         return variation.Dispersion()
-    phases, amplitudes = (disturbances.values(parts.disturbance, what).size for what in ("phase", "amplitude"))
+    phases, amplitudes = (disturbances.count(parts.disturbance, what) for what in ("phase", "amplitude"))
 
     def drawn(key: str, *how: Any) -> Any:
         kind = getattr(table, key, None)

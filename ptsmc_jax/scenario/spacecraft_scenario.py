@@ -210,12 +210,10 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def start(self) -> Any:
         """Attitude and rate at t = 0."""
-        import jax.numpy as jnp
-
         from ptsmc_jax.numerics.pytrees import vector
         from ptsmc_jax.plants.rigid_body import AttitudeState
 
-        q = jnp.asarray(attitude_keys.quaternion(self.initial, "initial"))
+        q = vector(attitude_keys.quaternion(self.initial, "initial"))
         return AttitudeState(q, vector(self.initial.rate))
 
     def target(self) -> Any:
@@ -257,7 +255,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         wheels = setup.actuators.wheels
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
         shares = {
-            "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes @ wheels.initial)),
+            "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
             "initial.rate": largest * self.turning,
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }

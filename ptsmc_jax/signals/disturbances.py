@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude
@@ -123,6 +124,12 @@ def terms(disturbance: Any) -> tuple[Any, ...]:
 def _drawn_field(term: Any, what: str) -> str | None:
     """The field of a term that holds its phase or amplitude; None where it has none, or is a plain function."""
     return getattr(term, "drawn", {}).get(what)
+
+
+def count(disturbance: Any, what: Literal["phase", "amplitude"]) -> int:
+    """How many phases or amplitudes a disturbance has."""
+    fields = ((term, _drawn_field(term, what)) for term in terms(disturbance))
+    return sum(np.size(getattr(term, field)) for term, field in fields if field)
 
 
 def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:

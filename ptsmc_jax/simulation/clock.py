@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
 
 def _not_below(t: Array, limit: Scalar | float) -> Array:
@@ -145,12 +145,12 @@ class Graded:
 def anchored(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
     """Anchored clock for any t_f up to t_f_max and any hand-over at most longest_after before t_end; all in s."""
     before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
-    return Anchored(jnp.asarray(float(period)), jnp.asarray(float(t_end)), before, after)
+    return Anchored(vector(period), vector(t_end), before, after)
 
 
 def flight(period: float, t_end: float) -> Flight:
     """Flight clock; period and t_end in s."""
-    return Flight(jnp.asarray(float(period)), jnp.asarray(float(t_end)), math.ceil(t_end / period))
+    return Flight(vector(period), vector(t_end), math.ceil(t_end / period))
 
 
 def graded(
@@ -184,8 +184,8 @@ def graded(
     before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order))
     times = np.asarray(saves, dtype=float).reshape(-1)
     step, _ = _largest_steps(t_f, hold_rate, frequency, layer, order)
-    end, width, largest = (jnp.asarray(float(v)) for v in (t_end, window, step))
-    return Graded(end, width, largest, jnp.asarray(times), before, after)
+    end, width, largest = (vector(v) for v in (t_end, window, step))
+    return Graded(end, width, largest, vector(times), before, after)
 
 
 def graded_steps(

@@ -36,17 +36,18 @@ class Margins(NamedTuple):
     stable: Array  # bool, of the loop
     crossover: Array  # [rad/s] where the phase margin is
 
-    def worst(self) -> dict[str, Array]:
+    def worst(self) -> dict[str, Any]:
         """Each of `catalogues.MARGINS`, the worst over all axes and loops."""
-        return {name: (jnp.max if name == "modulus_margin" else jnp.min)(v) for name, v in self.each().items()}
+        return {name: (v.max if name == "modulus_margin" else v.min)() for name, v in self.each().items()}
 
-    def each(self) -> dict[str, Array]:
+    def each(self) -> dict[str, Any]:
         """Each of `catalogues.MARGINS` by axis: the nearer of both gains, of an unstable loop's sensitivity `MOST`."""
+        xp: Any = np if isinstance(self.phase, np.ndarray) else jnp
         return {
-            "gain_margin": jnp.minimum(self.gain_up, self.gain_down),
+            "gain_margin": xp.minimum(self.gain_up, self.gain_down),
             "phase_margin": self.phase,
             "delay_margin": self.delay,
-            "modulus_margin": jnp.where(self.stable, self.modulus, MOST),
+            "modulus_margin": xp.where(self.stable, self.modulus, MOST),
         }
 
 

@@ -55,7 +55,7 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
     seen: its history, where it is known; only where the command does swing is more computed. Of a law with the exact
     sign, which always swings, margins are those without it: None.
     """
-    if not np.all(getattr(parts.controller, "sign_width", 1.0)):
+    if not np.all(np.asarray(getattr(parts.controller, "sign_width", 1.0))):
         return None
     run = None
     if seen is None:
