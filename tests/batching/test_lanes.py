@@ -129,7 +129,7 @@ STRUCTURE: dict[str, tuple] = {
     "broadcast": (lambda x, s: (jnp.broadcast_to(x, (2, 3)), jnp.full((2, 2), s), x[:, None] * jnp.ones((3, 2))), X, S),
     "squeeze": (lambda x: (jnp.squeeze(x[None, :, None]), jnp.squeeze(x[None, :, None], 0)), X),
     "pad": (lambda n, s: (jnp.pad(n, 1), lax.pad(n, s, ((1, 0, 1), (-1, 2, 0)))), N, S),
-    "split": (lambda x: jnp.split(x, 3), X),
+    "split": (lambda x: jnp.split(x, [1]), X),
     "tile and repeat": (lambda x: (jnp.tile(x, 2), jnp.repeat(x, 2), jnp.roll(x, 1)), X),
     "diagonals": (lambda x, m: (jnp.diag(x), jnp.diag(m), jnp.trace(m), jnp.tril(m)), X, M),
     "of booleans": (lambda x: ((x > 0)[::-1], jnp.stack([x > 0, x > 1])), X),

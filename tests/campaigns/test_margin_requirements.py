@@ -53,6 +53,17 @@ def test_every_margin_has_its_requirement():
     assert tuple(some.worst()) == tuple(catalogues.MARGINS)
 
 
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+def test_the_worst_margin_is_the_smallest_but_for_the_peak_of_the_sensitivity(xp):
+    two = {"gain_up": [7.0, 9.0], "gain_down": [8.0, 6.5], "phase": [50.0, 40.0], "delay": [0.1, 0.2]}
+    values = {**two, "modulus": [3.0, 4.0], "stable": [True, True], "crossover": [1.0, 2.0]}
+    some = margins.Margins(**{name: xp.asarray(v) for name, v in values.items()})
+    expected = {"gain_margin": 6.5, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 4.0}
+    assert {name: float(v) for name, v in some.worst().items()} == expected
+    unstable = some._replace(stable=xp.asarray([False, True]))
+    assert float(unstable.worst()["modulus_margin"]) == margins.MOST
+
+
 @pytest.mark.parametrize(
     ("value", "met", "over"), [(6.0, True, 1.0), (5.9, False, 1.0 + 0.1 / 6), (np.inf, True, 0.0), (-3.0, False, 2.5)]
 )

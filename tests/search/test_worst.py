@@ -191,6 +191,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     assert roomy.trials.size == 8 + rounds.SPARE
     drawn = {name: v.tolist() for name, v in own.items()}
     given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
+    assert roomy.trials[8] == roomy.trials[0]  # left as it was
     at = vector([3.2, 0.9])
     measure = jax.jit(objective.measure)
     f, c, _ = measure(more, at)

@@ -33,6 +33,10 @@ def chain(**changes):
 
 def opened(parts, hold=True):
     run = linear.nominal_jit(parts)
+    for side in (True, False):
+        periods = linear.full_periods(parts, run, hold=side)
+        assert periods.size > 0
+        assert np.all(np.asarray(run.period.now.hold)[periods] == side)
     index = linear.full_periods(parts, run, hold=hold)[-1:]
     return jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, index))
 

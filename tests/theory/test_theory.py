@@ -222,6 +222,8 @@ def test_input_along_the_exact_motion_is_the_flown_one():
     pushed = dataclasses.replace(run, disturbance=disturbances.Constant(vector([0.01, -0.02, 0.0])))
     less = solutions.exact_input(run, vector(3.0))[0] - solutions.exact_input(pushed, vector(3.0))[0]
     np.testing.assert_allclose(less, [0.01, -0.02, 0.0], atol=1e-15)
+    against = solutions.exact_path(run)[1] - solutions.exact_path(pushed)[1]
+    np.testing.assert_allclose(against, np.broadcast_to([0.01, -0.02, 0.0], against.shape), atol=1e-12)
 
 
 def test_first_torque_to_a_reference_elsewhere():
