@@ -27,14 +27,17 @@ class Key(NamedTuple):
 
 
 def of(struct: type[Table]) -> list[Key]:
-    """The keys of a table, `kind` apart, in the order of the struct; a base's docstring speaks for what it declares."""
+    """The keys of a table, `kind` apart, in the order of the struct; a base's docstring speaks for what it declares.
+
+    Of a kind of one's own those that every such table has: what its code takes besides, in `rest`, is not known here.
+    """
     meanings: dict[str, str] = {}
     for base in reversed(struct.__mro__):
         meanings |= _attributes(base.__dict__.get("__doc__") or "")
     hints = typing.get_type_hints(struct, include_extras=True)
     keys = []
     for field in msgspec.structs.fields(struct):
-        if field.name != "kind":
+        if field.name not in ("kind", "rest"):
             parts = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name])
             assert parts is not None
             meaning, unit = parts.groups()

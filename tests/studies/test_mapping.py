@@ -12,6 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import run_margins
+from tests.helpers import ROOT
 from tuning.errors import UsageError
 from tuning.studies import mapping
 
@@ -59,6 +60,10 @@ def test_axes_have_the_units_of_their_keys():
     for key, unit in shown.items():
         assert mapping._label(loaded, key) == f"{key} {unit}"
     assert mapping._label(loaded, "controller.eta") == "controller.eta"
+    assert mapping._label(scenario.from_tables({}), "hardware.delay") == "hardware.delay"  # without that table
+    own = scenario.read(ROOT / "scenarios" / "own_parts.toml")
+    assert mapping._label(own, "controller.t_f") == "controller.t_f [s]"
+    assert mapping._label(own, "controller.k1") == "controller.k1"  # its class knows
 
 
 @pytest.mark.parametrize(

@@ -239,9 +239,10 @@ def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def _label(scenario: Scenario, key: str) -> str:
-    """A key with its unit, as it stands in the documentation of its table."""
+    """A key with its unit, as it stands in the documentation of its table; without, where the scenario has none."""
     table, _, name = key.partition(".")
-    known = keys.of(type(getattr(scenario, table)))
+    found = getattr(scenario, table, None)
+    known = [] if found is None else keys.of(type(found))
     unit = next((one.unit for one in known if one.name == name.partition("[")[0]), "")
     return f"{key} [{unit}]" if unit else key
 
