@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,11 @@ trials = 8
 starts = 2
 steps = 4
 """
+
+
+def untuned(text: str) -> dict[str, Any]:
+    """The tables of such a scenario but for [tune]."""
+    return {name: table for name, table in tomllib.loads(text).items() if name != "tune"}
 
 
 def roomy(timing: Any) -> Any:

@@ -13,11 +13,9 @@ from ptsmc_jax.campaigns import campaign, runs, store
 from ptsmc_jax.figures import animation
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import SHORT, SHORT_CHAIN
+from tests.helpers import SHORT, SHORT_CHAIN, untuned
 
-TABLES, CHAIN = (
-    {name: table for name, table in tomllib.loads(text).items() if name != "tune"} for text in (SHORT, SHORT_CHAIN)
-)
+TABLES, CHAIN = untuned(SHORT), untuned(SHORT_CHAIN)
 
 
 @pytest.fixture(scope="module")
@@ -146,9 +144,6 @@ def test_axes_are_turned_as_scipy_turns_them():
     np.testing.assert_allclose(animation.turned(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
 
 
-FLOWN = {name: table for name, table in TABLES.items() if name != "tune"}
-
-
 def peak(result, parts):
     return {"mine": 2.0 * result.metrics.peak_torque}
 
@@ -164,7 +159,7 @@ def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
 
 
 def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
-    slow = scenario.replace(scenario.from_tables(FLOWN), hardware__torque_limit=1e-3)
+    slow = scenario.replace(scenario.from_tables(TABLES), hardware__torque_limit=1e-3)
     run = ptsmc_jax.simulate(slow)
     assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
     assert "<td>settling_time</td><td>-</td><td>s</td>" in run.metrics._repr_html_()
@@ -184,7 +179,7 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
             return ""
 
     monkeypatch.setattr(animation, "FuncAnimation", Watched)
-    tables = FLOWN | {"reference": {"rotvec_deg": [0.0, 0.0, 40.0]}}
+    tables = TABLES | {"reference": {"rotvec_deg": [0.0, 0.0, 40.0]}}
     flight = ptsmc_jax.simulate(scenario.from_tables(tables), trial=1)
     flight.animate(frames=4)
     np.testing.assert_allclose([t for t, _ in drawn], [0.0, 6.5 / 3, 13.0 / 3, 6.5], atol=0.11)

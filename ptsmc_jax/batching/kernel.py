@@ -211,7 +211,7 @@ class _Inside:
         if name == "iota":
             with jax.ensure_compile_time_eval():
                 return [_constant(components.bind(eqn, [])[0])]
-        # spread anew for each equation: what is kept takes registers
+        # spread anew for each equation, as its speed on a GPU was measured
         made = components.apply(eqn, values, components.Alike()) if components.covers(name) else None
         if made is not None:
             return made

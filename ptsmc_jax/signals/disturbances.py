@@ -126,16 +126,20 @@ def _drawn_field(term: Any, what: str) -> str | None:
     return getattr(term, "drawn", {}).get(what)
 
 
+def _drawn(disturbance: Any, what: str) -> list[Any]:
+    """The phases or amplitudes of each term that has some."""
+    fields = ((term, _drawn_field(term, what)) for term in terms(disturbance))
+    return [getattr(term, field) for term, field in fields if field is not None]
+
+
 def count(disturbance: Any, what: Literal["phase", "amplitude"]) -> int:
     """How many phases or amplitudes a disturbance has."""
-    fields = ((term, _drawn_field(term, what)) for term in terms(disturbance))
-    return sum(np.size(getattr(term, field)) for term, field in fields if field)
+    return sum(map(np.size, _drawn(disturbance, what)))
 
 
 def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
     """Every phase [rad] or amplitude [N m] of a disturbance, (count,): term after term, input after input."""
-    fields = [(term, _drawn_field(term, what)) for term in terms(disturbance)]
-    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(getattr(term, field)) for term, field in fields if field)])
+    return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, _drawn(disturbance, what))])
 
 
 def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:

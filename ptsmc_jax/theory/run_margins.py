@@ -64,7 +64,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     it is no farther off than at the hand-over.
     """
     ticks, law = run.period.now, parts.controller
-    whole = linear.whole(run.period.now, parts.period)
+    whole = linear.whole(ticks, parts.period)
     off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
     first = jnp.argmax(hold)

@@ -1,4 +1,3 @@
-import tomllib
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -12,9 +11,9 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
-from tests.helpers import SHORT, SHORT_CHAIN, same, short
+from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
-TABLES = {name: table for name, table in tomllib.loads(SHORT).items() if name != "tune"}
+TABLES = untuned(SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +169,7 @@ def overshoot(result, parts):
 
 
 def test_metrics_of_ones_own_stand_in_the_rows():
-    tables = {name: table for name, table in tomllib.loads(SHORT_CHAIN).items() if name != "tune"}
-    made = campaign.Campaign(scenario.study(scenario.from_tables(tables)), 3)
+    made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), 3)
     own = replace(made, own=overshoot)
     assert own.own_names() == ["overshoot", "rows"]
     more = own.fly(range(100))

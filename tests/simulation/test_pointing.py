@@ -1,7 +1,6 @@
 """Pointing error indices against brute force: over made-up errors, and over the recorded history of a run."""
 
 import dataclasses
-import tomllib
 from functools import partial
 from typing import Any
 
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation import catalogues, pointing, rollout
-from tests.helpers import SHORT, drawn, fly, vector
+from tests.helpers import SHORT, drawn, fly, untuned, vector
 
 SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # half-cones of deviations are known to this factor, from above
 
@@ -188,7 +187,7 @@ rke_x = { limit = 1e-5, probability = 0.95, interpretation = "mixed" }
 
 @pytest.fixture(scope="module")
 def flown():
-    tables = {name: table for name, table in tomllib.loads(POINTED).items() if name != "tune"}
+    tables = untuned(POINTED)
     tables["loop"] |= {"clock": "flight"}
     ready = scenario.study(scenario.from_tables(tables))
     return ready, fly(ready.parts, 3, 5)

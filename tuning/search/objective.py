@@ -141,6 +141,13 @@ def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dic
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(trials)], *calls)
 
 
+def replaced(array: Leaf | np.ndarray, at: Any, values: Any) -> np.ndarray:
+    """A copy of one of the problem's arrays with other values there."""
+    changed = np.array(array)
+    changed[at] = values
+    return changed
+
+
 def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None = None) -> Problem:
     """The problem with these trials added, which count in the constraints.
 

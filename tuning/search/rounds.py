@@ -2,16 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.numerics.pytrees import Leaf
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, margin_rows
 from tuning.search import worst as worst_case
 from tuning.search.evaluate import Evaluator
-from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, with_trials
+from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, replaced, with_trials
 from tuning.search.worst import Hardest
 
 MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
@@ -149,7 +147,7 @@ def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]
 def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
     """The problem with more trials, in these places."""
     placed = _placed(problem, at, more.trials, more.coordinates)
-    return replace(placed, counted=_with(placed.counted, np.s_[:, at], more.counted[:, None]))
+    return replace(placed, counted=replaced(placed.counted, np.s_[:, at], more.counted[:, None]))
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
@@ -159,8 +157,8 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
         problem = _placed(problem, at, band)
         problem = replace(
             problem,
-            among=_with(problem.among, np.s_[row, at], True),
-            counted=_with(problem.counted, np.s_[row, : problem.averaged], False),
+            among=replaced(problem.among, np.s_[row, at], True),
+            counted=replaced(problem.counted, np.s_[row, : problem.averaged], False),
         )
     return problem
 
@@ -175,16 +173,9 @@ def _placed(
         own = {name: np.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
-        trials=_with(problem.trials, at, trials),
-        coordinates={name: _with(v, at, own[name]) for name, v in problem.coordinates.items()},
+        trials=replaced(problem.trials, at, trials),
+        coordinates={name: replaced(v, at, own[name]) for name, v in problem.coordinates.items()},
     )
-
-
-def _with(array: Leaf | np.ndarray, at: Any, values: Any) -> np.ndarray:
-    """A copy with other values there."""
-    changed = np.array(array)
-    changed[at] = values
-    return changed
 
 
 def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import store
@@ -26,7 +25,7 @@ from tuning.search.cma_es import NEARBY
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.journal import Journal
-from tuning.search.objective import T_F, Problem
+from tuning.search.objective import T_F, Problem, replaced
 from tuning.search.optimise import Search
 from tuning.search.progress import Report, headed
 from tuning.search.rounds import MARGIN
@@ -99,7 +98,7 @@ def trace(
     at = problem.metrics.index(TORQUE)
 
     def under(limit: float) -> Problem:
-        return replace(problem, limits=jnp.asarray(problem.limits).at[at].set(limit))
+        return replace(problem, limits=replaced(problem.limits, at, limit))
 
     loose = [replace(r, limit=OFF) if r.metric == TORQUE else r for r in posed.asked]
     report = headed(tell, "most torque")
