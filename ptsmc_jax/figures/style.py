@@ -48,10 +48,11 @@ def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
 
 
 class _Decades(matplotlib.ticker.LogLocator):
-    """1, 2 and 5 times each power of ten, or the powers alone where there are more than four."""
+    """1, 2 and 5 times each power of ten; the powers alone where there are more than four, or too little room."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        self.set_params(subs=(1.0,) if vmax > MANY * vmin else (1.0, 2.0, 5.0))
+        room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / 3)  # three numbers a power
+        self.set_params(subs=(1.0,) if vmax > min(MANY, room) * vmin else (1.0, 2.0, 5.0))
         return super().tick_values(vmin, vmax)
 
 

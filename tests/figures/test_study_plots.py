@@ -12,6 +12,15 @@ GRID = np.array([[1e-5, 2e-5], [3e-5, 4e-5]])
 NAMES = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
 
 
+def numbers_apart(axes):
+    """How many numbers stand along the axis across, none of them over the next one."""
+    axes.figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
+    boxes = sorted((b for b in boxes if axes.bbox.x0 <= (b.x0 + b.x1) / 2 <= axes.bbox.x1), key=lambda b: b.x0)
+    assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
+    return len(boxes)
+
+
 def test_the_search_is_coloured_where_the_requirements_are_met():
     """Grey: all steps of a start; coloured above it: those that are admissible."""
     values = np.array([[3.0, 5.0], [2.0, 4.0], [1.0, np.nan]])
@@ -36,11 +45,7 @@ def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap
     assert drawn["limits kept"] == [at[1]]
     assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
     assert drawn["beyond the limit of gain_margin"] == [at[2]]
-    figure.draw_without_rendering()
-    boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
-    boxes = sorted((box for box in boxes if 0 <= box.x0 <= figure.bbox.x1), key=lambda box: box.x0)
-    assert len(boxes) >= 5
-    assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
+    assert numbers_apart(axes) >= 5
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])
@@ -61,3 +66,11 @@ def test_every_grid_that_has_numbers_has_its_map(count):
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == count
     assert len(figure.axes) == 2 * count  # and its bar of colours
+
+
+@pytest.mark.parametrize(("low", "high"), [(1e-3, 1e-1), (1e-2, 1.0), (0.05, 5.0), (1e-5, 1.0)])
+def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
+    across = study_plots.MapAxis("sign_width", np.geomspace(low, high, 2), True)
+    up = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
+    figure = study_plots.accuracy_map(across, up, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
+    assert numbers_apart(figure.axes[2]) >= 2

@@ -272,8 +272,8 @@ def slew_times_lines(summary: Summary) -> Iterator[str]:
                 yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
                        f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
         if fast["rms"] and slow["rms"]:
-            yield (f"RMS window error: {fast['rms']:.3e} at t_f = {fast['t_f']:g} s, {fast['rms'] / slow['rms']:.3g} "
-                   f"times that at {slow['t_f']:g} s")  # fmt: skip
+            error, ratio = valued(fast["rms"], "window_error", summary["plant"]), fast["rms"] / slow["rms"]
+            yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {ratio:.3g} times that at {slow['t_f']:g} s"
     for t_f in summary["without"]:
         yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"
     if summary["requirements"] and not any(slew["meets"] for slew in slews):
