@@ -473,6 +473,10 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
     not_met = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
     assert (not_met.returncode, not_met.stdout, not_met.stderr) == (1, "", "")
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdicts"]["peak_torque"]["met"] is False
+    again = ("simulate", tmp_path / "s.toml", "--out", tmp_path / "out")
+    full = in_a_process(*again, then="assert 'jax' not in sys.modules")  # refused at once
+    assert (full.returncode, full.stdout) == (2, "")
+    assert full.stderr.endswith("allowed is a new folder, or --force to write into it\n")
     (tmp_path / "s.toml").write_text("controller.eta = 2")
     bad = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "other")
     assert (bad.returncode, bad.stdout) == (2, "")

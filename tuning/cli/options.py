@@ -142,6 +142,12 @@ def prepare(
     from ptsmc_jax.scenario import reading
 
     loaded = reading.from_tables({}) if scenario is None else reading.read(scenario)
+    name = "default" if scenario is None else scenario.stem
+    folder = out if out is not None else Path("out") / f"{command}-{name}"
+    if force is not None:
+        from ptsmc_jax.campaigns import store
+
+        store.check(folder, force)
     from ptsmc_jax.configure import NoDeviceError, configure
 
     try:
@@ -155,11 +161,4 @@ def prepare(
         if not any(parsing.stated(loaded).values()):
             print(f"ptsmc: {scenario} says nothing: what flies is the paper's Case I", file=sys.stderr)
         own_parts.allow_scenario(scenario, loaded, trust)
-    loaded = reading.complete(loaded)
-    name = "default" if scenario is None else scenario.stem
-    folder = out if out is not None else Path("out") / f"{command}-{name}"
-    if force is not None:
-        from ptsmc_jax.campaigns import store
-
-        store.check(folder, force)
-    return loaded, folder
+    return reading.complete(loaded), folder
