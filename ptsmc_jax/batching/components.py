@@ -20,9 +20,9 @@ LARGEST = 64
 TRIAL, DIRECTION = 1, 2
 
 
-def small(shape: tuple[int, ...]) -> bool:
+def small(shape: tuple[int, ...], largest: int = LARGEST) -> bool:
     """Whether an array of this shape is taken apart."""
-    return math.prod(shape) <= LARGEST
+    return math.prod(shape) <= largest
 
 
 class Lane:
@@ -131,10 +131,13 @@ def known(eqn: Any) -> list | None:
     return [np.zeros(out.shape, out.dtype)] if eqn.invars[0].val == 0 and small(out.shape) else None
 
 
-def apply(eqn: Any, values: Sequence, alike: "Alike") -> list[Lane] | None:
-    """The outputs of a primitive with at least one lane among its operands; None where they must stay dense."""
+def apply(eqn: Any, values: Sequence, alike: "Alike", largest: int = LARGEST) -> list[Lane] | None:
+    """The outputs of a primitive with at least one lane among its operands; None where they must stay dense.
+
+    largest: entries of an array that is taken apart.
+    """
     rule = _RULES[eqn.primitive.name]
-    if all(small(v.aval.shape) for v in (*eqn.invars, *eqn.outvars)):
+    if all(small(v.aval.shape, largest) for v in (*eqn.invars, *eqn.outvars)):
         return rule(eqn, values, alike)
     return None
 

@@ -30,6 +30,7 @@ from ptsmc_jax.batching.dependence import called, dependence, settle
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
 MAPPED = 256  # the same of loops that carry nothing from step to step, whose results are stacked
+LARGEST = 1024  # entries of an array: there are none but those taken apart
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
 
@@ -212,7 +213,7 @@ class _Inside:
             with jax.ensure_compile_time_eval():
                 return [_constant(components.bind(eqn, [])[0])]
         # spread anew for each equation, as its speed on a GPU was measured
-        made = components.apply(eqn, values, components.Alike()) if components.covers(name) else None
+        made = components.apply(eqn, values, components.Alike(), LARGEST) if components.covers(name) else None
         if made is not None:
             return made
         raise NotImplementedError(f"a kernel has no rule for the primitive `{name}`{lanes.place(eqn)}")

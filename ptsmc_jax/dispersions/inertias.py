@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -38,7 +39,8 @@ class RelativeInertia:
         plain, turn, slender = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
         candidates = plain.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)
         # loops over the draws: the same work, but a fraction of the code to compile
-        more = jax.lax.map(self._slender, slender.reshape(SLENDER, 4))
+        sorting = jnp.eye(3)[jnp.argsort(self.moments)]  # here, for a kernel cannot sort
+        more = jax.lax.map(partial(self._slender, sorting), slender.reshape(SLENDER, 4))
         shares, counts = jax.tree.map(lambda *both: jnp.concatenate(both), candidates, more)
 
         def look(first: tuple[Array, Array], candidate: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
@@ -54,7 +56,7 @@ class RelativeInertia:
         axes = self.axes @ jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
         return (axes @ jnp.diag(moments)) @ axes.T, (axes @ jnp.diag(1.0 / moments)) @ axes.T
 
-    def _slender(self, n: Float[Array, "4"]) -> tuple[Float[Array, "3"], Array]:
+    def _slender(self, sorting: Float[Array, "3 3"], n: Float[Array, "4"]) -> tuple[Float[Array, "3"], Array]:
         """Shares whose two larger moments differ by at most the smallest, and whether they count, from normals [-].
 
         Of nominal moments a, b >= c with shares s, those of a and b are as well given by u = (a s_a - b s_b) / r and
@@ -64,8 +66,7 @@ class RelativeInertia:
         none, with the chances W(s_c) / 2 W(0) and W(-s_c) / 2 W(0): their sum is largest, 1, at s_c = 0, since both
         ends move in proportion to s_c, and 0 lies between them at first.
         """
-        order = jnp.argsort(self.moments)
-        c, a, b = self.moments[order]
+        c, a, b = sorting @ self.moments
         r, std = guards.norm(jnp.stack([a, b])), jnp.where(self.std > 0.0, self.std, 1.0)
 
         def ends(s: Array) -> tuple[Array, Array]:
@@ -78,7 +79,7 @@ class RelativeInertia:
         turns = other[1] - other[0] > (high - low) * (1.0 - _uniform(n[1]))
         s, (low, high) = guards.select(stays, (n[0], one), (-n[0], other))
         u, v = _normal(low + (high - low) * (1.0 + _uniform(n[2])) / 2.0), n[3]
-        return jnp.stack([s, (a * u + b * v) / r, (a * v - b * u) / r]) @ jnp.eye(3)[order], stays | turns
+        return jnp.stack([s, (a * u + b * v) / r, (a * v - b * u) / r]) @ sorting, stays | turns
 
 
 def _uniform(normal: Float[Array, "..."]) -> Float[Array, "..."]:

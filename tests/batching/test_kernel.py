@@ -142,7 +142,9 @@ def test_what_is_written_out_and_what_is_looped():
         last, _ = jax.lax.scan(step, x, table)
         pairs, _ = jax.lax.scan(lambda c, row: (0.9 * c + row[1] * x - row[0], None), x, table.reshape(50, 2))
         own, _ = jax.lax.scan(lambda c, row: (c * 0.5 + row, None), jnp.zeros(()), x * table[:20])
-        return {"few": jnp.sum(few), "last": last, "pairs": pairs, "own": own, "same": table[3] * 2.0, "number": trial}
+        each = jax.lax.map(lambda row: jnp.abs(row - x / 6.0), table)  # carries nothing: written out too
+        single = {"few": jnp.sum(few), "nearest": jnp.min(each), "same": table[3] * 2.0, "number": trial}
+        return {**single, "last": last, "pairs": pairs, "own": own}
 
     arguments = NUMBERS, np.linspace(0.5, 1.5, 6)
     got = kernel.vmap(function, block=4, interpret=True)(*arguments)
