@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ptsmc_jax.simulation.pointing import ErrorPath, Pointing
+from ptsmc_jax.simulation.pointing import ConstantPath, ErrorPath, Pointing
 
 
 class Criteria(NamedTuple):
@@ -76,9 +76,7 @@ class Interval(NamedTuple):
     last_torque: Array  # (m,) delivered at the end of the interval before [N m]
     torques: Torques
     attitude_error: Callable[[], ErrorPath] | None = None  # where pointing is observed
-    knowledge_error: Callable[[], ErrorPath] | None = (
-        None  # of the attitude measured at the start, where it is measured
-    )
+    knowledge_error: Callable[[], ConstantPath] | None = None  # of the attitude measured at the start, where it is
 
     @property
     def length(self) -> Array:

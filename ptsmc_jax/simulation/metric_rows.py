@@ -141,7 +141,7 @@ def _pointing_rows(
     absolute: str,
     mean: str,
     relative: str,
-    error_of: Callable[[Interval], Callable[[], pointing.ErrorPath] | None],
+    error_of: Callable[[Interval], Callable[[], pointing.ErrorPath | pointing.ConstantPath] | None],
     *,
     measured: bool,
     drift: str | None = None,

@@ -83,31 +83,46 @@ def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
 
 
 class ErrorPath(NamedTuple):
-    """An `attitude_error` (5,) over an interval: the cubic through both ends and slopes (Hermite)."""
+    """An `attitude_error` (5,) over an interval: start + x rise + x (1 - x) ((1 - x) a + x b) at a share x of it."""
 
     start: Array  # [rad]
-    start_rate: Array  # [rad/s]
     end: Array
-    end_rate: Array
+    rise: Array
+    a: Array
+    b: Array
     length: Scalar  # of the interval [s]
-
-    def _coefficients(self) -> tuple[Array, Array, Array]:
-        """Rise r and bends a, b of start + x r + x (1 - x) ((1 - x) a + x b)."""
-        rise = self.end - self.start
-        return rise, self.length * self.start_rate - rise, rise - self.length * self.end_rate
 
     def at(self, x: Scalar) -> Array:
         """The error where a share x of the interval has passed."""
-        rise, a, b = self._coefficients()
-        return self.start + x * rise + x * (1.0 - x) * ((1.0 - x) * a + x * b)
+        return self.start + x * self.rise + x * (1.0 - x) * ((1.0 - x) * self.a + x * self.b)
 
     def integral(self, x: Scalar) -> Array:
         """Its integral from the start until then [rad s]."""
-        rise, a, b = self._coefficients()
         square = x * x
         first = square * (0.5 - x * (2.0 / 3.0 - x / 4.0))
         second = square * x * (1.0 / 3.0 - x / 4.0)
-        return self.length * (x * self.start + square / 2.0 * rise + first * a + second * b)
+        return self.length * (x * self.start + square / 2.0 * self.rise + first * self.a + second * self.b)
+
+
+class ConstantPath(NamedTuple):
+    """An `attitude_error` (5,) that stays as it is over an interval."""
+
+    end: Array  # [rad]
+    length: Scalar  # of the interval [s]
+
+    def at(self, x: Scalar) -> Array:
+        """The error."""
+        return self.end
+
+    def integral(self, x: Scalar) -> Array:
+        """Its integral until a share x of the interval has passed [rad s]."""
+        return self.length * (x * self.end)
+
+
+def hermite(start: Array, start_rate: Array, end: Array, end_rate: Array, length: Scalar) -> ErrorPath:
+    """The cubic through both ends (5,) [rad] with these slopes [rad/s], over an interval [s]."""
+    rise = end - start
+    return ErrorPath(start, end, rise, length * start_rate - rise, rise - length * end_rate, length)
 
 
 def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
@@ -117,15 +132,14 @@ def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Sca
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
         return jax.jvp(lambda q, target: attitude_error(q, target, frame), (x.q, target.q), rates)
 
-    return ErrorPath(*with_rate(*start), *with_rate(*end), length)
+    return hermite(*with_rate(*start), *with_rate(*end), length)
 
 
 def constant_path(
     q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3"], length: Scalar
-) -> ErrorPath:
+) -> ConstantPath:
     """The error of a measured attitude from the true one at its sample, which is known until the next one."""
-    error = attitude_error(q, true, frame)
-    return ErrorPath(error, jnp.zeros_like(error), error, jnp.zeros_like(error), length)
+    return ConstantPath(attitude_error(q, true, frame), length)
 
 
 class Segments(NamedTuple):
@@ -196,7 +210,7 @@ def begin(zero: Scalar, segments: int = 0) -> Tally:
 
 def update(
     tally: Tally,
-    error: ErrorPath,
+    error: ErrorPath | ConstantPath,
     t: Scalar,
     t_next: Scalar,
     begins: Scalar,
@@ -244,7 +258,8 @@ def update(
         if segments is not None:
             beyond = segments.time_beyond(mean, limits[2])
             segments = segments.emptied().added(last, error.end, length * (1.0 - until))
-        new = Window(rest, 0.0 * means - jnp.inf, 0.0 * means + jnp.inf, segments).including(last).including(error.end)
+        projections = _projections(last)
+        new = Window(rest, projections, projections, segments).including(error.end)
         return still_open._replace(
             mean=jnp.maximum(still_open.mean, _sizes(mean)),
             relative=jnp.maximum(still_open.relative, _sizes_of(deviations)),

@@ -84,7 +84,7 @@ def tallied(nodes, error, rate, begins, window, limits, segments=33):
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row
-        path = pointing.ErrorPath(start, start_rate, end, end_rate, t_next - t)
+        path = pointing.hermite(start, start_rate, end, end_rate, t_next - t)
         return pointing.update(tally, path, t, t_next, begins, window, limits), None
 
     rows = nodes[:-1], nodes[1:], error[:-1], rate[:-1], error[1:], rate[1:]
