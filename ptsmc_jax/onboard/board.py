@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.batching.dependence import dependence
-from ptsmc_jax.devices.actuators import Actuators, ActuatorState
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.attitude_filter import Estimate
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Observer
@@ -216,10 +216,15 @@ def _observing(computer: Board, observer: Observer, device: Actuators | None) ->
     computer.outputs["d_hat"] = real(m)
     computer.about |= {"observer": "memory of the observer, which begins with the estimate",
                    "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
+    measured = {}  # of the wheels: what the torque over the next period is known by
     if wheels is not None:
-        computer.inputs["wheel_momentum"] = computer.state["wheel_momentum"] = real(*np.shape(wheels.initial))
+        each = real(*np.shape(wheels.initial))
         computer.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
-        acted = ("before.wheel_momentum", "in.wheel_momentum")
+        measured = {"wheel_momentum": each, **({"acting": each} if device is not None and device.moves else {})}
+        computer.inputs |= measured
+        computer.state |= measured
+        names = [f"{when}.{name}" for when in ("before", "in") for name in measured]
+        acted = ("last.wheel_torque", *names)
     elif device is not None and device.moves:
         computer.inputs["applied"] = real(m)
         computer.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
@@ -233,18 +238,18 @@ def _observing(computer: Board, observer: Observer, device: Actuators | None) ->
 
         def updated() -> Any:
             applied = read[2 * size]
-            if wheels is not None:
-                h_before, h_now = read[2 * size :]
-                axes = parameters["actuators"].wheels.axes
-                stored = axes @ (0.5 * (h_before + h_now))
+            if measured:
+                h, *v = read[2 * size + 1 :][: len(measured)]
+                drive = Drive(v[0] if v else None, applied, h, jnp.zeros((), bool))
+                torque = parameters["actuators"].assumed(drive, dt)
                 turning = (model.velocity(before) + model.velocity(now)) / 2
-                applied = axes @ ((h_before - h_now) / dt) - jnp.cross(turning, stored)
+                applied = torque.mean - jnp.cross(turning, torque.middle)
             impulse = model.unexplained_impulse(t, before, now, applied, dt)
             return known.update(parameters["observer_matrix"], memory, impulse, t, dt)
 
         memory = jax.lax.cond(regular != 0, updated, lambda: memory)
         written = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
-        return written if wheels is None else {**written, "now.wheel_momentum": read[-1]}
+        return written | {f"now.{name}": read[k - len(measured)] for k, name in enumerate(measured)}
 
     states = [f"{when}.{name}" for when in ("before", "now") for name in computer.seen]
     reads = ("t", "dt", "regular", "before.observer", *states, *acted)
@@ -318,7 +323,7 @@ def _acting(computer: Board, device: Actuators, m: int) -> None:
         computer.about["queue"] = "commands on their way, the oldest first [N m]"
         names.append("before.queue")
     if device.moves:
-        computer.inputs["acting"] = real(m) if wheels is None else real(*np.shape(wheels.initial))
+        computer.inputs.setdefault("acting", real(m))
         computer.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
         names.append("in.acting")
     computer.outputs["torque"] = real(m)

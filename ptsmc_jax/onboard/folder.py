@@ -53,7 +53,7 @@ class Controller:
 def flown(scenario: Scenario) -> Scenario:
     """The scenario as a flight computer has it, on the flight clock.
 
-    Raises ScenarioError of a continuous loop, and of a filter of the command.
+    Raises ScenarioError of a continuous loop, of a filter of the command, and of failures that it would be told of.
     """
     if scenario.loop.mode != "sampled":
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
@@ -62,6 +62,9 @@ def flown(scenario: Scenario) -> Scenario:
         raise wrong(
             "hardware.command_filter", parsing.plain(filtering), "absent to be exported: it is not written in C"
         )
+    failure = getattr(scenario.dispersion, "wheel_failure", None)
+    if failure is not None and failure.known:
+        raise wrong("dispersion.wheel_failure.known", True, "false to be exported: the C is not told of failures")
     return scenarios.replace(scenario, loop__clock="flight")
 
 

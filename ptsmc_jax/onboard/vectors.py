@@ -129,7 +129,7 @@ def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.nda
     inputs = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
              "acting": samples.acting, "attitude_valid": samples.valid, "attitude_age": samples.age}  # fmt: skip
     state_by_name = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
-            "wheel_momentum": samples.momentum, "clearance": samples.clearance,
+            "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
     if board.spacecraft:
         inputs |= {"attitude": samples.measured.q, "rate": samples.measured.w}

@@ -8,6 +8,8 @@ LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 LAW = {"t_f": 5.0, "delta": 0.5}
 NOISE = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
+MISFITS = {**SPREAD, "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
+           "wheel_failure": {"kind": "uniform", "latest": 4.0}}  # fmt: skip
 FULL = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
 OWN = f"{ROOT / 'scenarios' / 'own_parts.py'}:"
 PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
@@ -28,7 +30,7 @@ CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, -0.2]}, "loop": LOOP
 FLIGHTS: dict[str, dict[str, Any]] = {
     "raw": flight(),
     "filter": flight(**FILTER),
-    "wheels": flight(**FILTER, wheels={"torque_limit": 2.0}, spacecraft={"inertia": FULL}),
+    "wheels": flight(**FILTER, wheels={"torque_limit": 2.0}, spacecraft={"inertia": FULL}, dispersion=MISFITS),
     "chain": CHAIN,
     "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
                              reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
@@ -52,7 +54,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
         **FILTER, hardware={"star_tracker_every": 5, "rate_bias": 1e-5, "rate_bias_walk": 1e-7}),
     "star tracker out of step": flight(**FILTER, hardware={"star_tracker_period": 0.25, "rate_bias": 1e-5}),
     "wheels with lag, limits, delay": flight(
-        hardware={"torque_lag": 0.05, "delay": 1}, controller={"delta": 1.0},
+        hardware={"torque_lag": 0.05, "delay": 1}, controller={"delta": 1.0}, dispersion=MISFITS,
         wheels={"torque_limit": 1.5, "momentum_limit": 4.0, "momentum": [0.5, -0.2, 0.1, 0.3]}),
     "spin": flight(reference={"kind": "spin", "rate": [0.01, 0.02, -0.01]}),
     "slew": flight(controller={"error": "multiplicative"},
