@@ -46,8 +46,9 @@ HOUSE = {
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
         "theory": """
-            borders error_floor linear rules solutions
-            covariance crossings envelopes
+            borders carries error_floor rules solutions
+            envelopes linear
+            covariance crossings
             rest
             margins
             hold run_margins

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax import programs
@@ -32,20 +31,12 @@ from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, assumed_torque, boot, decide, schedule
 from ptsmc_jax.simulation.sampled import PeriodMotion
+from ptsmc_jax.theory.carries import Carry, Local
 
 Scalar = Float[Array, ""]
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
 _WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # of Lagrange's polynomials
-
-
-class Carry(NamedTuple):
-    """What the loop carries from sample to sample."""
-
-    x: Any  # true state of the plant
-    acting: ActuatorState  # true state of the actuators, without commands on their way
-    computer: Computer
-    model: ActuatorState  # the flight computer's own of its actuators, with them
 
 
 @pytree
@@ -110,7 +101,7 @@ def nominal(parts: Parts) -> Nominal:
         after = Carry(x, acting, computer, model)
         return after, Nominal(period, carry, after, wanted)
 
-    first = Carry(x0, model._replace(queue=None), computer, model)
+    first = Carry(x0, model._replace(queue=None), computer, model._replace(h=None))
     return jax.lax.scan(step, first, listed)[1]
 
 
@@ -123,9 +114,10 @@ def _computed(
     """The flight computer's part of a period; seen: the state as the sensors see it."""
     actuators, dt = parts.effective_actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
-    drive, queue = actuators.command(carry.model, decision.u, decision.w, period.now.t, dt, period.now.noise_weight)
+    model = carry.model._replace(h=carry.acting.h)
+    drive, queue = actuators.command(model, decision.u, decision.w, period.now.t, dt, period.now.noise_weight)
     computer = computer._replace(applied=assumed_torque(actuators, drive, dt))
-    return decision, computer, actuators.end(carry.model, drive, queue, dt)
+    return decision, computer, actuators.end(model, drive, queue, dt)._replace(h=None)
 
 
 def _acted(
@@ -148,59 +140,6 @@ def _acted(
     return x, acting
 
 
-class _Local:
-    """Local coordinates of carries about one: x, then the state last seen, the sensors' memory, and all the rest."""
-
-    def __init__(self, parts: Parts, base: Carry):
-        self._plant, self._model, self._sensors = parts.plant, parts.observer.model, parts.sensors
-        self._base = base
-        self._turned = hasattr(parts.sensors, "retract")
-        start = parts.plant.local_coordinates(base.x, base.x)
-        known = self._model.local_coordinates(base.computer.seen, base.computer.seen)
-        sensing = base.computer.sensors
-        inside = parts.sensors.local_coordinates(sensing, sensing) if self._turned else jnp.zeros(0)
-        rest, self._unravel = ravel_pytree(self._rest(base))
-        self.sizes = [start.size, known.size, inside.size, rest.size]
-
-    def _rest(self, carry: Carry) -> Any:
-        computer = carry.computer
-        sensing = None if self._turned else _numbers(computer.sensors)
-        own = _numbers(computer.law), computer.command_filter
-        return carry.acting, computer.observer, computer.applied, carry.model, sensing, *own
-
-    def retract(self, z: Array) -> Carry:
-        x, seen, sensing, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
-        base, plant = self._base, self._plant
-        near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
-        acting, memory, applied, model, numbers, law, filtered = near
-        inside = base.computer.sensors
-        inside = self._sensors.retract(inside, sensing) if self._turned else _with_numbers(inside, numbers)
-        law = _with_numbers(base.computer.law, law)
-        computer = Computer(inside, self._model.retract(base.computer.seen, seen), memory, law, applied, filtered)
-        return Carry(plant.retract(base.x, x), acting, computer, model)
-
-    def local_coordinates(self, other: Carry) -> Array:
-        base, plant = self._base, self._plant
-        seen = self._model.local_coordinates(base.computer.seen, other.computer.seen)
-        inside = jnp.zeros(0)
-        if self._turned:
-            inside = self._sensors.local_coordinates(base.computer.sensors, other.computer.sensors)
-        rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
-        return jnp.concatenate([plant.local_coordinates(base.x, other.x), seen, inside, rest])
-
-
-def _numbers(memory: Any) -> list[Array]:
-    """The numbers of a memory, of sensors or a law, that can change by a little."""
-    return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
-
-
-def _with_numbers(memory: Any, numbers: list[Array]) -> Any:
-    leaves, structure = jax.tree.flatten(memory)
-    new = iter(numbers)
-    leaves = [next(new) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
-    return jax.tree.unflatten(structure, leaves)
-
-
 class Opened(NamedTuple):
     """A control period of the nominal run: the loop, and what is asked of it."""
 
@@ -215,7 +154,7 @@ def opened(parts: Parts, during: Nominal) -> Opened:
     parts = quiet(parts)
     period, before, after, arriving = during
     k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
-    here, there, now, dt = _Local(parts, before), _Local(parts, after), period.now, period.length
+    here, there, now, dt = Local(parts, before), Local(parts, after), period.now, period.length
     z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
 

@@ -1,5 +1,6 @@
 """Margins against closed forms, an independent frequency response, central differences and the flown loop."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -320,3 +321,31 @@ def test_rounding_next_to_a_pole_at_one_is_no_crossing():
     there, factor = crossings.real_at(seen)
     assert there.tolist() == [False, False, False, True]
     assert factor[-1] == pytest.approx(-np.log(2.0), rel=1e-12)
+
+
+def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
+    """No gain changes it: its poles stay at 1, and gains are limited where other poles leave the circle.
+
+    On the way as in hold, about a body that turns; by the poles of the loop with other gains of one axis.
+    """
+    scene = {
+        "reference": {"kind": "spin", "rate": [0.0, 0.05, 0.02]},
+        "wheels": {"momentum": [1.0, -2.0, 0.5, 3.0]},
+        "initial": {"rotvec_deg": [40.0, 30.0, 0.0]},
+        "loop": {"mode": "sampled", "period": 0.1, "t_end": 14.0},
+        "controller": {"t_f": 10.0, "delta": 0.5, "sign_width": 0.05},
+    }
+    parts = scenario.study(scenario.from_tables({**BODY, **scene})).parts
+    run = linear.nominal_jit(parts)
+    on_the_way, in_hold = (linear.full_periods(parts, run, hold=hold) for hold in (False, True))
+    loops = linear.loops_in(parts, run, np.array([on_the_way[len(on_the_way) // 2], in_hold[-1]]))
+    for loop in (jax.tree.map(lambda v, k=k: v[k], loops) for k in range(2)):
+        found = of(loop)
+        assert found.stable.all()
+        poles = np.linalg.eigvals(linear.at_input(loop, xp=np).closed())
+        assert np.sum(np.abs(poles - 1.0) < 1e-9) == 4  # each wheel's; of rounding of 1e-15, by the square root
+        for (way, borders_of), axis in itertools.product(((1, found.gain_up), (-1, found.gain_down)), range(3)):
+            gains = (10 ** (way * share * borders_of[axis] / 20) for share in (0.2, 0.4, 0.6, 0.8, 0.99, 1.01))
+            sizes = [linear.radius(loop, np.diag(np.where(np.arange(3) == axis, gain, 1.0))) for gain in gains]
+            assert max(sizes[:-1]) < 1.0 + 1e-9
+            assert sizes[-1] > 1.0 + 1e-5
