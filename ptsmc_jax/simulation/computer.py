@@ -56,6 +56,13 @@ class Period(NamedTuple):
         """Length of the control period [s]."""
         return self.now.t_next - self.now.t
 
+    def told(self, period: Scalar) -> Scalar:
+        """The length [s] that flight software goes by: it does not know that the run ends within its last period.
+
+        period: a whole one [s].
+        """
+        return jnp.where((self.now.noise_weight < 1.0) & (self.length > 0.0), self.length, period)
+
 
 class Software(NamedTuple):
     """A flight computer, as the rollout flies it: `boot` and `decide`, or other software in their place."""
@@ -118,11 +125,10 @@ def command(
     parts: Parts, k2: Bound, period: Period, computer: Computer, seen: Any, target: Any, d_hat: Array
 ) -> tuple[Array, Array, Any]:
     """The law's torque (m,) [N m], its sliding variable and its memory."""
-    now, has_length = period.now, period.length > 0.0
-    # a length that one may divide by, also in a period that has none
-    sample = Sample(now.t, now.hold, jnp.where(has_length, period.length, parts.period))
+    now = period.now
+    sample = Sample(now.t, now.hold, period.told(parts.period))
     u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
-    return u, s, guards.select(has_length, memory, computer.law)
+    return u, s, guards.select(period.length > 0.0, memory, computer.law)
 
 
 def decide(
@@ -148,7 +154,7 @@ def decide(
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
     command_filter = computer.command_filter
     if parts.command_filter is not None:
-        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.length)
+        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.told(parts.period))
         command_filter = guards.select(period.length > 0.0, command_filter, computer.command_filter)
     decision = Decision(target, d_hat, u, s, parts.observer.model.velocity(seen))
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)

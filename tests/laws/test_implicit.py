@@ -77,6 +77,16 @@ def test_on_the_surface_the_error_falls_by_a_closed_form():
     np.testing.assert_allclose(ratio, factor, rtol=1e-9)
 
 
+def test_the_law_does_not_know_that_the_run_ends_within_a_period():
+    """Its last command is the one of a run that goes on, as a flight computer's is."""
+    parts = study(k1=1.3)
+    end = vector(6.97)
+    cut = replace(parts, t_end=end, clock=replace(parts.clock, t_end=end))
+    (t, *_, u), (t_cut, *_, u_cut) = flown(parts), flown(cut)
+    assert t_cut[-1] == t[-1] == pytest.approx(6.9)
+    np.testing.assert_array_equal(u_cut, u)
+
+
 def test_a_disturbance_leaves_of_s_what_it_does_in_a_period():
     """With |d| <= K the sign is solved for: s+ = g d, g what a unit of input adds to s in a period; no chattering."""
     t, _, s, u = flown(study(bound=0.2, disturbance=0.15, k1=2.0))
