@@ -167,8 +167,9 @@ def graded(
     """Grid of the continuous loop.
 
     200 graded steps and at most t_f/200 each leave 1e-8 in the states of the paper's cases, and the error falls with
-    the fourth power. Chains take 3 n - 4 times as many, which leaves 1e-9 of the largest state up to order 5. Explicit
-    steps must resolve the smooth sign.
+    the fourth power. Chains take 3 n - 4 times as many, which leaves 1e-9 of the largest state up to order 5 before the
+    hand-over. Explicit steps must resolve the smooth sign: where s enters a layer of width 0.02 after the hand-over,
+    under a disturbance that no observer takes off, 3e-5 are left in the last state and 3e-6 in x_1 (of 1).
 
     Args:
         t_f: prescribed time [s].

@@ -19,8 +19,18 @@ class Noise(NamedTuple):
     s: float  # of the sliding variable, RMS over the window and its components
 
 
+def predicts(parts: Parts) -> bool:
+    """Whether `noise` says what such sampled parts do under the noise of s, of any size [-].
+
+    Not of implicit sampling: s lands at once where the noise is within what switching reaches in a period, and hardly
+    beyond; which of these rules, no slope about the quiet run tells.
+    """
+    readable = parts.sensors is not None and hasattr(parts.sensors, "reading")
+    return readable and parts.observer.linear and not getattr(parts.controller, "implicit", False)
+
+
 def noise(parts: Parts) -> Noise:
-    """Linear covariance along the nominal run of sampled parts: what sensor noise, bias and random walk cost.
+    """Linear covariance along the nominal run of sampled parts that it `predicts`: what noise, bias, random walk cost.
 
     Behind an attitude filter its steady state is known at t = 0. The smooth sign counts with the mean slope that it has
     under the noise of s, E[sech^2(s / width)] / width (statistical linearisation): a few rounds find both.

@@ -1,5 +1,7 @@
 """The covariance of the linearised loop against flown trials."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,3 +59,11 @@ def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials):
     share = np.sqrt(rms[0] ** 2 - rms[1] ** 2)
     assert share > 0.4 * rms[0]  # the noise can be told from the rest
     np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
+
+
+def test_implicit_sampling_is_not_predicted():
+    """A noise beyond what its switching reaches would count thirteen times in the torque."""
+    parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
+    assert covariance.predicts(parts)
+    assert not covariance.predicts(replace(parts, controller=replace(parts.controller, implicit=True)))
+    assert not covariance.predicts(replace(parts, sensors=None))

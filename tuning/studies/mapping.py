@@ -187,8 +187,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             figures[f"{prefix}gain_margin"] = float(10.0 ** (left.gain_up.min() / 20.0))
             figures[f"{prefix}delay_margin"] = float(left.delay.min())
             figures[f"{prefix}radius"] = radius
-        readable = parts.sensors is not None and hasattr(parts.sensors, "reading")
-        if readable and parts.observer.linear and figures["radius"] < 1.0 + margins.NEUTRAL:
+        if covariance.predicts(parts) and figures["radius"] < 1.0 + margins.NEUTRAL:
             expected = covariance.noise(parts)
             figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
