@@ -43,6 +43,15 @@ def bodies(tensors: np.ndarray) -> np.ndarray:
     return (moments[:, 0] > 1e-12 * scale) & (moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-9))
 
 
+def flexible_bodies(tensors: np.ndarray, couplings: np.ndarray) -> np.ndarray:
+    """Which flexible bodies can be, (n,) bool: those whose J - D'D is positive definite.
+
+    tensors: J (n, 3, 3) [kg m^2]; couplings: D (n, modes, 3) [sqrt(kg) m].
+    """
+    least = np.linalg.eigvalsh(tensors - np.swapaxes(couplings, 1, 2) @ couplings)[:, 0]
+    return least > 1e-9 * np.abs(tensors).max(axis=(1, 2))
+
+
 def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
     """J - D'D (3, 3) of a flexible body [kg m^2], for D (modes, 3) [sqrt(kg) m]; raises ValueError where it is not > 0.
 
@@ -50,8 +59,8 @@ def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
     """
     rows = np.asarray(coupling, dtype=float)
     rest = inertia - rows.T @ rows
-    least = float(np.linalg.eigvalsh(rest)[0])
-    if least <= 1e-9 * np.abs(inertia).max():
+    if not flexible_bodies(inertia[None], rows[None])[0]:
+        least = float(np.linalg.eigvalsh(rest)[0])
         raise ValueError(
             "the inertia less D'D, what is left when all modes move along, must be positive definite "
             f"(its smallest principal moment is {least:.6g} kg m^2)"

@@ -6,7 +6,8 @@ What is neither given nor drawn is nominal. Results (status, metrics) may stand 
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -134,7 +135,11 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
                 f"{where} has the column {present}, but not {absent[0]}: {_all(columns_of[name])} come together"
             )
         values = np.stack([_numbers(table, column, where) for column in columns_of[name]], axis=1)
-        given[name] = _checked(values, name, columns_of[name], where)
+        with _refusing(values, columns_of[name], where):
+            given[name] = QUANTITIES[name].checked(values)
+    for name, values in given.items():
+        with _refusing(values, columns_of[name], where):
+            QUANTITIES[name].check_with(given, parts)
     whose_draws = {}
     for name, other in OF_ROWS.items():  # of rows that are flown again, `trial` is but their number
         column = other if other in table.columns else name
@@ -193,10 +198,11 @@ def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     return values.astype(np.uint32)
 
 
-def _checked(values: np.ndarray, name: str, columns: list[str], where: str) -> np.ndarray:
-    """The numbers (rows, n) of a quantity as they are flown."""
+@contextmanager
+def _refusing(values: np.ndarray, columns: list[str], where: str) -> Iterator[None]:
+    """Raise RefusedError of the row of a quantity's numbers (rows, n) that a check in here finds unfit."""
     try:
-        return QUANTITIES[name].checked(values)
+        yield
     except UnfitError as error:
         row = ", ".join(f"{v:.9g}" for v in values[error.row])
         heading = columns[0] if len(columns) == 1 else f"{_all(columns)} ="

@@ -4,7 +4,7 @@ Coordinates are numbers uniform on (0, 1) or standard normal: a trial's are draw
 moves them: value = at(coordinates).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,6 +26,7 @@ DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amp
 DISTURBANCE_BIAS = "disturbance_bias"
 FARTHEST = 3.0  # standard deviations of what is truncated, at most
 NEAR = 1e-6  # of 1, the norm of a unit vector, or quaternion, that a plan gives
+PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
 
 
 class UnfitError(ValueError):
@@ -44,6 +45,7 @@ class UnfitError(ValueError):
 
 
 Checked = Callable[[np.ndarray], np.ndarray]
+Given = Mapping[str, np.ndarray]  # numbers (rows, n) that a plan gives, by the names of `QUANTITIES`
 
 
 class Quantity(NamedTuple):
@@ -53,6 +55,7 @@ class Quantity(NamedTuple):
     read: Callable[[Parts], Numbers]
     write: Callable[[Parts, Numbers], Parts]
     checked: Checked = lambda rows: rows  # numbers (rows, n) of a plan -> as they are flown; raises UnfitError
+    check_with: Callable[[Given, Parts], None] = lambda given, parts: None  # raises it where others forbid them
 
 
 def of_field(
@@ -94,6 +97,23 @@ def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
 
 not_negative = fitting(lambda numbers: numbers >= 0.0, "numbers of at least 0")
 positive = fitting(lambda numbers: numbers > 0.0, "a number greater than 0")
+
+
+def tensors(rows: np.ndarray) -> np.ndarray:
+    """Symmetric tensors (rows, 3, 3) of their upper triangles (rows, 6), as `PAIRS` has them [kg m^2]."""
+    full = np.zeros((len(rows), 3, 3))
+    for k, (i, j) in enumerate(PAIRS):
+        full[:, i, j] = full[:, j, i] = rows[:, k]
+    return full
+
+
+def reason(check: Callable[..., Any], *values: Any) -> str:
+    """What a check says that refuses these values, in any unit [-], by a ValueError."""
+    try:
+        check(*values)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def numbered(name: str, count: int) -> list[str]:

@@ -12,7 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.dispersions.base import NEAR, Drawn, Numbers, Quantity, fitting, numbered, of_field, plant_of, positive
+from ptsmc_jax import formulas
+from ptsmc_jax.dispersions.base import (
+    INERTIA,
+    NEAR,
+    Drawn,
+    Given,
+    Numbers,
+    Quantity,
+    UnfitError,
+    fitting,
+    numbered,
+    of_field,
+    plant_of,
+    positive,
+    reason,
+    tensors,
+)
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.simulation.assembly import Parts
@@ -69,6 +85,24 @@ def _with_failure(parts: Parts, failure: Numbers) -> Parts:
     return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 
+def _check_wheel(given: Given, parts: Parts) -> None:
+    """Numbers of wheels are whole and those of wheels that there are, or 0."""
+    wheel, last = given["wheel_failure"][:, 1], channels(parts).shape[1]
+    fit = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
+    UnfitError.check(fit, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
+
+
+def _check_coupling(given: Given, parts: Parts) -> None:
+    """The body can be, with the inertia that a row gives or else the nominal one."""
+    rows = given["mode_coupling"].reshape(-1, _modes(parts), 3)
+    nominal = np.asarray(plant_of(parts).inertia)
+    inertia = tensors(given[INERTIA]) if INERTIA in given else np.broadcast_to(nominal, (len(rows), 3, 3))
+    UnfitError.check(
+        formulas.flexible_bodies(inertia, rows),
+        lambda k: f"a flexible body's coupling ({reason(formulas.rest_inertia, inertia[k], rows[k])})",
+    )
+
+
 _OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
 _FAILURE = ["wheel_failure_time", "wheel_failure_wheel"]
 OF_MISFITS: dict[str, Quantity] = {
@@ -90,12 +124,18 @@ OF_MISFITS: dict[str, Quantity] = {
         "sensors", "misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3
     ),
     "gyro_scale": of_field("sensors", "rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
-    "star_tracker_outage": of_field("sensors", "outage", _OUTAGE, [np.inf, np.inf]),
+    "star_tracker_outage": of_field(
+        "sensors",
+        "outage",
+        _OUTAGE,
+        [np.inf, np.inf],
+        fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
+    )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else _OUTAGE),
     "wheel_failure": Quantity(
         lambda parts: [] if parts.effective_actuators.wheels is None else _FAILURE,
         _failure,
         _with_failure,
-        fitting(lambda rows: rows[:, 1] == np.round(rows[:, 1]), "a time and the number of a wheel, from 1 on"),
+        check_with=_check_wheel,
     ),
     "timing_jitter": Quantity(
         lambda parts: ["timing_jitter"] if parts.clock.sampled else [],
@@ -115,6 +155,7 @@ OF_MISFITS: dict[str, Quantity] = {
         lambda parts, rows: replace(
             parts, plant=replace(plant_of(parts), coupling=rows.reshape(-1, 3)).with_rest_inverse()
         ),
+        check_with=_check_coupling,
     ),
 }
 

@@ -23,6 +23,7 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_RATE,
     INITIAL_STATE,
     NEAR,
+    PAIRS,
     REFERENCE,
     Numbers,
     Quantity,
@@ -32,6 +33,8 @@ from ptsmc_jax.dispersions.base import (
     of_field,
     plant_of,
     positive,
+    reason,
+    tensors,
 )
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.numerics import matrices
@@ -61,9 +64,6 @@ def _unit(q: np.ndarray) -> np.ndarray:
     return np.where(rounding[:, None], q, q / norm[:, None])
 
 
-PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle
-
-
 def with_body(parts: Parts, body: Spacecraft) -> Parts:
     """The parts with another true body, on which the disturbance acts."""
     return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
@@ -76,19 +76,11 @@ def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
 
 
 def _inertia_checked(rows: np.ndarray) -> np.ndarray:
-    tensors = np.zeros((len(rows), 3, 3))
-    for k, (i, j) in enumerate(PAIRS):
-        tensors[:, i, j] = tensors[:, j, i] = rows[:, k]
-    UnfitError.check(formulas.bodies(tensors), lambda k: f"a rigid body's inertia ({_why_no_body(tensors[k])})")
+    full = tensors(rows)
+    UnfitError.check(
+        formulas.bodies(full), lambda k: f"a rigid body's inertia ({reason(formulas.check_inertia, full[k])})"
+    )
     return rows
-
-
-def _why_no_body(tensor: np.ndarray) -> str:
-    try:
-        formulas.check_inertia(tensor)
-    except ValueError as error:
-        return str(error)
-    return ""
 
 
 def _of_disturbance(name: str, what: Literal["phase", "amplitude"]) -> Quantity:

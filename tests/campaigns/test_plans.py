@@ -247,6 +247,8 @@ BAD = [
     ({"trial": [0, -1]}, "has trial -1 in row 1, but must have a whole number from 0 to 4294967295"),
     ({"trial": [0.5]}, "has trial 0.5 in row 0, but must have a whole number"),
     ({"seed": [2**32]}, "has seed 4294967296 in row 0, but must have a whole number"),
+    ({"star_tracker_outage_begin": [3.0], "star_tracker_outage_end": [17.0]},  # there is no filter that lacks anything
+     "has the column star_tracker_outage_begin, with which no trial of this scenario flies"),
 ]  # fmt: skip
 
 
@@ -256,6 +258,63 @@ def test_what_cannot_be_flown_is_refused_with_row_and_column(everything, columns
         plans.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+HARDWARE = """
+spacecraft = { inertia = [10.0, 12.0, 14.0] }
+flexible = { frequency = [3.0], damping = [0.01], coupling = [[1.5, 0.0, 0.0]] }
+loop = { mode = "sampled", period = 0.1 }
+hardware = { attitude_noise = 1e-5, rate_noise = 1e-5 }
+filter = { kind = "steady_state", bandwidth = 1.0 }
+wheels = { kind = "pyramid", torque_limit = 2.0 }
+"""
+COUPLING = [f"mode_coupling_1{i}" for i in (1, 2, 3)]
+OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
+FAILURE = ["wheel_failure_time", "wheel_failure_wheel"]
+ONE_WHEEL = "but must have a time and the number of a wheel, from 1 to 4, or 0 for none"
+NO_BODY = (
+    "but must have a flexible body's coupling (the inertia less D'D, what is left when all modes move along, must be "
+)
+MISFIT = [
+    (OUTAGE, [(3.0, 9.0), (9.0, 3.0)],
+     f"{OUTAGE[0]} to {OUTAGE[1]} = 9, 3 in row 1, but must have a begin and an end that is not before it"),
+    (FAILURE, [(2.0, 9.0)], f"wheel_failure_time to wheel_failure_wheel = 2, 9 in row 0, {ONE_WHEEL}"),
+    (FAILURE, [(2.0, 4.0), (2.0, 5.0)], f"= 2, 5 in row 1, {ONE_WHEEL}"),
+    (FAILURE, [(2.0, 0.0), (2.0, -3.0)], f"= 2, -3 in row 1, {ONE_WHEEL}"),
+    (FAILURE, [(2.0, 1.0), (2.0, 1.5)], f"= 2, 1.5 in row 1, {ONE_WHEEL}"),
+    (COUPLING, [(1.5, 0.0, 0.0), (5.0, 0.0, 0.0)],
+     f"mode_coupling_11 to mode_coupling_13 = 5, 0, 0 in row 1, {NO_BODY}positive definite (its smallest "
+     "principal moment is -15 kg m^2))"),
+    ([*COUPLING, *J], [(3.1, 0.0, 0.0, *body) for body in ((10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (9.0, 0, 0, 9, 0, 9))],
+     f"mode_coupling_11 to mode_coupling_13 = 3.1, 0, 0 in row 1, {NO_BODY}positive definite (its smallest principal "
+     "moment is -0.61 kg m^2))"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def misfit():
+    """The parts of a spacecraft with wheels, an attitude filter and a mode."""
+    return ready(HARDWARE).parts
+
+
+def table_of(columns, rows):
+    return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.Float64), orient="row")
+
+
+@pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
+def test_hardware_that_cannot_be_is_refused_with_row_and_column(misfit, columns, rows, said):
+    with pytest.raises(RefusedError) as refused:
+        plans.checked(table_of(columns, rows), misfit)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_no_outage_no_failure_and_a_coupling_that_the_rows_own_body_bears_are_none_of_these(misfit):
+    """Outages without a length, wheel 0, the last wheel; a coupling too large for the nominal inertia alone."""
+    heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
+    rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
+    plan = plans.checked(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
+    assert [list(values[1]) for values in plan.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 
 def test_an_angle_that_does_not_follow_is_refused(everything):
