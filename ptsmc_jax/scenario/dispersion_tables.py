@@ -143,6 +143,7 @@ class RelativeInertia(Table, frozen=True):
         axes_deg: 1 sigma of the small rotation of the principal axes [deg]
     """
 
+    farthest: ClassVar[float] = 3.0  # how far a moment goes, in times std
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
     axes_deg: NotNegative = 0.0

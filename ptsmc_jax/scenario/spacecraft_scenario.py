@@ -84,6 +84,26 @@ class Flexible(Table, frozen=True):
         except ValueError as error:
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
+    def check_drawn(self, inertia: Any, drawn: dispersion_tables.Dispersion | None) -> None:
+        """Refuse draws of couplings that no body can have; inertia: of the body that flies [kg m^2].
+
+        Rows are at most f times as long and moments at least s times as large, so that every draw leaves at least
+        s J - f^2 D'D. Axes that are turned besides are not looked at.
+        """
+        rows, moments = (getattr(drawn, key, None) for key in ("mode_coupling", "inertia"))
+        if rows is None or rows.nothing:
+            return
+        longest = 1.0 + rows.farthest * float(rows.of()[0])
+        smallest = 1.0 if moments is None else 1.0 - moments.farthest * moments.std
+        body = "" if moments is None else f", and moments {smallest:.6g} times as large"
+        said = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
+        try:
+            formulas.rest_inertia(smallest * formulas.check_inertia(inertia), longest * np.asarray(self.coupling))
+        except ValueError as error:
+            raise ScenarioError(
+                f"{said}, but with rows {longest:.6g} times those of flexible.coupling{body}, as may be drawn, {error}"
+            ) from None
+
 
 class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     """A scenario of a rigid spacecraft."""
@@ -175,7 +195,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             self.flexible.check(self.true_inertia)
 
     def check_plant(self) -> None:
-        """Attitudes that are given once, and devices that fit."""
+        """Attitudes that are given once, devices that fit, and modes that a body can have however they are drawn."""
         attitude_keys.quaternion(self.initial, "initial")
         self.reference.check()
         several = len(self.terms) > 1 or self.disturbance.kind == "sum"
@@ -187,6 +207,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             self.wheels.check()
         if self.pointing is not None:
             self.pointing.check(self)
+        if self.flexible is not None:
+            self.flexible.check_drawn(self.true_inertia, self.dispersion)
 
     def observation(self) -> Any:
         """What pointing error indices are taken of."""

@@ -12,6 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.devices import actuators
 from ptsmc_jax.dispersions import misfits
+from ptsmc_jax.dispersions.base import FARTHEST, plant_of
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants import flexible_body
 from ptsmc_jax.simulation import sampled
@@ -228,6 +229,30 @@ def test_samples_that_are_in_time_change_no_digit(tables):
     one, other = (fly(p, 5, 1) for p in (parts, replace(parts, jitter=vector(0.0))))
     for name, value in one.metrics._asdict().items():
         np.testing.assert_array_equal(value, getattr(other.metrics, name), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("coupling", "inertia"),
+    [
+        ({"kind": "relative_uniform", "half_width": 0.054}, {}),  # 10 kg m^2 = (1.0541 * 3)^2
+        ({"kind": "relative_normal", "std": 0.018}, {}),
+        ({"kind": "relative_uniform", "half_width": 0.021}, {"kind": "relative_normal", "std": 0.02}),
+    ],
+)
+def test_the_widest_couplings_that_are_allowed_leave_a_body_at_their_farthest(coupling, inertia):
+    """Rows as long and moments as small as can be drawn, and a tenth of the width more is refused."""
+    drawn = {"mode_coupling": coupling, **({"inertia": inertia} if inertia else {})}
+    tables = {**FLIGHT, "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
+              "flexible": {"coupling": [[3.0, 0.0, 0.0]]}, "dispersion": drawn}  # fmt: skip
+    ready = scenario.study(scenario.from_tables(tables))
+    ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-FARTHEST)}
+    plant = plant_of(ready.dispersion.at(ready.parts, ends))
+    left = np.linalg.eigvalsh(plant.rest_inertia)[0]
+    assert 0.0 < left < 0.05
+    np.testing.assert_allclose(plant.rest_inertia @ plant.rest_inverse, np.eye(3), rtol=0, atol=1e-9)
+    wider = {key: value * 1.1 if key != "kind" else value for key, value in coupling.items()}
+    with pytest.raises(scenario.ScenarioError, match="must be positive definite"):
+        scenario.from_tables({**tables, "dispersion": {**drawn, "mode_coupling": wider}})
 
 
 def test_streams_of_their_own():

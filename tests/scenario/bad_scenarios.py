@@ -12,6 +12,7 @@ INERTIA, CLEAR = "three principal moments or a symmetric 3x3", "|q4| of at least
 FINITE, PRESCRIBED = "observer.kind = 'finite_time'\n", "observer.kind = 'prescribed_time'\n"
 OPPOSITE = "controller.error = 'multiplicative'\n"
 CHAIN = 'plant.kind = "chain"\n'
+FLEXIBLE = "spacecraft.inertia = [10, 12, 14]\nflexible.coupling = [[3, 0, 0]]\n"
 OWN = 'plant = { kind = "system", system = "%s" }'
 
 # scenario file; what its one sentence must say of key and value; what it must say is allowed
@@ -289,6 +290,21 @@ BAD = [
         "at most 0.1, the largest",
     ),
     ("dispersion.mode_frequency = {}", "dispersion.mode_frequency needs flexible modes", "no [flexible] table"),
+    (
+        FLEXIBLE + "dispersion.mode_coupling = { kind = 'relative_uniform', half_width = 0.99 }",
+        "dispersion.mode_coupling.half_width is 0.99, but with rows 1.99 times those of flexible.coupling, as may be",
+        "must be positive definite (its smallest principal moment is -25.6409 kg m^2)",
+    ),
+    (  # (1 + 3 * 0.02)^2 9 > 10
+        FLEXIBLE + "dispersion.mode_coupling = { std = 0.02 }",
+        "dispersion.mode_coupling.std is 0.02, but with rows 1.06 times those of flexible.coupling",
+        "must be positive definite",
+    ),
+    (  # (1 + 0.01)^2 9 < 10, but not of moments 1 - 3 * 0.05 times as large
+        FLEXIBLE + "dispersion = { mode_coupling = { kind = 'relative_uniform', half_width = 0.01 }, inertia = {} }",
+        "half_width is 0.01, but with rows 1.01 times those of flexible.coupling, and moments 0.85 times as large",
+        "must be positive definite",
+    ),
     (
         SAMPLED + "dispersion.actuator_misalignment = { std_deg = -1 }",
         "dispersion.actuator_misalignment.std_deg is -1",
