@@ -92,3 +92,9 @@ def test_what_is_no_attitude_is_refused(command, options, said):
     assert (code, out) == (2, "")
     assert error.startswith(f"ptsmc: {said}"), error
     assert error.count("\n") == 1
+
+
+def test_of_a_whole_turn_no_rounding_is_left():
+    said = convert.lines(np.array([0.0, 0.0, -1.2246e-16, 1.0]))
+    assert "rotvec_deg = [0, 0, 0]  # 0 degrees" in said
+    assert 'euler_deg = [0, 0, 0]  # with sequence = "ZYX"' in said

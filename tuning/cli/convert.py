@@ -47,12 +47,12 @@ def lines(q: np.ndarray, sequence: str | None = None) -> list[str]:
     order = sequence or SEQUENCE
     turn = Rotation.from_quat(q)
     x, y, z, w = (float(v) for v in q)
-    vector = turn.as_rotvec(degrees=True)
+    vector = np.round(turn.as_rotvec(degrees=True), DIGITS)  # of a whole turn there is rounding left
     angle = float(np.linalg.norm(vector))
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            euler = turn.as_euler(order, degrees=True)
+            euler = np.round(turn.as_euler(order, degrees=True), DIGITS)
     except ValueError:
         raise UsageError(
             f"--sequence is {order}, but must be three axes in SciPy's notation, such as ZYX or zyx"

@@ -269,7 +269,7 @@ def compare(
 ) -> int:
     """Tune the paper's law and others to the same requirements, and judge all on the same fresh trials.
 
-    Those of --against, and laws of your own. Interrupted or killed, the same command goes on from there.
+    Those of --against, and laws of your own, for attitudes. Interrupted or killed, the same command goes on from there.
 
     Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
     interrupted.
