@@ -83,6 +83,8 @@ def test_a_front_with_gains_that_never_fly_can_be_told():
         ("", "-", "-", "-", "-", "3", "9 failed or missed"),
         ("paper", "-", "-", "-", "-", "3", "9 failed or missed"),
     ]
+    assert not any("without a point" in line for line in sentences.front_lines({**summary, "steps": 1}))
+    assert any("without a point of their own: 2," in line for line in sentences.front_lines({**summary, "steps": 3}))
 
 
 def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():

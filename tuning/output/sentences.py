@@ -235,7 +235,11 @@ def front_lines(summary: Summary) -> Iterator[str]:
     if summary.get("floor"):
         yield f"the floor is {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
     kept = [point for point in summary["points"] if not point["dominated"]]
-    lost = len(summary["points"]) - len(kept)
+    found = len(summary["points"])
+    without = summary.get("steps", found) - found
+    if without:
+        yield f"limits without a point of their own: {without}, which no gains keep, or the same gains as at another"
+    lost = found - len(kept)
     if lost:
         yield f"points left out: {lost}, each beaten by another in error and torque by more than its interval"
     if summary["requirements"] and not any(point["meets"] for point in kept):

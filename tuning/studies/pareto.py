@@ -64,6 +64,7 @@ class Front:
     """The points in order of their peak torque, and for comparison the paper's and the scenario's own gains."""
 
     points: list[Point]
+    steps: int  # of the ladder of limits that they were looked for on
     others: dict[str, Point]
     paper_refused: str | None  # why the paper's gains are not among them
     fresh_seed: int
@@ -122,6 +123,7 @@ def trace(
         others[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
     return Front(
         points=_marked(judged),
+        steps=points,
         others=others,
         paper_refused=refused,
         fresh_seed=fresh_seed,
@@ -274,6 +276,7 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "rollouts": front.rollouts,
         "gradients": front.gradients,
         "points": [asdict(point) for point in front.points],
+        "steps": front.steps,
         **{name: asdict(point) for name, point in front.others.items()},
         "paper_refused": front.paper_refused,
         "cautions": cautions.of(scenario),
