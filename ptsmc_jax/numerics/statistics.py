@@ -176,6 +176,10 @@ def fewest_for(failures: int, quantile: float, confidence: float) -> int:
     return failures + 1 + bisect.bisect_left(range(failures + 1, enough), True, key=shown)
 
 
-def most_extreme(values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the worst trials: failed ones first, then those without a value, then by value, largest first."""
-    return np.lexsort((-np.nan_to_num(values, nan=np.inf), ~np.isnan(values), ~failed))[:count]
+def most_extreme(values: np.ndarray, failed: np.ndarray, count: int, *, larger_is_better: bool = False) -> np.ndarray:
+    """Indices of the worst trials: failed ones first, then those without a value, then by value, largest first.
+
+    Smallest first where larger is better.
+    """
+    badness = values if larger_is_better else -values
+    return np.lexsort((badness, ~np.isnan(values), ~failed))[:count]

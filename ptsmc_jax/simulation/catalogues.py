@@ -80,6 +80,7 @@ STATE_CATALOGUE = {
     "peak_rate": Entry("x2", "largest |x_2|"),
 }
 MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
+LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # a run that failed has 0; of others less is better
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,

@@ -75,6 +75,25 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert [row[9] for row in table.rows] == ["22", "4", "every run flown"]  # 0.9^22 <= 0.1
 
 
+def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
+    _, said, rows, found = flown
+    within = rows["within_ape_boresight"].to_numpy()
+    ordered = np.sort(within)
+    told = found["quantiles"]["within_ape_boresight"]
+    assert (told["min"], told["0.0027"]["value"]) == (ordered[0], ordered[0])  # 99.73 % of 150 runs are all of them
+    assert told["0.1"]["value"] == ordered[15]  # 135 runs of 150 reach it
+    assert told["0.5"]["value"] == ordered[75]
+    assert "0.9973" not in told
+    assert "within_ape_boresight" not in said.split("99.73 % reach")[0]  # but below it, beside the smallest
+    assert f"{ordered[0]:.3g}" in said.split("99.73 % reach")[1]
+    assert "Shares of time within a limit, of which more is better" in checked(tmp_path / FOLDER).text
+
+    assert command("worst", FOLDER, "--by", "within_ape_boresight", "-n", 3, "--why")[0] == 0
+    assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["within_ape_boresight"].to_list() == list(ordered[:3])
+    why = pl.read_csv(tmp_path / FOLDER / "why.csv").filter(pl.col("metric") == "within_ape_boresight")
+    assert set(why["trial"]) == set(np.argsort(within, kind="stable")[:3])
+
+
 def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     from tuning.studies import campaign_summary
 

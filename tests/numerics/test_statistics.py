@@ -85,6 +85,7 @@ def test_the_worst_come_first_failed_ones_before_all():
     values = np.array([1.0, np.nan, 5.0, 3.0, 9.0])
     failed = np.array([False, False, False, True, False])
     assert statistics.most_extreme(values, failed, 4).tolist() == [3, 1, 4, 2]
+    assert statistics.most_extreme(values, failed, 4, larger_is_better=True).tolist() == [3, 1, 0, 2]
 
 
 def test_the_bound_of_a_mean_of_shares_is_a_share():

@@ -198,7 +198,9 @@ def worst(
     folder: CampaignFolder,
     /,
     *,
-    by: Annotated[str, Parameter(help="Column of the rows: a metric.")] = "window_error",
+    by: Annotated[
+        str, Parameter(help="Column of the rows: a metric; the largest are the worst, of `within_*` the smallest.")
+    ] = "window_error",
     n: Annotated[
         int, whole_number("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))
     ] = 5,

@@ -41,7 +41,8 @@ class Progress(Bar):
 def campaign(summary: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
     terminal.say(*sentences.campaign_counts(summary))
-    terminal.table(sentences.campaign(summary))
+    for table in sentences.campaign(summary):
+        terminal.table(table)
     terminal.say(*pointing_sentences.heading(summary))
     for table in pointing_sentences.tables(summary):
         terminal.table(table)

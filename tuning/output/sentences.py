@@ -291,17 +291,29 @@ def slew_times_heading(summary: Summary) -> str:
     return f"gains tuned for {times}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
 
 
-def campaign(summary: Summary) -> Table:
-    """Quantiles of every metric."""
+def campaign(summary: Summary) -> list[Table]:
+    """Quantiles of every metric; those of shares of time, of which more is better, in a table of their own."""
+    tables = [
+        Table(("", "median", "99.73 %", "its 95 % interval", "largest", "unit"), _ends(summary, "0.9973", "max")),
+        Table(
+            ("", "median", "99.73 % reach", "its 95 % interval", "smallest", "unit"), _ends(summary, "0.0027", "min")
+        ),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def _ends(summary: Summary, quantile: str, extreme: str) -> list[tuple[str, ...]]:
+    """Rows of the metrics that have this quantile at their bad end."""
     rows: list[tuple[str, ...]] = []
     for name, statistics in summary["quantiles"].items():
-        if pointing_sentences.is_index(name):
+        if pointing_sentences.is_index(name) or quantile not in statistics:
             continue
-        median, far, largest = statistics["0.5"]["value"], statistics["0.9973"], statistics.get("max")
+        far = statistics[quantile]
         between = f"{_number(far['low'])}..{_number(far['high'])}"
+        values = (_number(v) for v in (statistics["0.5"]["value"], far["value"]))
         unit = CATALOGUES[summary["plant"]].get(name, ("",))[0]
-        rows.append((name, _number(median), _number(far["value"]), between, _number(largest), unit))
-    return Table(("", "median", "99.73 %", "its 95 % interval", "largest", "unit"), rows)
+        rows.append((name, *values, between, _number(statistics.get(extreme)), unit))
+    return rows
 
 
 def _number(value: float | None) -> str:
