@@ -1,9 +1,35 @@
-"""Shares of time in what is said of a campaign."""
+"""Shares of time in what is said of a campaign, and how its figures judge trials."""
 
 import numpy as np
+import polars as pl
 import pytest
 
+from ptsmc_jax.figures.campaign_plots import AT_TIMES, BEYOND
+from ptsmc_jax.simulation.requirements import Requirement
 from tuning.studies import campaign_summary
+
+# a run that keeps the limit, two that leave it for a tenth and for half of the time, one without an end
+FRAME = pl.DataFrame({
+    "status": ["ok", "ok", "ok", "diverged"], "ape_z": [0.5, 2.0, 2.0, None], "within_ape_z": [1.0, 0.9, 0.5, None],
+    "peak_torque": [3.0, 1.0, 1.0, None],
+})  # fmt: skip
+
+
+@pytest.mark.parametrize(("interpretation", "outcomes", "said"), [
+    ("ensemble", ["ok", BEYOND, BEYOND, "diverged"], ""),
+    ("mixed", ["ok", AT_TIMES, AT_TIMES, "diverged"], "asked for: 80 % of the time of all runs; seen: 60 %"),
+    ("temporal", ["ok", AT_TIMES, BEYOND, "diverged"],
+     "asked for: 80 % of the time, in every run; seen: at least 0 %"),
+])  # fmt: skip
+def test_a_limit_that_may_be_left_at_times_is_told_apart(interpretation, outcomes, said):
+    asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
+    assert campaign_summary._outcomes(FRAME, [asked]).tolist() == outcomes
+    torque = Requirement("peak_torque", 2.0, "N m")
+    for both in ([asked, torque], [torque, asked]):  # what a trial breaks is said whatever else it leaves
+        assert campaign_summary._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
+    values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
+    verdict = asked.verdict(values, np.array([True, True, True, False]), within)
+    assert campaign_summary._of_time(verdict) == said
 
 
 def test_a_failed_trial_has_no_share_of_time():

@@ -18,7 +18,7 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
+from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, floor_of, margins_of
 
@@ -293,13 +293,17 @@ def _off(a: Any, b: Any) -> float:
 def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Figures of a campaign by name."""
     parts, kind = folder.whole_parts(), folder.scenario.plant.kind
-    limits = {r.metric: r.limit for r in scenario.requirements(folder.scenario)}
+    wanted = scenario.requirements(folder.scenario)
+    limits = {r.metric: r.limit for r in wanted}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
-    frame = rows.read(parts, ["trial", "status", "initial_angle", *names]).head(folder.trials)
+    timed = [r.timed for r in wanted if r.timed is not None]
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
     finished = flying.finished(frame)
+    of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
 
     def column(name: str, values: np.ndarray) -> plots.Column:
-        return plots.Column(catalogues.CATALOGUES[kind].get(name, ("",))[0], values, limits.get(name))
+        unit = catalogues.CATALOGUES[kind].get(name, ("",))[0]
+        return plots.Column(unit, values, limits.get(name), of_time.get(name, ""))
 
     figures: dict[str, Figure] = {}
     if finished.any():
@@ -308,11 +312,10 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
-    outcome = frame["status"].to_numpy().astype(object)
-    for metric, limit in limits.items():
-        outcome[(outcome == "ok") & ~(frame[metric].to_numpy() <= limit)] = plots.BEYOND
+    outcome = _outcomes(frame, wanted)
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
-    bad, good = np.flatnonzero(outcome != "ok")[: POINTS // 2], np.flatnonzero(outcome == "ok")
+    fine = np.isin(outcome, ("ok", plots.AT_TIMES))
+    bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
     some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
     figures["torque_by_angle"] = plots.torque_by_angle(
         frame["initial_angle"].to_numpy()[some],
@@ -333,6 +336,33 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
             totals,
         )
     return figures
+
+
+def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
+    """How each trial ended, by its name in `plots.MARKS`, (trials,).
+
+    A limit that is asked for in a share of the time is broken by a trial where each must keep it for that long; where
+    the share is of the time of all runs, no single one breaks it.
+    """
+    outcome = frame["status"].to_numpy().astype(object)
+    ok = outcome == "ok"
+    for one in wanted:
+        beyond = ok & ~(frame[one.metric].to_numpy() <= one.limit)
+        breaks = beyond if one.timed is None else np.zeros_like(ok)
+        if one.timed is not None and one.interpretation == "temporal":
+            breaks = ok & ~(frame[one.timed].to_numpy() >= one.quantile)
+        outcome[beyond & (outcome == "ok")] = plots.AT_TIMES
+        outcome[breaks] = plots.BEYOND
+    return outcome
+
+
+def _of_time(verdict: Verdict) -> str:
+    """What a requirement on a share of the time asks for and what is seen of it; empty: it is on trials."""
+    if verdict.share_of_time is None or verdict.quantile is None:
+        return ""
+    asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
+    least = "at least " if verdict.interpretation == "temporal" else ""
+    return f"{asked}; seen: {least}{100 * verdict.share_of_time:.6g} %"
 
 
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:

@@ -1,0 +1,35 @@
+"""What figures of campaigns say, read back from their legends."""
+
+import numpy as np
+import pytest
+
+from ptsmc_jax.figures import campaign_plots
+
+
+@pytest.mark.parametrize(("of_time", "said"), [
+    ("", "limit 2.5 rad: 50 % within"),
+    ("asked for: 50 % of the time of all runs; seen: 80 %",
+     "limit 2.5 rad: 50 % of the trials within at all times\nasked for: 50 % of the time of all runs; seen: 80 %"),
+])  # fmt: skip
+def test_a_limit_on_a_share_of_the_time_is_said_as_such(of_time, said):
+    column = campaign_plots.Column("rad", np.array([1.0, 2.0, 3.0, np.nan]), 2.5, of_time)
+    (axes,) = campaign_plots.distributions({"ape_z": column}).axes
+    assert axes.get_legend_handles_labels()[1] == [said]
+
+
+def test_each_outcome_is_counted_and_drawn():
+    outcome = np.array(list(campaign_plots.MARKS), dtype=object)
+    x, totals = 1.0 + np.arange(outcome.size), dict.fromkeys(campaign_plots.MARKS, 7)
+    (axes,) = campaign_plots.torque_by_angle(x, x, outcome, totals, None).axes
+    assert axes.get_legend_handles_labels()[1] == [f"{name}: 7" for name in outcome]
+    flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "missed"))]
+    assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
+
+
+def test_the_legend_of_a_narrow_figure_stays_inside_it():
+    outcome = np.array([campaign_plots.AT_TIMES, campaign_plots.BEYOND, "ok"], dtype=object)
+    x, totals = np.arange(3.0), dict.fromkeys(campaign_plots.MARKS, 1000)
+    figure = campaign_plots.inputs({"x": x}, {"ape_z": campaign_plots.Column("rad", x)}, outcome, totals)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert figure.bbox.x0 <= legend.get_window_extent().x0
