@@ -38,9 +38,7 @@ CATALOGUE = {
     "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
     "window_error": Entry("-", "RMS of the attitude error vector's 2-norm over the window after t_f"),
     "hold_error": Entry("-", "largest 2-norm of the attitude error vector from t_f to t_end, at ends of periods"),
-    "window_angle": Entry(
-        "rad", "RMS of the angle to the reference attitude over the window after t_f"
-    ),
+    "window_angle": Entry("rad", "RMS of the angle to the reference attitude over the window after t_f"),
     "hold_angle": Entry("rad", "largest angle to the reference attitude from t_f to t_end, at ends of periods"),
     "peak_torque": Entry("N m", "largest commanded torque about one axis, before the actuator"),
     "peak_torque_delivered": Entry("N m", "largest delivered torque about one axis"),

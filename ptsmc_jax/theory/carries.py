@@ -30,9 +30,9 @@ class _Stored:
     alone, taken to go on for ever, would look as if commands changed it a little.
     """
 
-    def __init__(self, parts: Parts, base: Carry):
-        self._plant, self._h, self._on_body = parts.plant, base.acting.h, parts.effective_actuators.on_body
-        self._total_there = self._total(base.x, base.acting.h)
+    def __init__(self, parts: Parts, x: Any, h: Array):
+        self._plant, self._h, self._on_body = parts.plant, h, parts.effective_actuators.on_body
+        self._total_there = self._total(x, h)
 
     def _inverse(self, momentum: Array) -> Array:
         """The smallest momenta (wheels,) that make this one (3,) [N m s]."""
@@ -66,7 +66,7 @@ class Local:
         known = self._model.local_coordinates(base.computer.seen, base.computer.seen)
         sensing = base.computer.sensors
         inside = parts.sensors.local_coordinates(sensing, sensing) if self._turned else jnp.zeros(0)
-        self._stored = None if base.acting.h is None else _Stored(parts, base)
+        self._stored = None if base.acting.h is None else _Stored(parts, base.x, base.acting.h)
         rest, self._unravel = ravel_pytree(self._rest(base))
         stored = 0 if base.acting.h is None else base.acting.h.size
         self.sizes = [start.size, known.size, inside.size, stored, rest.size]
@@ -99,6 +99,7 @@ class Local:
         if self._turned:
             inside = self._sensors.local_coordinates(base.computer.sensors, other.computer.sensors)
         if self._stored is not None:
+            assert other.acting.h is not None
             stored = self._stored.local_coordinates(other.x, other.acting.h)
         rest, _ = ravel_pytree(jax.tree.map(jnp.subtract, self._rest(other), self._rest(base)))
         return jnp.concatenate([plant.local_coordinates(base.x, other.x), seen, inside, stored, rest])
