@@ -134,7 +134,10 @@ def check_file(file: Path, force: bool) -> None:
 def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:  # names a folder that nobody asked for
+        raise OSError(error.errno, error.strerror, str(folder)) from None
     try:
         fill(making)
         making.chmod(0o755)

@@ -133,7 +133,7 @@ def _said(function: Any) -> str:
 
 def _reading(computer: Board, parts: Parts) -> None:
     """The states of a chain or a system as they are measured."""
-    computer.inputs["x"] = computer.state["x"] = real(*np.shape(parts.initial))
+    computer.inputs["x"] = computer.state["x"] = real(*np.shape(parts.plant.visible(parts.initial)))
     computer.about["x"] = "the state as it is measured, in its own units"
     computer.stages.append(Stage("sense", "The state as the law sees it.", ("in.x",), lambda given, x: {"now.x": x}))
 

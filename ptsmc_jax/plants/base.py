@@ -71,6 +71,10 @@ class Plant(ABC):
         """The part of a state that sensors can see: the state of the nominal model, of most plants all of it."""
         return x
 
+    def to_plan_by(self, model: Any) -> Any:
+        """The plant by whose input a motion is planned: the law's model where states that it does not know act."""
+        return self
+
     def with_hidden_at_rest(self, visible: Any) -> Any:
         """The state with this visible part, and the rest of it at rest."""
         return visible

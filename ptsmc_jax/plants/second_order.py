@@ -139,6 +139,10 @@ class HiddenSystem(System):
         """x_1 and x_2."""
         return x[: 2 * self.inputs]
 
+    def to_plan_by(self, model: Any) -> Any:
+        """The model: an input that acts through z alone is none for x_2' at once."""
+        return model
+
     def with_hidden_at_rest(self, visible: Float[Array, " twice"]) -> Float[Array, " whole"]:
         """The state of these x_1 and x_2, with z at z0."""
         return jnp.append(visible, self.z0)

@@ -136,7 +136,7 @@ def _reference(parts: Parts, ask: _Asked) -> None:
 
 def _sensors(parts: Parts, ask: _Asked) -> None:
     own, zero = parts.sensors.own, jnp.zeros(())
-    x = parts.controller.align(parts.initial, parts.reference(zero))
+    x = parts.controller.align(parts.plant.visible(parts.initial), parts.reference(zero))
     memory = ask("begin", own.begin, x)
     period = jnp.asarray(parts.period)
     returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
@@ -164,6 +164,9 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
             raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
         if not np.all(np.isfinite(value)):
             raise ask.refused("at", "parts with numbers that are not finite", "finite ones")
+    values = own.values(c)
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
+        raise ask.refused("values", _described(values), "a dict of numbers by name")
     for name, value in ask("values", own.values, c).items():
         ask.check("values", f"a number {name}", value, ())
         if name in taken:
@@ -177,14 +180,17 @@ def _observer(parts: Parts, ask: _Asked) -> None:
     kept = ask("step", observer.step, memory, jnp.zeros(m), period, period)
     ask.same_memory("step", memory, kept)
     ask.check("estimate", "an estimate", ask("estimate", observer.estimate, kept), (m,))
-    ask.check("error_bound", "a bound", ask("error_bound", observer.error_bound().__call__, period), ())
+    bound = observer.error_bound()
+    if not callable(bound):
+        raise ask.refused("error_bound", _described(bound), "a function of t, see observers.base.Bound")
+    ask.check("error_bound", "a bound", ask("error_bound", bound.__call__, period), ())
 
 
 def _law(parts: Parts, ask: _Asked) -> None:
     law: Any = parts.controller
     zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
     target = parts.reference(zero)
-    x = law.align(parts.initial, target)
+    x = law.align(parts.plant.visible(parts.initial), target)
     now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.period))
     k2, memory = parts.observer.error_bound()(zero), ask("begin", law.begin)
     methods = {

@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, Literal
 
+from ptsmc_jax.scenario.errors import ScenarioError, show
 from ptsmc_jax.scenario.own import Code, Own, build
 from ptsmc_jax.scenario.values import Kinds, Table
 
@@ -31,6 +32,7 @@ class OwnSensors(Own, Table, kw_only=True, frozen=True):
         from ptsmc_jax.numerics.pytrees import vector
 
         made = build(self, model=model)
+        _check_count(made, "sensors", "draws", 0)
         type(made).tunable = tuple(name.removeprefix(self.prefix) for name in self.gains)
         return Physics(made, vector(1.0))
 
@@ -54,4 +56,22 @@ class OwnDraw(Own, Table, kw_only=True, frozen=True):
 
     def build(self) -> Any:
         """What the code names."""
-        return build(self)
+        from ptsmc_jax.numerics.draws import DISTRIBUTIONS
+
+        made = build(self)
+        _check_count(made, "dispersion.own", "count", 1)
+        if made.drawn not in DISTRIBUTIONS:
+            raise _unfit(made, "dispersion.own", "drawn", '"normal" or "uniform"')
+        return made
+
+
+def _check_count(made: Any, table: str, field: str, least: int) -> None:
+    """Raise ScenarioError where a class says no whole number of what is drawn for it."""
+    value = getattr(made, field)
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise _unfit(made, table, field, f"a whole number of at least {least}")
+
+
+def _unfit(made: Any, table: str, field: str, must: str) -> ScenarioError:
+    names = f"{table}.code names a class whose {field} is {show(getattr(made, field))}"
+    return ScenarioError(f"{names}, but must be {must}")

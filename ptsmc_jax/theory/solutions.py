@@ -74,8 +74,9 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     For attitudes 1 - |v|^2, the square of the scalar part, stands for the clearance; at or below 0 there is no path.
     """
     motion = parts.controller.exact_motion(t, parts.reference(t), parts.initial, starts(parts))
-    d = parts.disturbance(t, motion.x)
-    return parts.plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
+    d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
+    plant = parts.plant.to_plan_by(parts.controller.model)
+    return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
 
 
 def visited(parts: Setup, points: int = 64) -> tuple[Array, Any]:

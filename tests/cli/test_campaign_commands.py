@@ -195,6 +195,9 @@ def test_trials_until_the_share_is_known(command, tmp_path):
     again = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
     assert again[0] == 1
     assert summary(tmp_path / FOLDER)["flown"] == 400
+    command("montecarlo", "s.toml", "--trials", 600, "--no-figures")
+    command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
+    assert summary(tmp_path / FOLDER)["flown"] == 600  # what was flown besides counts
 
 
 def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):

@@ -451,6 +451,16 @@ def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
         main.main()
 
 
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(command, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tuning.studies.single.write", full)
+    before = tree(tmp_path)
+    assert command("simulate", "s.toml", "--no-figures") == (2, "", "ptsmc: No space left on device\n")
+    assert tree(tmp_path) == before
+
+
 def test_figures_only_where_wanted_and_force_keeps_what_is_not_ours(command, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")

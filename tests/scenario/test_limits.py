@@ -90,3 +90,5 @@ def test_a_page_says_the_share_of_what_decides():
 
     assert told(0.75) == "; the trial that decides is at 0.45, 90 % of the limit"
     assert told(None) == "; the worst is 140 % of the limit"
+    of_time = {"margin": 0.2, "limit": 0.02, "quantile": 0.9, "trials": 50, "share_of_time": 0.98}
+    assert page._distance(of_time) == "; beyond the limit for 20 % of the time that it may be"

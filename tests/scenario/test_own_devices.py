@@ -228,6 +228,7 @@ SEES = [
     ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
+    ("draws = 2\n    sigma", "draws = 2.5\n    sigma", "draws is 2.5, but must be a whole number of at least 0"),
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
 ]
 DRAWS = [
@@ -239,6 +240,9 @@ DRAWS = [
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
+    ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
+    ("count = 2", "count = 0", "count is 0, but must be a whole number of at least 1"),
+    ("count = 2", "count = 2\n    drawn = 'gaussian'", 'drawn is "gaussian", but must be "normal" or "uniform"'),
 ]
 
 

@@ -10,11 +10,13 @@ from scipy.linalg import expm
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
+from ptsmc_jax.onboard import board
 from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import linear, margins, run_margins
+from ptsmc_jax.theory import linear, margins, run_margins, solutions
+from tuning.studies import stability
 
 FILE = """
 import jax.numpy as jnp
@@ -102,6 +104,21 @@ def test_trials_of_a_truth_with_hidden_states():
     by_hand = replace(ready.parts, initial=jnp.array([flown.drawn["initial_x1"][2], -0.2, 0.1]))
     again = rollout.simulate_jit(by_hand, 0, 2).metrics
     np.testing.assert_allclose(flown.metrics.window_error[2], again.window_error, rtol=1e-12)
+
+
+def test_what_plans_reads_and_exports_a_truth_with_hidden_states_knows_nothing_of_them():
+    """The input along the exact motion is the model's; names and what the C reads are of what sensors see."""
+    law = {"t_f": 5.0, "delta": 1.0}
+    parts, known = (
+        scenario.study(scenario.from_tables({**tables, "controller": law})).parts
+        for tables in (HIDDEN, {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:known"}})
+    )
+    for t in (0.0, 2.0):
+        planned, expected = (solutions.exact_input(one, jnp.asarray(t))[0] for one in (parts, known))
+        np.testing.assert_allclose(planned, expected, rtol=1e-12)
+    ready = scenario.study(scenario.from_tables({**HIDDEN, "controller": law}))
+    assert stability.names(ready)[1] == ["x1", "x2"]
+    assert board.board(parts).inputs["x"].shape == (2,)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_a_limit_that_may_be_left_at_times_is_told_apart(interpretation, outcome
 
 def test_a_failed_trial_has_no_share_of_time():
     told = campaign_summary._of_share(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
-    assert (told["min"], told["max"], told["without_value"]) == (0.5, 0.9, 1)
+    assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)
     assert (told["0.0027"]["value"], told["0.1"]["value"], told["0.5"]["value"]) == (0.0, 0.0, 0.8)
     shares, ended = np.linspace(0.0, 1.0, 200), np.arange(200) % 50 > 0
     told, mirrored = campaign_summary._of_share(shares, ended), campaign_summary._of_metric(1.0 - shares, ended)

@@ -329,7 +329,8 @@ def main() -> None:
         print("ptsmc: interrupted; nothing was written", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
-        _fail(f"{error.strerror or error}: {error.filename}")
+        where = "" if error.filename is None else f": {error.filename}"  # of a full disk it is not known
+        _fail(f"{error.strerror or error}{where}")
     finally:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled

@@ -247,6 +247,8 @@ def _distance(verdict: dict[str, Any]) -> str:
     margin = verdict["margin"]
     if margin is None or margin != margin or verdict.get("at_least") or verdict["limit"] == 0.0:
         return ""
+    if verdict.get("share_of_time") is not None:
+        return f"; beyond the limit for {sentences.ratio(100 * margin)} % of the time that it may be"
     share = f"{sentences.ratio(100 * margin)} % of the limit"
     if verdict.get("quantile") is None or verdict["trials"] == 1:
         return f"; {'the worst' if verdict['trials'] > 1 else 'that'} is {share}"

@@ -37,7 +37,8 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
     Looked at after each doubling. The intervals are those of a campaign whose size was fixed beforehand: looking
     often, and stopping by what is seen, makes them a little too sure.
     """
-    count = min(flying.PART, folder.trials)
+    there = sum(part.count for part in folder.rows.parts()[0])  # of a campaign that goes on none is left out
+    count = min(max(flying.PART, there), folder.trials)
     while True:
         fly_first(count)
         intervals = [verdict["share_interval"] for verdict in judged(folder, first=count)]
@@ -184,8 +185,7 @@ def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     """
     kept = np.where(finished & np.isfinite(values), values, 0.0)
     entry, ordered = _of_metric(values, finished), np.sort(-kept)
-    if "max" in entry:
-        entry["min"] = values[finished & np.isfinite(values)].min()
+    entry["min"] = kept.min()
     for quantile in QUANTILES:
         del entry[str(quantile)]
         low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)

@@ -73,7 +73,7 @@ def names(ready: Study) -> tuple[list[str], list[str]]:
     plant = ready.parts.plant
     if plant.attitude:
         return list("xyz"), [f"{what} {axis}" for what in ("attitude", "rate") for axis in "xyz"]
-    size = np.asarray(ready.parts.initial).size
+    size = np.asarray(plant.visible(ready.parts.initial)).size
     return [f"u{k + 1}" for k in range(plant.inputs)], [f"x{k + 1}" for k in range(size)]
 
 
