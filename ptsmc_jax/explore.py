@@ -166,7 +166,7 @@ def trials(
     ready = _ready(what)
     if isinstance(count, pl.DataFrame):
         names = campaign.Campaign(ready, seed, own).own_names()
-        plan = plans.checked(count, ready.parts, own=names)
+        plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
         return campaign.of_plan(ready, seed, plan, own).fly(range(plan.count))
     _check_whole_number("count", count, 1)
     return campaign.Campaign(ready, seed, own).fly(range(count))

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -71,6 +72,13 @@ class Dispersion:
     def varies(self) -> bool:
         """Whether anything differs from trial to trial."""
         return bool(self.kinds)
+
+    def own_names(self) -> tuple[str, ...]:
+        """Names of the numbers that draws of one's own say of a trial."""
+        if self.own is None:
+            return ()
+        numbers = jax.ShapeDtypeStruct((self.own.count,), jnp.result_type(float))
+        return tuple(jax.eval_shape(self.own.values, numbers))
 
     @property
     def kinds(self) -> dict[str, Any]:

@@ -85,18 +85,22 @@ class Flexible(Table, frozen=True):
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
     def check_drawn(self, inertia: Any, drawn: dispersion_tables.Dispersion | None) -> None:
-        """Refuse draws of couplings that no body can have; inertia: of the body that flies [kg m^2].
+        """Refuse draws of couplings and inertias that no body can have; inertia: of the body that flies [kg m^2].
 
         Rows are at most f times as long and moments at least s times as large, so that every draw leaves at least
         s J - f^2 D'D. Axes that are turned besides are not looked at.
         """
         rows, moments = (getattr(drawn, key, None) for key in ("mode_coupling", "inertia"))
-        if rows is None or rows.nothing:
+        longest = smallest = 1.0
+        said, body = "", ""
+        if moments is not None and moments.std > 0.0:
+            smallest = 1.0 - moments.farthest * moments.std
+            said, body = f"dispersion.inertia.std is {moments.std}", f", and moments {smallest:.6g} times as large"
+        if rows is not None and not rows.nothing:
+            longest = 1.0 + rows.farthest * float(rows.of()[0])
+            said = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
+        if not said:
             return
-        longest = 1.0 + rows.farthest * float(rows.of()[0])
-        smallest = 1.0 if moments is None else 1.0 - moments.farthest * moments.std
-        body = "" if moments is None else f", and moments {smallest:.6g} times as large"
-        said = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
         try:
             formulas.rest_inertia(smallest * formulas.check_inertia(inertia), longest * np.asarray(self.coupling))
         except ValueError as error:

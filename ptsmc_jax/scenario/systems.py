@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ptsmc_jax import configure
 
@@ -26,7 +26,18 @@ ALLOWED = f"{WHERE}, a system made with plants.system"
 
 LONGEST = 4096  # characters of a path, on Linux
 
-_ran: dict[tuple[str, str], ModuleType] = {}  # files by path and SHA-256: what has changed is run anew
+OURS = ("ptsmc_jax", "tuning")  # packages that no folder of one's own has helpers of the name of
+
+
+class _Ran(NamedTuple):
+    """A file that was run."""
+
+    module: ModuleType
+    helpers: dict[str, str]  # files beside it that were imported, by path: their SHA-256
+
+
+_ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
+_helpers: dict[str, tuple[str, str]] = {}  # modules that the last ones imported from beside them: path and SHA-256
 
 
 def named(where: str, allowed: str) -> tuple[str, str]:
@@ -128,21 +139,31 @@ def _home(place: str) -> str:
 
 @contextlib.contextmanager
 def _importing_from(folder: str) -> Iterator[None]:
+    written, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a copy hides a change within the same second
     sys.path.insert(0, folder)
     try:
         yield
     finally:
         sys.path.remove(folder)
+        sys.dont_write_bytecode = written
 
 
 def _run(path: Path, content: bytes) -> ModuleType:
-    """The file as a module of a name of its own; two files with one name do not meet.
+    """The file as a module of a name of its own; two files with one name do not meet, nor do those that they import.
 
     What is run is what was read and can be read: no compiled copy from a __pycache__ that came with it.
     """
     known = os.path.realpath(path), hashlib.sha256(content).hexdigest()
-    if known in _ran:
-        return _ran[known]
+    ran = _ran.get(known)
+    if ran is not None and all(_sha(file) == sha for file, sha in ran.helpers.items()):
+        return ran.module
+    home = _home(str(path))
+    if not all(file.startswith(home + os.sep) and _sha(file) == sha for file, sha in _helpers.values()):
+        for name in _helpers:  # all: one may have imported another
+            sys.modules.pop(name, None)
+        _helpers.clear()
+        importlib.invalidate_caches()
+    before = set(sys.modules)
     unique = hashlib.sha256("".join(known).encode(errors="surrogateescape")).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(f"_ptsmc_jax_{path.stem}_{unique}", path)
     assert spec is not None
@@ -154,5 +175,29 @@ def _run(path: Path, content: bytes) -> ModuleType:
     except BaseException:
         del sys.modules[spec.name]
         raise
-    _ran[known] = module
+    _helpers.update(_beside(home, before))
+    _ran[known] = _Ran(module, dict(_helpers.values()))
     return module
+
+
+def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str]]:
+    """The modules from a folder that were not there before: path and SHA-256 by name."""
+    found = {}
+    for name in set(sys.modules) - before:
+        top, file = name.partition(".")[0], getattr(sys.modules[name], "__file__", None)
+        if (
+            file
+            and top not in OURS
+            and top not in before
+            and os.path.realpath(file).startswith(os.path.join(home, top))
+        ):
+            found[name] = os.path.realpath(file), _sha(file)
+    return found
+
+
+def _sha(file: str) -> str:
+    """SHA-256 of a file; empty where it is gone."""
+    try:
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    except OSError:
+        return ""

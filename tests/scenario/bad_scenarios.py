@@ -295,6 +295,11 @@ BAD = [
         "dispersion.mode_coupling.half_width is 0.99, but with rows 1.99 times those of flexible.coupling, as may be",
         "must be positive definite (its smallest principal moment is -25.6409 kg m^2)",
     ),
+    (
+        FLEXIBLE + "dispersion.inertia = { std = 0.3 }",
+        "dispersion.inertia.std is 0.3, but with rows 1 times those of flexible.coupling, and moments 0.1 times",
+        "must be positive definite",
+    ),
     (  # (1 + 3 * 0.02)^2 9 > 10
         FLEXIBLE + "dispersion.mode_coupling = { std = 0.02 }",
         "dispersion.mode_coupling.std is 0.02, but with rows 1.06 times those of flexible.coupling",

@@ -190,6 +190,9 @@ def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here)
     rows = ptsmc.trials(scenario.from_tables(tables), 40, seed=2)
     assert rows["drift"].n_unique() == 40
     np.testing.assert_allclose(rows["drift"][5], 1.0 + 0.1 * float(c[0]), rtol=1e-12)
+    plan = rows[3:9].select("trial", "drift", "window_error")  # rows are a plan: `trial` says the draws
+    again = ptsmc.trials(scenario.from_tables(tables), plan, seed=2)
+    np.testing.assert_array_equal(again["drift"], rows["drift"][3:9])
     text = "\n".join([
         'plant = { kind = "chain", order = 2, x0 = [1.0, 0.0] }',
         'controller = { kind = "pd", k_p = 2.0, k_d = 2.0, t_f = 5.0 }',

@@ -11,10 +11,11 @@ import pytest
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from tests.helpers import ROOT, SHORT, small_search
+from tests.helpers import ROOT, SHORT, small_search, vector
 from tests.scenario.bad_scenarios import check_sentence
 from tuning.search import gains
 
@@ -412,3 +413,32 @@ def test_fields_of_a_class_that_it_is_derived_from_are_keys_too(here):
     whole = reading.complete(scenario.from_tables({**CHAIN, "controller": {**MINE, "eta": 2.5}}))
     assert set(whole.controller.gains) == {"eta", "delta", "k1", "t_f"}
     assert scenario.study(whole).parts.controller.eta == 2.5
+
+
+def test_what_files_import_from_beside_them_is_of_their_own_folder_and_as_it_is_now(tmp_path):
+    """Two folders with a helper of one name, then the helper changed: by the acceleration that the law asks for."""
+    law = "import helper\n" + HEAD + LAW.replace("return 0.5 * wanted", "return helper.K * wanted")
+    for folder, k in (("a", 1.0), ("b", 3.0)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(law)
+        (tmp_path / folder / "helper.py").write_text(f"K = {k}\n")
+
+    def asked(folder):
+        table = {**MINE, "code": f"{tmp_path / folder / 'mine.py'}:Mine"}
+        parts = scenario.study(scenario.from_tables({**CHAIN, "controller": table})).parts
+        now = Sample(jnp.zeros(()), jnp.asarray(False), jnp.asarray(0.1))
+        return float(parts.controller.acceleration(now, vector([1.0]), vector([0.2]), jnp.asarray(0.1))[0][0])
+
+    one = asked("a")
+    assert asked("b") == pytest.approx(3.0 * one, rel=1e-12)
+    assert asked("a") == one
+    (tmp_path / "a" / "helper.py").write_text("K = 2.0\n")
+    assert asked("a") == pytest.approx(2.0 * one, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["observer_rate", "sensors_x", "filter_bandwidth"])
+def test_a_law_has_no_gain_of_the_name_of_another_parts(here, name):
+    gain = f"{name}: float = ptsmc.gain(1.0, (0.5, 2.0))\n    width: float"
+    (here / "mine.py").write_text(HEAD + LAW.replace("width: float", gain))
+    with pytest.raises(ScenarioError, match=f"the name of its gain {name} stands for one of another part"):
+        scenario.study(scenario.from_tables({**CHAIN, "controller": MINE}))
