@@ -9,7 +9,7 @@ LAW = {"t_f": 5.0, "delta": 0.5}
 NOISE = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
 MISFITS = {**SPREAD, "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
-           "wheel_failure": {"kind": "uniform", "latest": 4.0}}  # fmt: skip
+           "wheel_failure": {"kind": "uniform", "latest": 4.0}, "timing_jitter": {"largest": 0.3}}  # fmt: skip
 FULL = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
 OWN = f"{ROOT / 'scenarios' / 'own_parts.py'}:"
 PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
@@ -30,7 +30,8 @@ CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, -0.2]}, "loop": LOOP
 FLIGHTS: dict[str, dict[str, Any]] = {
     "raw": flight(),
     "filter": flight(**FILTER),
-    "wheels": flight(**FILTER, wheels={"torque_limit": 2.0}, spacecraft={"inertia": FULL}, dispersion=MISFITS),
+    "wheels": flight(**FILTER, wheels={"torque_limit": 2.0, "momentum_limit": 2.0}, spacecraft={"inertia": FULL},
+                     dispersion=MISFITS),
     "chain": CHAIN,
     "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
                              reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
