@@ -49,6 +49,7 @@ class Period(NamedTuple):
     now: Ticks
     dt_before: Scalar  # length of the one before [s]
     matrix: Array  # `Observer.update_matrix` of that length
+    whole: Scalar  # length of a whole one [s]
     star_x: Any = None  # `star_state` of the one before
 
     @property
@@ -56,12 +57,10 @@ class Period(NamedTuple):
         """Length of the control period [s]."""
         return self.now.t_next - self.now.t
 
-    def told(self, period: Scalar) -> Scalar:
-        """The length [s] that flight software goes by: it does not know that the run ends within its last period.
-
-        period: a whole one [s].
-        """
-        return jnp.where((self.now.noise_weight < 1.0) & (self.length > 0.0), self.length, period)
+    @property
+    def told(self) -> Scalar:
+        """The length [s] that flight software goes by: it does not know that the run ends within its last period."""
+        return jnp.where((self.now.noise_weight < 1.0) & (self.length > 0.0), self.length, self.whole)
 
 
 class Software(NamedTuple):
@@ -82,7 +81,7 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
 
     def period_of(tick: tuple) -> Period:
         now, dt_before, partial = tick
-        return Period(now, dt_before, jnp.where(partial, first_matrix, matrix))
+        return Period(now, dt_before, jnp.where(partial, first_matrix, matrix), parts.period)
 
     first = jax.tree.map(lambda v: v[jnp.argmax(lengths > 0.0)], ticks)
     return (ticks, length_before, partial_before), period_of, first
@@ -126,7 +125,7 @@ def command(
 ) -> tuple[Array, Array, Any]:
     """The law's torque (m,) [N m], its sliding variable and its memory."""
     now = period.now
-    sample = Sample(now.t, now.hold, period.told(parts.period))
+    sample = Sample(now.t, now.hold, period.told)
     u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
     return u, s, guards.select(period.length > 0.0, memory, computer.law)
 
@@ -154,7 +153,7 @@ def decide(
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
     command_filter = computer.command_filter
     if parts.command_filter is not None:
-        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.told(parts.period))
+        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.told)
         command_filter = guards.select(period.length > 0.0, command_filter, computer.command_filter)
     decision = Decision(target, d_hat, u, s, parts.observer.model.velocity(seen))
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)
