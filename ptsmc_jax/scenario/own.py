@@ -131,12 +131,10 @@ def read(table: Any, name: str, code: object) -> Any:
         raise ScenarioError(f"{name}.code is {shown}: {error}") from None
 
 
-_PREFIXES = ("observer_", "sensors_")  # of the gains that observers and sensors have
-_OF_FILTERS = ("filter_bandwidth", "command_corner")
-
-
 @functools.lru_cache(maxsize=256)
 def _with_keys(table: Any, found: Any) -> Any:
+    from ptsmc_jax.simulation.gains import of_law
+
     base = table.base()
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
@@ -161,7 +159,7 @@ def _with_keys(table: Any, found: Any) -> Any:
         if gain is not None and not table.tuned:
             raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
         if gain is not None:
-            if not table.prefix and (field.name.startswith(_PREFIXES) or field.name in _OF_FILTERS):
+            if not table.prefix and not of_law({field.name: gain}):
                 raise ValueError(f"the name of its gain {field.name} stands for one of another part")
             if table.prefix + field.name == "observer_gain":
                 raise ValueError("the name of its gain must be another than gain, which has a number for each axis")

@@ -164,10 +164,10 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
             raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
         if not np.all(np.isfinite(value)):
             raise ask.refused("at", "parts with numbers that are not finite", "finite ones")
-    values = own.values(c)
+    values = ask("values", own.values, c)
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ask.refused("values", _described(values), "a dict of numbers by name")
-    for name, value in ask("values", own.values, c).items():
+    for name, value in values.items():
         ask.check("values", f"a number {name}", value, ())
         if name in taken:
             raise ask.refused("values", f"a number {name}", "names that no column of the rows has")

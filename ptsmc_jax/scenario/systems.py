@@ -33,11 +33,13 @@ class _Ran(NamedTuple):
     """A file that was run."""
 
     module: ModuleType
-    helpers: dict[str, str]  # files beside it that were imported, by path: their SHA-256
+    helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
 _ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
-_helpers: dict[str, tuple[str, str]] = {}  # modules that the last ones imported from beside them: path and SHA-256
+_helpers: dict[
+    str, tuple[str, str | None]
+] = {}  # modules that the last ones imported from beside them: path and SHA-256
 
 
 def named(where: str, allowed: str) -> tuple[str, str]:
@@ -117,10 +119,7 @@ def digest(where: object) -> str | None:
         except (Exception, SystemExit):  # which `item` says
             spec = None
         file = None if spec is None else spec.origin
-    try:
-        return None if not file else hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    except (OSError, ValueError):
-        return None
+    return _sha(file) if file else None
 
 
 def _content(path: Path) -> bytes:
@@ -175,29 +174,25 @@ def _run(path: Path, content: bytes) -> ModuleType:
     except BaseException:
         del sys.modules[spec.name]
         raise
-    _helpers.update(_beside(home, before))
+    finally:
+        _helpers.update(_beside(home, before))
     _ran[known] = _Ran(module, dict(_helpers.values()))
     return module
 
 
-def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str]]:
+def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
     """The modules from a folder that were not there before: path and SHA-256 by name."""
     found = {}
     for name in set(sys.modules) - before:
-        top, file = name.partition(".")[0], getattr(sys.modules[name], "__file__", None)
-        if (
-            file
-            and top not in OURS
-            and top not in before
-            and os.path.realpath(file).startswith(os.path.join(home, top))
-        ):
-            found[name] = os.path.realpath(file), _sha(file)
+        top, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
+        if top not in OURS and top not in before and file.startswith(os.path.join(home, top)):
+            found[name] = file, _sha(file)
     return found
 
 
-def _sha(file: str) -> str:
-    """SHA-256 of a file; empty where it is gone."""
+def _sha(file: str) -> str | None:
+    """SHA-256 of a file; None where it cannot be read."""
     try:
         return hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    except OSError:
-        return ""
+    except (OSError, ValueError):
+        return None

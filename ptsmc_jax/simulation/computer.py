@@ -60,7 +60,8 @@ class Period(NamedTuple):
     @property
     def told(self) -> Scalar:
         """The length [s] that flight software goes by: it does not know that the run ends within its last period."""
-        return jnp.where((self.now.noise_weight < 1.0) & (self.length > 0.0), self.length, self.whole)
+        starts = jnp.where(self.now.noise_weight < 1.0, self.length, self.whole)
+        return jnp.where(self.length > 0.0, starts, 0.0)
 
 
 class Software(NamedTuple):
@@ -124,10 +125,11 @@ def command(
     parts: Parts, k2: Bound, period: Period, computer: Computer, seen: Any, target: Any, d_hat: Array
 ) -> tuple[Array, Array, Any]:
     """The law's torque (m,) [N m], its sliding variable and its memory."""
-    now = period.now
-    sample = Sample(now.t, now.hold, period.told)
+    now, has_length = period.now, period.length > 0.0
+    # a length that one may divide by, also in a period that has none
+    sample = Sample(now.t, now.hold, jnp.where(has_length, period.told, period.whole))
     u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
-    return u, s, guards.select(period.length > 0.0, memory, computer.law)
+    return u, s, guards.select(has_length, memory, computer.law)
 
 
 def decide(

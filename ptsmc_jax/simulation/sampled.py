@@ -125,8 +125,9 @@ class _Loop(NamedTuple):
         decision, computer = self.software.decide(
             parts, self.k2, period, computer, parts.plant.visible(state.x), hardware.actuators
         )
-        told = jnp.where(dt > 0.0, period.told, 0.0)  # what limits of the wheels' momentum go by
-        drive, queue = actuators.command(hardware.actuators, decision.u, decision.w, now.t, told, now.noise_weight)
+        drive, queue = actuators.command(
+            hardware.actuators, decision.u, decision.w, now.t, period.told, now.noise_weight
+        )
         if decision.channels is not None:
             drive = drive._replace(c=decision.channels)
         walk = hardware.walk

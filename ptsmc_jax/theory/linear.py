@@ -115,7 +115,7 @@ def _computed(
     actuators, dt = parts.effective_actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     model = carry.model._replace(h=carry.acting.h)
-    drive, queue = actuators.command(model, decision.u, decision.w, period.now.t, dt, period.now.noise_weight)
+    drive, queue = actuators.command(model, decision.u, decision.w, period.now.t, period.told, period.now.noise_weight)
     computer = computer._replace(applied=assumed_torque(actuators, drive, dt))
     return decision, computer, actuators.end(model, drive, queue, dt)._replace(h=None)
 

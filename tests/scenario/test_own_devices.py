@@ -244,6 +244,7 @@ DRAWS = [
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
+    ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),
     ("count = 2", "count = 0", "count is 0, but must be a whole number of at least 1"),
     ("count = 2", "count = 2\n    drawn = 'gaussian'", 'drawn is "gaussian", but must be "normal" or "uniform"'),
 ]

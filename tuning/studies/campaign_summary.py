@@ -168,14 +168,8 @@ def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     In the quantiles a trial without a value counts as beyond all others: it is not left out.
     """
     has = finished & np.isfinite(values)
-    known, ordered = values[has], np.sort(np.where(has, values, np.inf))
-    entry: dict[str, Any] = {"without_value": int(values.size - known.size)}
-    if known.size:
-        entry |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
-    for quantile in QUANTILES:
-        low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
-        entry[str(quantile)] = {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
-    return entry
+    ordered = np.sort(np.where(has, values, np.inf))
+    return _of_known(values, has) | {str(quantile): _at(ordered, quantile) for quantile in QUANTILES}
 
 
 def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
@@ -183,14 +177,28 @@ def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
 
     A trial without a value counts as 0. "0.0027" is what 99.73 % of the trials reach.
     """
-    kept = np.where(finished & np.isfinite(values), values, 0.0)
-    entry, ordered = _of_metric(values, finished), np.sort(-kept)
-    entry["min"] = kept.min()
+    has = finished & np.isfinite(values)
+    ordered = np.sort(-np.where(has, values, 0.0))  # the best first
+    entry = _of_known(values, has) | {"min": -ordered[-1]}
     for quantile in QUANTILES:
-        del entry[str(quantile)]
-        low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
-        entry[f"{1.0 - quantile:g}"] = {"value": -statistics.value_at(ordered, quantile), "low": -high, "high": -low}
+        at = _at(ordered, quantile)
+        entry[f"{1.0 - quantile:g}"] = {"value": -at["value"], "low": -at["high"], "high": -at["low"]}
     return entry
+
+
+def _of_known(values: np.ndarray, has: np.ndarray) -> dict[str, Any]:
+    """Statistics of the trials that have a value."""
+    known = values[has]
+    entry: dict[str, Any] = {"without_value": int(values.size - known.size)}
+    if known.size:
+        entry |= {"mean": known.mean(), "rms": np.sqrt(np.mean(known**2)), "max": known.max()}
+    return entry
+
+
+def _at(ordered: np.ndarray, quantile: float) -> dict[str, float]:
+    """A quantile with its interval."""
+    low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
+    return {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
 
 
 def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> None:
