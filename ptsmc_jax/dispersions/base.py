@@ -56,10 +56,16 @@ class Quantity(NamedTuple):
     write: Callable[[Parts, Numbers], Parts]
     checked: Checked = lambda rows: rows  # numbers (rows, n) of a plan -> as they are flown; raises UnfitError
     check_with: Callable[[Given, Parts], None] = lambda given, parts: None  # raises it where others forbid them
+    unit: str | tuple[str, ...] = "-"  # a spacecraft's, of all its numbers or of each
 
 
 def of_field(
-    part: str, key: str, columns: list[str], nominal: Sequence[float] = (), checked: Checked = lambda rows: rows
+    part: str,
+    key: str,
+    columns: list[str],
+    nominal: Sequence[float] = (),
+    checked: Checked = lambda rows: rows,
+    unit: str = "-",
 ) -> Quantity:
     """The quantity that one field of a part holds, such as `rate_scale` of `sensors`.
 
@@ -69,6 +75,7 @@ def of_field(
         columns: names of its numbers (n,) [SI units].
         nominal: the numbers where the field is None.
         checked: see `Quantity`.
+        unit: likewise.
     """
 
     def read(parts: Parts) -> Numbers:
@@ -78,7 +85,8 @@ def of_field(
     def write(parts: Parts, numbers: Numbers) -> Parts:
         return replace(parts, **{part: replace(getattr(parts, part), **{key: numbers})})
 
-    return Quantity(lambda parts: columns if hasattr(getattr(parts, part), key) else [], read, write, checked)
+    there = Quantity(lambda parts: columns if hasattr(getattr(parts, part), key) else [], read, write)
+    return there._replace(checked=checked, unit=unit)
 
 
 def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:

@@ -121,7 +121,7 @@ OF_MISFITS: dict[str, Quantity] = {
         ),
     ),
     "star_tracker_misalignment": of_field(
-        "sensors", "misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3
+        "sensors", "misalignment", numbered("star_tracker_misalignment_", 3), [0.0] * 3, unit="rad"
     ),
     "gyro_scale": of_field("sensors", "rate_scale", numbered("gyro_scale_", 3), [1.0] * 3),
     "star_tracker_outage": of_field(
@@ -130,12 +130,14 @@ OF_MISFITS: dict[str, Quantity] = {
         _OUTAGE,
         [np.inf, np.inf],
         fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
+        "s",
     )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else _OUTAGE),
     "wheel_failure": Quantity(
         lambda parts: [] if parts.effective_actuators.wheels is None else _FAILURE,
         _failure,
         _with_failure,
         check_with=_check_wheel,
+        unit=("s", "-"),
     ),
     "timing_jitter": Quantity(
         lambda parts: ["timing_jitter"] if parts.clock.sampled else [],
@@ -148,6 +150,7 @@ OF_MISFITS: dict[str, Quantity] = {
         lambda parts: plant_of(parts).frequency,
         lambda parts, frequency: replace(parts, plant=replace(plant_of(parts), frequency=frequency)),
         positive,
+        unit="rad/s",
     ),
     "mode_coupling": Quantity(
         lambda parts: _paired("mode_coupling", _modes(parts)),
@@ -156,6 +159,7 @@ OF_MISFITS: dict[str, Quantity] = {
             parts, plant=replace(plant_of(parts), coupling=rows.reshape(-1, 3)).with_rest_inverse()
         ),
         check_with=_check_coupling,
+        unit="sqrt(kg) m",
     ),
 }
 

@@ -42,12 +42,12 @@ from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
-# of what a trial may have more or less, by one factor: name -> where in the parts it stands
+# of what a trial may have more or less, by one factor: name -> where in the parts it stands, and its unit
 LEVELS = {
-    "attitude_noise": ("sensors", "attitude_noise"),
-    "rate_noise": ("sensors", "rate_noise"),
-    "state_noise": ("sensors", "sigma"),
-    "torque_limit": ("actuators", "torque_limit"),
+    "attitude_noise": ("sensors", "attitude_noise", "rad"),
+    "rate_noise": ("sensors", "rate_noise", "rad/s"),
+    "state_noise": ("sensors", "sigma", ""),
+    "torque_limit": ("actuators", "torque_limit", "N m"),
 }
 
 
@@ -83,7 +83,7 @@ def _inertia_checked(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _of_disturbance(name: str, what: Literal["phase", "amplitude"]) -> Quantity:
+def _of_disturbance(name: str, what: Literal["phase", "amplitude"], unit: str) -> Quantity:
     def read(parts: Parts) -> Numbers:
         return disturbances.values(parts.disturbance, what)
 
@@ -91,11 +91,12 @@ def _of_disturbance(name: str, what: Literal["phase", "amplitude"]) -> Quantity:
         lambda parts: numbered(f"{name}_", read(parts).size),
         read,
         lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, new)),
+        unit=unit,
     )
 
 
 def _level(name: str) -> Quantity:
-    part, key = LEVELS[name]
+    part, key, unit = LEVELS[name]
 
     def value_in(parts: Parts) -> Any:
         return getattr(getattr(parts, part), key, None)
@@ -111,7 +112,7 @@ def _level(name: str) -> Quantity:
         return replace(parts, **{part: replace(device, **{key: new.reshape(value_in(parts).shape)})})
 
     checked = positive if name == "torque_limit" else not_negative
-    return Quantity(columns, lambda parts: jnp.ravel(value_in(parts)), write, checked)
+    return Quantity(columns, lambda parts: jnp.ravel(value_in(parts)), write, checked, unit=unit)
 
 
 # in the order of their columns
@@ -126,11 +127,13 @@ QUANTITIES: dict[str, Quantity] = {
         lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
         lambda parts: parts.initial.w,
         lambda parts, w: replace(parts, initial=parts.initial._replace(w=w)),
+        unit="rad/s",
     ),
     INITIAL_STATE: Quantity(
         lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
         lambda parts: parts.plant.visible(parts.initial),
         lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
+        unit="",
     ),
     REFERENCE: of_field("reference", "q", numbered("reference_q", 4), checked=_unit),
     INERTIA: Quantity(
@@ -138,17 +141,19 @@ QUANTITIES: dict[str, Quantity] = {
         lambda parts: jnp.stack([plant_of(parts).inertia[i, j] for i, j in PAIRS]),
         _with_inertia,
         _inertia_checked,
+        unit="kg m^2",
     ),
-    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase"),
-    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude"),
+    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase", "rad"),
+    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude", "N m"),
     DISTURBANCE_BIAS: Quantity(
         lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
         lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
         lambda parts, bias: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, bias)),
+        unit="N m",
     ),
     **{level(name): _level(name) for name in LEVELS},
     # the gyro's at the first sample, which a sensor draws for itself where none is given: it is read there
-    RATE_BIAS: of_field("sensors", "given_bias", numbered(f"{RATE_BIAS}_", 3), [0.0] * 3),
+    RATE_BIAS: of_field("sensors", "given_bias", numbered(f"{RATE_BIAS}_", 3), [0.0] * 3, unit="rad/s"),
     **OF_MISFITS,
 }
 
@@ -162,3 +167,18 @@ def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
             numbers = quantity.read(parts)
             by_column |= {column: numbers[k] for k, column in enumerate(columns)}
     return by_column
+
+
+def units(parts: Parts) -> dict[str, str]:
+    """Units, "rad" or "-" say, by column of all that these parts fly with, `initial_angle` with it.
+
+    Empty where another plant than a spacecraft has units of its own.
+    """
+    attitude = parts.plant.attitude
+    named = {"initial_angle": "rad" if attitude else "x1"}
+    for quantity in QUANTITIES.values():
+        columns, unit = quantity.columns(parts), quantity.unit
+        each = (unit,) * len(columns) if isinstance(unit, str) else unit[: len(columns)]
+        known = [one if attitude or one in ("rad", "s", "-") else "" for one in each]
+        named |= dict(zip(columns, known, strict=True))
+    return named

@@ -29,7 +29,7 @@ MARKS = {
 
 
 class Column(NamedTuple):
-    """A metric of many trials."""
+    """A metric of many trials, or what was drawn for them."""
 
     unit: str  # empty: it has none
     values: np.ndarray  # (trials,), NaN where a trial has none
@@ -37,7 +37,7 @@ class Column(NamedTuple):
     of_time: str = ""  # where it is asked for in a share of the time: this share, and what is seen of it
 
     def label(self, name: str) -> str:
-        """The metric of this name with its unit."""
+        """This name with its unit."""
         return f"{name} [{self.unit}]" if self.unit else name
 
     def within(self) -> str:
@@ -143,7 +143,7 @@ def torque_by_angle(
 
 @styled
 def inputs(
-    drawn: Mapping[str, np.ndarray],
+    drawn: Mapping[str, Column],
     metrics: Mapping[str, Column],
     outcome: np.ndarray,
     totals: Mapping[str, int],
@@ -155,14 +155,14 @@ def inputs(
     for line, (metric, column) in zip(grid, metrics.items(), strict=True):
         known = column.values[np.isfinite(column.values)]
         for axes, x in zip(line, drawn.values(), strict=True):
-            _points(axes, x, column.values, outcome, totals)
+            _points(axes, x.values, column.values, outcome, totals)
             if column.limit is not None:
                 axes.axhline(column.limit, **LIMIT)
             if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
                 axes.set_yscale("log")
-        line[0].set_ylabel(column.label(metric))
-    for axes, name in zip(grid[-1], drawn, strict=True):
-        axes.set_xlabel(name)
+        line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # longer than a row is high
+    for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):
+        axes.set_xlabel(x.label(name))
         axes.xaxis.set_major_locator(MaxNLocator(4))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=min(len(handles), columns), fontsize=9)

@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.numerics import statistics
 from tuning.output import campaign_terminal
 from tuning.studies import campaign_summary
@@ -16,6 +17,8 @@ class Rows:
     """A campaign of 401 trials, whose torque follows the angle that is drawn."""
 
     own_names = ()
+    scenario = scenarios.from_tables({"dispersion": {"attitude": {"kind": "uniform"}}})
+    ready = scenarios.study(scenario)
     trials = 401
     path = "rows"
 
@@ -36,15 +39,16 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 says what the angle does
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
-                       "percentile": 100.0, "median": 1.0, "rank_correlation": pytest.approx(1.0, rel=1e-12),
+                       "unit": "rad", "percentile": 100.0, "median": 1.0,
+                       "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05)}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    campaign_terminal.why(told)
+    campaign_terminal.why(told, "spacecraft")
     (said,) = capsys.readouterr().out.splitlines()
     assert (
-        said == "peak_torque 4 in trial 400: initial_angle 2 at 100.0 % (median 1)"
+        said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
     )  # the rate is drawn apart from it
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1))
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
     assert "goes with nothing that was drawn" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]

@@ -9,9 +9,10 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices import actuators
-from ptsmc_jax.dispersions import attitudes, base, inertias, numbers, variation
+from ptsmc_jax.dispersions import attitudes, base, inertias, numbers, quantities, variation
 from ptsmc_jax.signals import disturbances, references
 from tests import helpers
 from tests.helpers import chain_parts, short, vector
@@ -436,3 +437,19 @@ def test_the_parts_of_coordinates_are_those_of_the_trial_that_has_them():
     turn = (REFERENCE.inv() * Rotation.from_quat(np.asarray(middle.initial.q))).as_rotvec()
     np.testing.assert_allclose(turn, [math.radians(140.0), 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(middle.initial.w, PARTS.initial.w + np.array([0.0, 0.01, 0.0]), rtol=1e-15)
+
+
+def test_what_trials_fly_with_has_the_units_of_each_column():
+    flight = {
+        "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.5, 0.0, 0.0]]},
+        "loop": {"mode": "sampled"}, "hardware": {"attitude_noise": 1e-5, "torque_limit": 1.0}, "wheels": {},
+    }  # fmt: skip
+    named = quantities.units(scenario.study(scenario.from_tables(flight)).parts)
+    for column, unit in {
+        "initial_angle": "rad", "initial_q4": "-", "initial_w1": "rad/s", "inertia_12": "kg m^2",
+        "disturbance_bias_3": "N m", "attitude_noise": "rad", "wheel_failure_time": "s", "wheel_failure_wheel": "-",
+        "mode_frequency_1": "rad/s", "mode_coupling_11": "sqrt(kg) m", "actuator_scale_1": "-", "timing_jitter": "-",
+    }.items():  # fmt: skip
+        assert named[column] == unit, column
+    chain = quantities.units(chain_parts([1.0, 0.0]))
+    assert (chain["initial_angle"], chain["initial_x2"], chain["disturbance_bias_1"]) == ("x1", "", "")

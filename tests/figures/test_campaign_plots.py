@@ -29,7 +29,10 @@ def test_each_outcome_is_counted_and_drawn():
 def test_the_legend_of_a_narrow_figure_stays_inside_it():
     outcome = np.array([campaign_plots.AT_TIMES, campaign_plots.BEYOND, "ok"], dtype=object)
     x, totals = np.arange(3.0), dict.fromkeys(campaign_plots.MARKS, 1000)
-    figure = campaign_plots.inputs({"x": x}, {"ape_z": campaign_plots.Column("rad", x)}, outcome, totals)
+    figure = campaign_plots.inputs(
+        {"initial_w1": campaign_plots.Column("rad/s", x)}, {"ape_z": campaign_plots.Column("rad", x)}, outcome, totals
+    )
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("initial_w1 [rad/s]", "ape_z\n[rad]")
     figure.draw_without_rendering()
     (legend,) = figure.legends
     assert figure.bbox.x0 <= legend.get_window_extent().x0

@@ -13,7 +13,7 @@ from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, numbers, variation
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation import catalogues, clock, rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.theory import envelopes
 from tests import helpers
@@ -462,7 +462,7 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
         assert len(path) <= evaluate.gradients
 
 
-def test_statistics_count_failures_and_average_the_rest():
+def test_statistics_count_failures_and_average_the_rest(monkeypatch):
     trials = montecarlo.run(problem().parts, SPREAD, 3, np.arange(8))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR
@@ -474,6 +474,10 @@ def test_statistics_count_failures_and_average_the_rest():
     errors = trials.metrics.window_error[trials.ok]
     np.testing.assert_allclose(told["window_error"]["rms"], np.sqrt(np.mean(errors**2)))
     np.testing.assert_allclose(told["peak_torque"]["max"], trials.metrics.peak_torque[trials.ok].max())
+    assert "min" not in told["window_error"]
+    monkeypatch.setattr(catalogues, "LARGER_IS_BETTER", ("window_error",))  # as shares of time are
+    told = tune_files.statistics(trials, "chain")
+    assert told["window_error"]["min"] == errors.min() < told["window_error"]["q01"] < told["window_error"]["median"]
 
 
 def test_the_goal_may_be_t_f_itself_or_another_metric():

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ptsmc_jax.simulation import catalogues
 from tuning.output import pointing_sentences, sentences, terminal
 from tuning.output.cells import Table
 from tuning.output.progress_lines import Bar
@@ -87,11 +88,11 @@ def worst(frame: "pl.DataFrame", by: str, folder: Path, kind: str, *, own_code: 
     terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 
-def why(inputs: list[dict[str, Any]]) -> None:
+def why(inputs: list[dict[str, Any]], kind: str) -> None:
     """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
-    inputs: rows as `campaign_summary.why` makes them.
+    inputs: rows as `campaign_summary.why` makes them; kind: of the plant.
     """
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
@@ -102,11 +103,17 @@ def why(inputs: list[dict[str, Any]]) -> None:
         else:
             rows.sort(key=lambda row: -abs(row["percentile"] - 50.0))
         texts = [
-            f"{row['input']} {row['drawn']:.4g} at {row['percentile']:.1f} % (median {row['median']:.3g})"
+            f"{row['input']} {_of(row['drawn'], row['unit'])} at {row['percentile']:.1f} % (median {row['median']:.3g})"
             for row in rows[:4]
         ]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
-        terminal.say(f"{metric} {value:.4g} in trial {trial}: {', '.join(texts) or nothing}")
+        unit = catalogues.CATALOGUES[kind][metric].unit if metric in catalogues.CATALOGUES[kind] else ""
+        terminal.say(f"{metric} {_of(value, unit)} in trial {trial}: {', '.join(texts) or nothing}")
+
+
+def _of(value: float, unit: str) -> str:
+    """A number with its unit."""
+    return f"{value:.4g} {unit}".rstrip(" -")
 
 
 def _explained(row: dict[str, Any]) -> float:

@@ -13,6 +13,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
 from ptsmc_jax.campaigns import plans, rows, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
@@ -132,6 +133,12 @@ def _drawn(folder: Folder, parts: list[rows.Part]) -> list[str]:
     return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
 
 
+def units(folder: Folder) -> dict[str, str]:
+    """Units of a campaign's metrics and of what was drawn, as far as they are known, by column."""
+    metrics = {name: entry.unit for name, entry in catalogues.CATALOGUES[folder.scenario.plant.kind].items()}
+    return metrics | ({} if folder.ready is None else quantities.units(folder.ready.parts))
+
+
 def _alike(quantiles: dict[str, Any], trials: int) -> list[str]:
     """Whether every trial is the same flight, to round-off."""
     known = [metric for metric in quantiles.values() if "max" in metric]
@@ -236,7 +243,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     Failed trials first, as in `worst`; of inputs that rank the trials alike only the first. Beside each stands how the
     metric goes with it over all trials that end, see `statistics.drivers`; None where so few trials do not show it.
     """
-    parts = folder.whole_parts()
+    parts, unit_of = folder.whole_parts(), units(folder)
     drawn = _drawn(folder, parts)
     frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
     inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
@@ -256,6 +263,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                     "value": float(values[at]),
                     "input": name,
                     "drawn": float(inputs[name][at]),
+                    "unit": unit_of.get(name, ""),
                     "percentile": 100.0 * float(np.mean(inputs[name] <= inputs[name][at])),
                     "median": float(np.median(inputs[name])),
                     **drivers.get(name, {"rank_correlation": None, "first_order": None}),
@@ -309,9 +317,10 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     finished = flying.finished(frame)
     of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
 
+    unit_of = units(folder)
+
     def column(name: str, values: np.ndarray) -> plots.Column:
-        unit = catalogues.CATALOGUES[kind].get(name, ("",))[0]
-        return plots.Column(unit, values, limits.get(name), of_time.get(name, ""))
+        return plots.Column(unit_of.get(name, ""), values, limits.get(name), of_time.get(name, ""))
 
     figures: dict[str, Figure] = {}
     if finished.any():
@@ -338,7 +347,7 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     if strongest:
         inputs = rows.read(parts, strongest)[some]
         figures["inputs"] = plots.inputs(
-            {name: inputs[name].to_numpy() for name in strongest},
+            {name: column(name, inputs[name].to_numpy()) for name in strongest},
             {name: column(name, frame[name].to_numpy()[some].astype(float)) for name in names[:4]},
             outcome[some],
             totals,

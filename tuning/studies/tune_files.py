@@ -41,6 +41,8 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
             "q99": np.quantile(known, 0.99),
             "max": known.max(),
         }
+        if name in catalogues.LARGER_IS_BETTER:  # whose bad end is the other one
+            summary[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
         if known.size < values.size:
             summary[name]["without_value"] = int(values.size - known.size)
         if name in JUDGED:
