@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ptsmc_jax.scenario import reading
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.gains import of_law, of_observer, of_sensors, on_every_axis
@@ -14,6 +15,12 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
 
     All else stays, defaults too. Raises ScenarioError where the scenario must not have them.
     """
+    if "filter_bandwidth" in gains and "filter_bandwidth" not in scenario.estimator.gains:
+        raise ScenarioError(
+            'filter_bandwidth is no gain of this scenario, which has no [filter] of kind "steady_state"'
+        )
+    if "command_corner" in gains and scenario.devices.command_filter is None:
+        raise ScenarioError("command_corner is no gain of this scenario, which has no hardware.command_filter")
     changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
     changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
     changes |= {f"sensors__{name}": value for name, value in of_sensors(gains).items()}

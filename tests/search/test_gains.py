@@ -111,6 +111,14 @@ def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
         assert np.all(np.isfinite(spread(at)))
 
 
+@pytest.mark.parametrize("tables", [{}, {"plant": {"kind": "chain", "order": 2}}], ids=["spacecraft", "chain"])
+@pytest.mark.parametrize("name", ["filter_bandwidth", "command_corner"])
+def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):
+    sampled = from_tables({"loop": {"mode": "sampled"}, **tables})
+    with pytest.raises(ScenarioError, match=f"{name} is no gain of this scenario, which has no"):
+        gains.in_scenario(sampled, {name: 2.0})
+
+
 @pytest.mark.parametrize("kind", short(["nonlinear", "finite_time", "prescribed_time"], ["prescribed_time"]))
 def test_a_chain_and_its_observer_gain_move_too(kind):
     tables = {
