@@ -1,6 +1,6 @@
 """Many trials of one set of parts: in blocks, over all local devices."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -130,7 +130,7 @@ def run(
     parts: Parts,
     dispersion: Dispersion,
     seed: int,
-    trials: np.ndarray | Row,
+    trials: Sequence[int] | np.ndarray | Row,
     block: int | None = None,
     own: OwnMetrics | None = None,
     kernel: bool = False,
@@ -148,8 +148,10 @@ def run(
         block: trials that a device flies at a time; None: `block_size()`.
         own: see `one`.
         kernel: whole runs in one kernel, see `kernel`; on a processor it is interpreted, slowly.
+
+    Raises ValueError where the trials are no such numbers.
     """
-    trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
+    trials = trials if isinstance(trials, Row) else _numbers(trials)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(jax.local_devices())
     block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
@@ -165,6 +167,18 @@ def run(
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
         calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
+
+
+def _numbers(trials: Any) -> np.ndarray:
+    """Numbers of trials, checked: a cast would cut fractions off, count backwards, and fly something else."""
+    numbers = np.asarray(trials)
+    if numbers.ndim != 1 or not numbers.size:
+        raise ValueError(f"trials is of shape {numbers.shape}, but must be the numbers of one trial or more, (N,)")
+    whole = np.issubdtype(numbers.dtype, np.integer)
+    if not whole or numbers.min() < 0 or numbers.max() >= 2**32:
+        said = f"between {numbers.min()} and {numbers.max()}" if whole else f"of type {numbers.dtype}"
+        raise ValueError(f"trials are {said}, but must be whole numbers from 0 to {2**32 - 1}")
+    return numbers.astype(np.uint32)
 
 
 def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:

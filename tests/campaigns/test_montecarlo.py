@@ -52,6 +52,24 @@ def test_any_number_of_trials_is_flown(flown, count):
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("trials", "said"),
+    [
+        (100, r"of shape \(\), but must be the numbers of one trial or more, \(N,\)"),
+        ([], r"of shape \(0,\)"),
+        ([[0, 1]], r"of shape \(1, 2\)"),
+        (np.array([3, -1]), "between -1 and 3, but must be whole numbers from 0 to 4294967295"),
+        ([2**32], "between 4294967296 and 4294967296"),
+        ([1.7], "of type float64"),
+        ([True, False], "of type bool"),
+    ],
+)
+def test_numbers_that_name_no_trials_are_refused(flown, trials, said):
+    """None of them is cut off, or counted from the other end, without a word."""
+    with pytest.raises(ValueError, match=said):
+        montecarlo.run(flown[0], SPREAD, 5, trials)
+
+
 @pytest.mark.long  # campaigns of several calls: `test_campaign.py`
 def test_more_trials_than_one_call_takes(flown, monkeypatch):
     run, trials = flown
