@@ -46,8 +46,9 @@ def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
 
-    Raises ValueError where there is no such gain, and where the parts' anchored clock has too few samples for them, as
-    far as they are known: under a transformation such a run comes back as `unfinished`.
+    Raises ValueError where there is no such gain, where one of the observer's is no single number, and where the parts'
+    anchored clock has too few samples for them, as far as they are known: under a transformation such a run comes back
+    as `unfinished`.
     """
     _check_names(parts, gains)
     gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
@@ -59,6 +60,8 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
     axes = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
     if axes is not None:
+        if any(np.ndim(value) > 0 for value in axes):
+            raise ValueError(f"the observer's gain must be a number; {AXIS}1 and so on name those of its axes")
         parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(axes)))
     if of_sensors(gains):
         own_sensors = replace(parts.sensors.own, **of_sensors(gains))

@@ -119,6 +119,15 @@ def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):
         gains.in_scenario(sampled, {name: 2.0})
 
 
+def test_an_observers_gain_is_a_number_on_every_axis_or_one_for_each():
+    """A list, as in a scenario, made a matrix of three, and a scan of which JAX said that its carry did not fit."""
+    parts = study(from_tables(BASE)).parts
+    with pytest.raises(ValueError, match="must be a number; observer_gain_1 and so on name those of its axes"):
+        gains.with_gains(parts, {"observer_gain": vector(10.0, 10.0, 10.0)})
+    many = jax.vmap(lambda gain: gains.with_gains(parts, {"observer_gain": gain}).observer.gain)(vector(3.0, 4.0))
+    np.testing.assert_array_equal(many, [[3.0] * 3, [4.0] * 3])
+
+
 @pytest.mark.parametrize("kind", short(["nonlinear", "finite_time", "prescribed_time"], ["prescribed_time"]))
 def test_a_chain_and_its_observer_gain_move_too(kind):
     tables = {
