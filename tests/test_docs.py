@@ -248,3 +248,12 @@ def test_examples_in_docstrings_run():
 
 def test_who_cites_this_names_its_version():
     assert f"\nversion: {ptsmc_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.long
+def test_what_the_guide_says_of_a_trial_is_what_is_printed():
+    guide = " ".join((DOCS / "guide.md").read_text().split())
+    said = dict(re.findall(r"`(\w+ at (?:least|most) [^:`]*): ([^`]*)`", guide))
+    printed = [str(v) for v in ptsmc_jax.simulate(ROOT / "scenarios" / "cubesat.toml", trial=7).verdicts]
+    assert said
+    assert {f"{asked}: {found}" for asked, found in said.items()} <= set(printed)
