@@ -35,9 +35,9 @@ flight = ptsmc.replace(
     ptsmc.read("../scenarios/first_flight.toml"),
     controller__eta=2.861,
     controller__delta=0.65,
-    controller__k1=6.64,
+    controller__k1=6.626,
     loop__clock="flight",
-    observer__gain=[1091.0] * 3,
+    observer__gain=[902.5] * 3,
     hardware__rate_bias=1e-6,
     dispersion__rate={"kind": "normal", "std": 0.002},
     dispersion__inertia={"kind": "relative_normal", "std": 0.05, "axes_deg": 1.0},
@@ -84,7 +84,7 @@ Figures({"torque_by_angle": figures["torque_by_angle"]})
 
 # %% [markdown]
 # The five worst trials by window error, with what they flew with: initial angle in rad, true inertia in kg m². As the
-# drivers above say, the angle explains little of it (2 % of the variance): what makes them bad is their noise.
+# drivers above say, the angle explains little of it (4 % of the variance): what makes them bad is their noise.
 
 # %%
 worst = campaign_summary.worst(folder, "window_error", 5)
@@ -104,4 +104,4 @@ again.plot("error", "torque")
 
 # %% [markdown]
 # The verdict, its confidence and the worst case, all from one folder that anyone can fly again: `ptsmc report` makes a
-# page of it. The last notebook is for plants that are no spacecraft.
+# page of it. The next notebook is for plants that are no spacecraft.
