@@ -29,7 +29,7 @@ quiet = ptsmc.replace(flight, hardware=None)
 
 # %% [markdown]
 # One slew with the noise and without it. Both dive at t_f = 35 s; then the quiet one rises to what the disturbance leaves,
-# while the noisy one jumps ten times as high: the last samples before the hand-over are multiplied by gains of
+# while the noisy one jumps five times as high at once: the last samples before the hand-over are multiplied by gains of
 # 2 η²/(δ + h)², with the period h = 0.05 s here 1 800, and what they leave takes seconds to fade.
 
 # %%
@@ -39,7 +39,7 @@ for label, case in {"quiet": quiet, "with noise": flight}.items():
     error = np.sqrt(sum(history[f"error{k}"].to_numpy() ** 2 for k in (1, 2, 3)))
     axes.semilogy(history["t"], np.maximum(error, 1e-9), label=label)
 axes.set(xlabel="time [s]", ylabel="2-norm of the attitude error [-]")
-axes.legend()
+_ = axes.legend()
 
 # %% [markdown]
 # Over 300 attitudes, for the paper's two values of η. The RMS error in the second after t_f grows 30 to 400 times, and the
@@ -59,7 +59,7 @@ for eta in (3.0, 5.0):
         print(f"eta {eta:g}, {label:10s}: RMS error {error:.1e}, mean peak torque {peak:.2f} N m")
 
 # %% [markdown]
-# Handing over earlier wins most of it back: with noise the error falls from 4e-4 to 3e-5 at δ = 0.45 s, 2.4 times the
+# Handing over earlier wins most of it back: with noise the error falls from 4e-4 to 3e-5 at δ = 0.45 s, 2.5 times the
 # best quiet one. The curve has a minimum: too late, and noise rules; too early, and what is left is for the slow constant
 # gains, which is why the quiet curve rises too. (Less than a period and a half is one and the same sample, so the first
 # two points are equal.)
@@ -74,7 +74,7 @@ figure, axes = plt.subplots(figsize=(8, 4))
 for label, errors in found.items():
     axes.loglog(deltas, errors, "o-", label=label)
 axes.set(xlabel="hand-over before t_f, delta [s]", ylabel="RMS window error [-]")
-axes.legend()
+_ = axes.legend()
 
 # %% [markdown]
 # Try it: the sliders change η, δ and the period and fly 64 attitudes at each stop, by one program: its clock has room for
