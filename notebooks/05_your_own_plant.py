@@ -67,7 +67,7 @@ for angle in (0.1, 0.5, 1.0, 2.0, 3.0):
     axes.semilogy(history["t"], np.abs(history["error1"]) + 1e-9, label=f"from {angle:g}")
 axes.axvline(4.0 - 0.2, color="0.4", ls=":")
 axes.set(xlabel="time [s]", ylabel="|error| [rad]")
-axes.legend()
+_ = axes.legend()
 
 # %% [markdown]
 # For your own jit, vmap and grad there is the pure core: `rollout.simulate(parts, seed, trial)`, with every number of the
@@ -157,7 +157,7 @@ for name, law in laws.items():
     axes.semilogy(history["t"], np.linalg.norm([history[f"error{k}"] for k in (1, 2, 3)], axis=0), label=name)
     print(f"{name}: {mine.metrics['window_error']:.4e}")
 axes.set(xlabel="time [s]", ylabel="|error| [-]")
-axes.legend()
+_ = axes.legend()
 
 # %%
 swung = ptsmc.replace(
