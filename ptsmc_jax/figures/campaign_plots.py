@@ -103,7 +103,10 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
             logarithmic(axes, "x")
         if column.limit is not None:
             axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
-            axes.legend(fontsize=9, loc="lower right")
+            place = axes.transData + axes.transAxes.inverted()
+            right = place.transform((column.limit, 0.5))[0] > 0.5
+            # the shares rise from the lower left to the upper right; the limit's line leaves one of the other two free
+            axes.legend(fontsize=9, loc="upper left" if right else "lower right")
         axes.set(xlabel=column.label(name), ylabel="share of the trials")
     return figure
 

@@ -17,6 +17,18 @@ def test_a_limit_on_a_share_of_the_time_is_said_as_such(of_time, said):
     assert axes.get_legend_handles_labels()[1] == [said]
 
 
+@pytest.mark.parametrize("limit", [0.2, 1.5, 50.0, 1e4])
+def test_the_line_of_a_limit_does_not_run_through_its_label(limit):
+    values = np.random.default_rng(0).lognormal(0.0, 1.0, 2000)
+    figure = campaign_plots.distributions({"a": campaign_plots.Column("rad", values, limit)})
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    label, line = axes.get_legend().get_window_extent(), axes.transData.transform((limit, 0.5))[0]
+    assert not label.x0 <= line <= label.x1
+    curve = axes.transData.transform(axes.lines[0].get_xydata())
+    assert not any(label.contains(x, y) for x, y in curve)
+
+
 def test_each_outcome_is_counted_and_drawn():
     outcome = np.array(list(campaign_plots.MARKS), dtype=object)
     x, totals = 1.0 + np.arange(outcome.size), dict.fromkeys(campaign_plots.MARKS, 7)
