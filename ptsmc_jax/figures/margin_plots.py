@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ptsmc_jax.figures.style import STYLES, styled
+from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
 MODULUS = 6.0  # dB, of the contour that is drawn
@@ -70,6 +70,7 @@ def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
         axes.set(ylabel=label, ylim=(0.0, None))
         axes.legend(fontsize=9, ncols=2)
     rows[-1].set_xlabel("time to t_f, before the hand-over [s]")
+    plain_ticks(rows[-1].xaxis)
     rows[0].set_title("Margins of the frozen loop, its worst axis", loc="left")
     rows[0].invert_xaxis()
     return figure

@@ -1,0 +1,24 @@
+"""What figures of margins say, read back from their axes."""
+
+from typing import Any
+
+import numpy as np
+
+from ptsmc_jax.figures import margin_plots
+from ptsmc_jax.theory.margins import Margins
+
+
+def margins(times):
+    """The same ones at each of so many times, about three axes."""
+    numbers = np.full((times, 3), 6.0)
+    values: dict[str, Any] = dict.fromkeys(Margins._fields, numbers) | {"stable": np.full((times, 3), True)}
+    return Margins(**values)
+
+
+def test_the_time_to_go_is_in_plain_numbers():
+    """Not in 3 x 10^1 and 6 x 10^0, beside each other."""
+    figure = margin_plots.over_time(np.array([34.0, 25.0, 10.0, 5.0, 3.0]), margins(5), margins(1))
+    figure.draw_without_rendering()
+    labels = [label.get_text() for label in figure.axes[-1].get_xticklabels(which="both") if label.get_text()]
+    assert {"5", "10", "20"} <= set(labels)
+    assert not [label for label in labels if "$" in label]
