@@ -166,7 +166,9 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """The paper's t_f of a chain, for every law but the paper's."""
+        """The paper's t_f of a chain, for every law but the paper's. Raises ScenarioError where x0 has no halves."""
+        if len(plant.x0) % 2:
+            raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
         return {"controller": {} if law == _PAPERS else {"t_f": 5.0}}
 
     @property
@@ -179,8 +181,6 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
         plant = self.plant
         if plant.system is None:
             raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
-        if len(plant.x0) % 2:
-            raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
         for key, value in (("system", plant.system), ("truth", plant.truth)):
             if isinstance(value, str):
                 try:

@@ -253,6 +253,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
             {"kind": "system", "system": ARM, "x0": [1, 2, 3]},
             "plant.x0 is [1.0, 2.0, 3.0], but must be a list of x_1 followed by x_2",
         ),
+        ({"kind": "system", "system": ARM, "x0": [1]}, "plant.x0 is [1.0], but must be a list of x_1 followed by x_2"),
         ({"kind": "system", "system": ARM, "x0": [1, 2]}, "plant.x0 is [1.0, 2.0], but must be a list of 4 numbers"),
         ({"kind": "system", "system": ARM, "order": 2}, "plant.order is not a known key"),
     ],
