@@ -160,12 +160,13 @@ def trials(
         seed: of the draws and the noise.
         own: metrics of one's own, see `montecarlo.one`.
 
-    Raises RefusedError, with one sentence, where a plan cannot be flown.
+    Raises RefusedError, with one sentence, where a plan cannot be flown, and ValueError where metrics of one's own are
+    no named numbers, or have the name of a column.
     """
     _check_whole_number("seed", seed)
     ready = _ready(what)
+    names = campaign.Campaign(ready, seed, own).own_names()
     if isinstance(count, pl.DataFrame):
-        names = campaign.Campaign(ready, seed, own).own_names()
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
         return campaign.of_plan(ready, seed, plan, own).fly(range(plan.count))
     _check_whole_number("count", count, 1)

@@ -158,6 +158,19 @@ def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
             asked()
 
 
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (lambda result, parts: result.metrics.effort, "but must return named numbers, a dict"),
+        (lambda result, parts: {"mine": result.log.t}, "its mine is no single number"),
+        (lambda result, parts: {"window_error": result.metrics.effort}, "has the name of a column that the rows have"),
+    ],
+)
+def test_metrics_of_ones_own_are_named_numbers_that_hide_no_others(own, said):
+    with pytest.raises(ValueError, match=said):
+        ptsmc_jax.trials(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 2, own=own)
+
+
 def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
     slow = scenario.replace(scenario.from_tables(TABLES), hardware__torque_limit=1e-3)
     run = ptsmc_jax.simulate(slow)
