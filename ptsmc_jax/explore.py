@@ -190,16 +190,22 @@ def _ready(what: Scenario | Study | str | Path) -> Study:
     return what if isinstance(what, Study) else scenario.study(_read(what))
 
 
-def verdicts(what: Scenario, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
+def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
     """One for each requirement of the scenario over these rows; a failed trial breaks every one of its runs.
 
     Margins are those of its loop, see `margin_verdicts`; where loops differ, of those of this seed's trials.
+
+    Raises ValueError where there are no rows, or a column that is asked for is missing.
     """
     _check_whole_number("seed", seed)
-    of_margins = []
-    if scenario.margin_requirements(what):
-        of_margins = margin_verdicts.over_trials(scenario.study(what), seed)
-    return [*campaign.verdicts(scenario.requirements(what), rows), *of_margins]
+    loaded = what.scenario if isinstance(what, Study) else _read(what)
+    asked = scenario.requirements(loaded)
+    needed = ["status", *(name for r in asked for name in (r.metric, r.timed) if name is not None)]
+    missing = [name for name in needed if name not in rows.columns]
+    if missing or not rows.height:
+        raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
+    of_margins = margin_verdicts.over_trials(_ready(what), seed) if scenario.margin_requirements(loaded) else []
+    return [*campaign.verdicts(asked, rows), *of_margins]
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

@@ -122,6 +122,18 @@ def test_trials_are_the_campaigns_rows(flight):
     assert ptsmc_jax.verdicts(flight.scenario, broken)[0].failures == 1
 
 
+def test_verdicts_are_on_rows_of_what_trials_take(flight, tmp_path):
+    rows = ptsmc_jax.trials(flight.scenario, 3)
+    (tmp_path / "s.toml").write_text(SHORT)
+    (expected,) = ptsmc_jax.verdicts(flight.scenario, rows)
+    for what in (tmp_path / "s.toml", scenario.study(flight.scenario)):
+        assert ptsmc_jax.verdicts(what, rows) == [expected]
+    for other, said in ((rows.head(0), "there are no rows"), (rows.drop("peak_torque"), "have no peak_torque"),
+                        (rows.drop("status"), "have no status")):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            ptsmc_jax.verdicts(flight.scenario, other)
+
+
 def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
     made = flight.animate(frames=4)
     content = made._repr_html_()
