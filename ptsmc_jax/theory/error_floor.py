@@ -16,7 +16,7 @@ It bounds the mean over trials. A single run, or a small campaign, may come out 
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -40,8 +40,8 @@ class Floor:
     """What no controller can beat; 0 where nothing is unknown."""
 
     window_error: float  # RMS over the window after t_f, in the unit of the metric
-    t: np.ndarray  # (time,) ends of the control periods [s]
-    error: np.ndarray  # (time,) RMS of the error's 2-norm then
+    t: np.ndarray = field(repr=False)  # (time,) ends of the control periods [s]
+    error: np.ndarray = field(repr=False)  # (time,) RMS of the error's 2-norm then
 
 
 class Model(NamedTuple):

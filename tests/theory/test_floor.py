@@ -253,3 +253,8 @@ def test_where_there_is_no_floor_nothing_is_said(least):
         assert "times the floor" not in sentences.front({**front, **known}).head
     assert sentences.front({**front, "floor": 5e-6}).head[5] == "times the floor"
     assert sentences.front({**front, "floor": 5e-6}).rows[0][5] == "2"
+
+
+def test_a_floor_is_shown_by_its_number_and_not_by_its_course():
+    course = np.arange(900.0)
+    assert repr(error_floor.Floor(8e-7, course, course)) == "Floor(window_error=8e-07)"
