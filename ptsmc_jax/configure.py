@@ -63,8 +63,13 @@ def configure(
     of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in
     which no code is patched, see `ptsmc_jax.programs`. Called before JAX is imported, it also silences what XLA says to
     stderr by itself ("Very slow compile?" after two minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before
-    anything runs on JAX; later it raises RuntimeError where the backend has already started with something else.
+    anything runs on JAX; later it raises RuntimeError where the backend has already started with something else, and
+    ValueError at any time for other bits and devices.
     """
+    if bits not in (32, 64):
+        raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
+    if device not in (None, "cpu", "gpu"):
+        raise ValueError(f'device is {device!r}, but must be "cpu", "gpu", or None for the first that JAX finds')
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when jaxlib is loaded; what is fatal is still said
     _set_compiler_options(fast, folder)

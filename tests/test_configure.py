@@ -28,6 +28,14 @@ def tried(monkeypatch):
     return seen
 
 
+@pytest.mark.parametrize("asked", [{"bits": "64"}, {"bits": 16}, {"device": "cuda"}, {"device": "GPU"}])
+def test_other_bits_and_devices_are_refused(asked):
+    """Whatever was not the number 64 was taken for 32 bits."""
+    (name,) = asked
+    with pytest.raises(ValueError, match=f"^{name} is .*, but must be"):
+        setup.configure(**asked)
+
+
 def test_options_are_written_as_xla_reads_them():
     assert setup._flags(("a=1", "--b=2", "-c=3")) == "--xla_backend_extra_options=a=1,-c=3 --b=2"
     assert setup._flags(()) == ""
