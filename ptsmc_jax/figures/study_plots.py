@@ -302,7 +302,8 @@ def accuracy_map(
         if y.logarithmic:
             logarithmic(axes, "y")
         mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grids[name]), norm=norm, cmap="cividis")
-        figure.colorbar(mesh, ax=axes, extend="max" if alike.size and alike.max() > high else "neither")
+        bar = figure.colorbar(mesh, ax=axes, extend="max" if alike.size and alike.max() > high else "neither")
+        plain_ticks(bar.ax.yaxis)
         column, row = np.meshgrid(x.values, y.values)
         axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
         limits = axes.get_xlim(), axes.get_ylim()

@@ -68,6 +68,19 @@ def test_every_grid_that_has_numbers_has_its_map(count):
     assert len(figure.axes) == 2 * count  # and its bar of colours
 
 
+@pytest.mark.parametrize("high", [2.3, 50.0])
+def test_the_bar_of_a_maps_colours_has_plain_numbers(high):
+    """Not 6 x 10^-1 and 2 x 10^0 beside axes that have 0.5 and 2."""
+    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
+    grids = dict.fromkeys(NAMES, np.array([[0.15, 1.0], [0.3, high]]))
+    figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), {})
+    figure.draw_without_rendering()
+    for bar in [axes for axes in figure.axes if not axes.get_title()]:
+        labels = [label.get_text() for label in bar.get_yticklabels(which="both") if label.get_text()]
+        assert len(labels) >= 2
+        assert not [label for label in labels if "$" in label]
+
+
 @pytest.mark.parametrize(("low", "high"), [(1e-3, 1e-1), (1e-2, 1.0), (0.05, 5.0), (1e-5, 1.0)])
 def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
     across = study_plots.MapAxis("sign_width", np.geomspace(low, high, 2), True)
