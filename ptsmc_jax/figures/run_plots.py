@@ -93,7 +93,8 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
         axes.plot([], [], **EXACT, label="exact, perfect estimate")
     row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
     peak = log.commanded[row, column]
-    label = f"peak {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
+    of = "peak" if np.array_equal(log.u, log.commanded) else "peak of the command"  # which then lies off the curves
+    label = f"{of} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
     axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
         _limit(axes, limit, unit)
