@@ -44,6 +44,14 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
         ("controller.eta", "3", ""),
         ("observer.gain", "1, 2, 3", "N m s"),
     ]
+    bounds = {
+        "controller": {"kind": "pd", "disturbance_bound": 0.1},
+        "observer": {"kind": "finite_time", "gain": [0.02]},
+    }
+    assert sentences.flown_gains(bounds, "spacecraft").rows[1::2] == [
+        ("controller.disturbance_bound", "0.1", "N m"),
+        ("observer.gain", "0.02", "N m/s"),  # the nonlinear one's is in N m s
+    ]
     own = {"controller": {"kind": "own", "t_f": 30.0, "k": 2.0}}  # whose class may say another unit than a built-in k
     assert sentences.flown_gains(own, "spacecraft").rows[1:] == [
         ("controller.t_f", "30", "s"),

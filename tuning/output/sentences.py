@@ -344,18 +344,21 @@ def campaign_error(summary: Summary) -> Iterator[str]:
 
 def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
     """The law, observer and filter of a scenario's tables, with the numbers that they fly with; kind: of its plant."""
-    from tuning.search.gains import units
+    from ptsmc_jax.scenario import keys
+    from ptsmc_jax.scenario.layouts import SCENARIOS
 
-    gain_units = units(kind)
     rows: list[tuple[str, ...]] = []
-    prefixes = {"controller": "", "observer": "observer_", "filter": "filter_", "sensors": "sensors_"}
-    for table, prefix in prefixes.items():
-        own = scenario.get(table, {}).get("kind") == "own"  # its class, which reading does not run, has the units
-        for key, value in scenario.get(table, {}).items():
+    for table in ("controller", "observer", "filter", "sensors"):
+        given = scenario.get(table, {})
+        own = given.get("kind") == "own"  # its class, which reading does not run, has the units
+        kinds: Any = SCENARIOS[kind].TABLES.get(table, {})
+        struct = kinds.get(given.get("kind", "nonlinear"))  # of the same name another kind's key has another unit
+        units = {key.name: key.unit for key in keys.of(struct)} if struct else {}
+        for key, value in given.items():
             numbers = value if isinstance(value, list) else [value]
             each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]
             text = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
-            unit = "" if own and key not in ("t_f", "delta") else gain_units.get(prefix + key, "").replace("-", "")
+            unit = "" if own and key not in ("t_f", "delta") else (units.get(key) or "").replace("-", "")
             rows.append((f"{table}.{key}", text, unit))
     return Table(("key", "value", "unit"), rows)
 
