@@ -23,7 +23,9 @@ def test_the_line_of_a_limit_does_not_run_through_its_label(limit):
     figure = campaign_plots.distributions({"a": campaign_plots.Column("rad", values, limit)})
     figure.draw_without_rendering()
     (axes,) = figure.axes
-    label, line = axes.get_legend().get_window_extent(), axes.transData.transform((limit, 0.5))[0]
+    legend = axes.get_legend()
+    assert legend is not None
+    label, line = legend.get_window_extent(), axes.transData.transform((limit, 0.5))[0]
     assert not label.x0 <= line <= label.x1
     curve = axes.transData.transform(axes.lines[0].get_xydata())
     assert not any(label.contains(x, y) for x, y in curve)

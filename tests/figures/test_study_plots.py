@@ -72,8 +72,8 @@ def test_every_grid_that_has_numbers_has_its_map(count):
 def test_the_bar_of_a_maps_colours_has_plain_numbers(high):
     """Not 6 x 10^-1 and 2 x 10^0 beside axes that have 0.5 and 2."""
     axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
-    grids = dict.fromkeys(NAMES, np.array([[0.15, 1.0], [0.3, high]]))
-    figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), {})
+    grid = np.array([[0.15, 1.0], [0.3, high]])
+    figure = study_plots.accuracy_map(axis, axis, dict.fromkeys(NAMES, grid), np.zeros((2, 2), bool), {})
     figure.draw_without_rendering()
     for bar in [axes for axes in figure.axes if not axes.get_title()]:
         labels = [label.get_text() for label in bar.get_yticklabels(which="both") if label.get_text()]
