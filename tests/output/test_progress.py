@@ -37,11 +37,15 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
 
 
 def test_the_gains_that_a_campaign_flew_with_have_their_units():
-    tables = {"controller": {"kind": "prescribed_time", "eta": 3.0}, "observer": {"gain": [1.0, 2.0, 3.0]}}
+    tables = {
+        "controller": {"kind": "prescribed_time", "eta": 3.0},
+        "observer": {"kind": "nonlinear", "gain": [1.0, 2.0, 3.0]},
+    }
     rows = sentences.flown_gains(tables, "spacecraft").rows
     assert rows == [
         ("controller.kind", "prescribed_time", ""),
         ("controller.eta", "3", ""),
+        ("observer.kind", "nonlinear", ""),
         ("observer.gain", "1, 2, 3", "N m s"),
     ]
     bounds = {

@@ -352,7 +352,7 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
         given = scenario.get(table, {})
         own = given.get("kind") == "own"  # its class, which reading does not run, has the units
         kinds: Any = SCENARIOS[kind].TABLES.get(table, {})
-        struct = kinds.get(given.get("kind", "nonlinear"))  # of the same name another kind's key has another unit
+        struct = kinds.get(given.get("kind"))  # of the same name another kind's key has another unit
         units = {key.name: key.unit for key in keys.of(struct)} if struct else {}
         for key, value in given.items():
             numbers = value if isinstance(value, list) else [value]
