@@ -163,7 +163,7 @@ def warn_if_forgotten() -> None:
     if not (_called or _said or jax.config.read("jax_enable_x64")):
         _said = True
         warnings.warn(
-            "JAX computes with 32 bits here, too few for errors below 1e-5: call ptsmc_jax.configure.configure() "
+            "JAX computes with 32 bits here, too few for errors below 1e-7: call ptsmc_jax.configure.configure() "
             "first, right after the imports, or configure(bits=32) if that is meant",
             RuntimeWarning,
             stacklevel=3,

@@ -57,7 +57,7 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
 
     >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
     """
-    store.check_file(Path(file), force)
+    store.check_file(Path(file), force, "force=True")
     store.write_toml(Path(file), parsing.dump(scenario))
 
 
@@ -131,8 +131,8 @@ class Figures(dict[str, Figure]):
         return "".join(images)
 
 
-def simulate(what: Scenario | str | Path, *, seed: int = 0, trial: int | None = None) -> Flight:
-    """Fly a scenario, or the scenario of a file, once: nominal, or a trial with its dispersions and noise.
+def simulate(what: Scenario | Study | str | Path, *, seed: int = 0, trial: int | None = None) -> Flight:
+    """Fly a scenario, that of a file or of a study, once: nominal, or a trial with its dispersions and noise.
 
     Raises ScenarioError, with one sentence, where it cannot be flown.
     """
@@ -182,7 +182,9 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
     return runs.floor(_ready(what), seed)
 
 
-def _read(what: Scenario | str | Path) -> Scenario:
+def _read(what: Scenario | Study | str | Path) -> Scenario:
+    if isinstance(what, Study):
+        return what.scenario
     return what if isinstance(what, Scenario) else scenario.read(what)
 
 
@@ -198,7 +200,7 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
     Raises ValueError where there are no rows, or a column that is asked for is missing.
     """
     _check_whole_number("seed", seed)
-    loaded = what.scenario if isinstance(what, Study) else _read(what)
+    loaded = _read(what)
     asked = scenario.requirements(loaded)
     needed = ["status", *(name for r in asked for name in (r.metric, r.timed) if name is not None)]
     missing = [name for name in needed if name not in rows.columns]
@@ -209,7 +211,9 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
-    """The unit of each metric of this kind of plant."""
+    """The unit of each metric of this kind of plant; raises ValueError where there is no such kind."""
+    if kind not in catalogues.CATALOGUES:
+        raise ValueError(f"there is no kind of plant {kind!r}; allowed are {', '.join(catalogues.CATALOGUES)}")
     return {name: entry.unit for name, entry in catalogues.CATALOGUES[kind].items()}
 
 

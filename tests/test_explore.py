@@ -189,6 +189,9 @@ def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
     assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
     assert "<td>settling_time</td><td>-</td><td>s</td>" in run.metrics._repr_html_()
     assert explore.units("chain")["peak_torque"] == "u"
+    with pytest.raises(ValueError, match="no kind of plant 'boat'; allowed are spacecraft, chain, system"):
+        explore.units("boat")
+    assert repr(ptsmc_jax.simulate(scenario.study(slow))) == repr(run)
 
 
 def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):

@@ -122,12 +122,12 @@ def check(folder: Path, force: bool) -> None:
         )
 
 
-def check_file(file: Path, force: bool) -> None:
-    """Raise RefusedError where this file must not be written."""
+def check_file(file: Path, force: bool, way: str = "--force") -> None:
+    """Raise RefusedError where this file must not be written; way: how `force` is said."""
     if not file.parent.is_dir():
         raise RefusedError(f"the file is {file}, but {file.parent} is no folder; allowed is one that exists")
     if file.is_dir() or (file.exists() and not force):
-        allowed = "another name" if file.is_dir() else "another name, or --force to write over it"
+        allowed = "another name" if file.is_dir() else f"another name, or {way} to write over it"
         raise RefusedError(f"the file is {file}, which is there already; allowed is {allowed}")
 
 

@@ -88,7 +88,7 @@ def _check_names(parts: Parts, names: Iterable[str]) -> None:
     if parts.command_filter is not None:
         allowed.add("command_corner")
     for name in names:
-        if name not in allowed and not hasattr(parts.controller, name):
+        if name not in allowed:
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(allowed))}")
 
 

@@ -309,6 +309,8 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
         ticks = ticks_of(parts.clock, vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
+    with pytest.raises(ValueError, match="delta is -3, but must be a finite number of at least 0"):
+        reach_of(scenario, delta=-3)
 
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])

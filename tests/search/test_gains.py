@@ -258,6 +258,8 @@ def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, neede
     ready = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None))
     with pytest.raises(ValueError, match=rf"needs {needed} of samples {where} the hand-over, but the parts' clock has"):
         gains.with_gains(ready.parts, other)
+    with pytest.raises(ValueError, match="model is no gain of these parts; allowed are delta, eta"):
+        gains.with_gains(ready.parts, {"model": 1.0})  # an attribute of the law
     roomy = scenario.study(ready.scenario, reach=replace(timing.reach_of(ready.scenario), t_f=40.0, delta=1.0))
     moved = gains.with_gains(roomy.parts, other)
     law = moved.controller
