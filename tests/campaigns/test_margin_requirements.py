@@ -240,3 +240,21 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
                 beyond = way * np.stack([found[name], each[name]]) > way * limits[name]
                 np.testing.assert_array_equal(*beyond)
     assert sum(judged) < 6 * every["phase_margin"].size / 2
+
+
+@pytest.mark.parametrize("left", [None, '{"window_error": 1e-6, "marg', '{"window_error": 1e-6}'])
+def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_path, left):
+    """A kill may come between the last trial and them; and a file may be damaged."""
+    tables = {**BODY, "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
+    del tables["tune"]
+    store.write_toml(tmp_path / "s.toml", tables)
+    again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"
+    assert command(*again, "--quiet") == (0, "", "")
+    whole = (folder / "floor.json").read_text()
+    (folder / "floor.json").unlink() if left is None else (folder / "floor.json").write_text(left)
+    code, said, _ = command("summarize", folder, "--no-figures")
+    assert code == 1
+    assert "gain_margin is asked for and NOT judged yet" in said
+    assert json.loads((folder / "summary.json").read_text())["status"] == "unfinished"
+    assert command(*again, "--quiet") == (0, "", "")
+    assert (folder / "floor.json").read_text() == whole

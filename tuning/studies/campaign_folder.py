@@ -24,6 +24,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import Study, own, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
 from tuning.search import own_parts
 
 TABLE = "plan.parquet"  # the plan that is flown; what `--dry-run` writes is a folder
@@ -304,11 +305,11 @@ def fly(
 
 
 def find_floor(folder: Folder) -> None:
-    """Write what theory says into the folder, where it is not there yet.
+    """Write what theory says into the folder, where it is not there yet, or cannot be read.
 
     The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
     """
-    if not (folder.path / FLOOR).exists():
+    if "window_error" not in _theory(folder) or unjudged(folder):
         ready, plan = folder.campaign.ready, folder.campaign.plan
         first, looked_at = [], None
         if plan is not None:
@@ -328,6 +329,12 @@ def floor_of(folder: Folder) -> float | None:
 def margins_of(folder: Folder) -> list[dict[str, Any]]:
     """The verdicts on margins that `find_floor` wrote, as `summary.json` says them."""
     return _theory(folder).get("margins", [])
+
+
+def unjudged(folder: Folder) -> list[str]:
+    """Margins that are asked for and that no verdict is there of: flying ended before, or what it wrote is damaged."""
+    judged = {verdict["metric"] for verdict in margins_of(folder)}
+    return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 
 
 def _theory(folder: Folder) -> dict[str, Any]:

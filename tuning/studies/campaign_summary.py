@@ -21,7 +21,7 @@ from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
-from tuning.studies.campaign_folder import Folder, floor_of, margins_of
+from tuning.studies.campaign_folder import Folder, floor_of, margins_of, unjudged
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
@@ -87,7 +87,7 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
 def summarise(folder: Folder) -> dict[str, Any]:
     """What `summary.json` says."""
     parts = folder.whole_parts()
-    verdicts = [*judged(folder), *margins_of(folder)]
+    verdicts, waiting = [*judged(folder), *margins_of(folder)], unjudged(folder)
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
     finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
@@ -109,12 +109,13 @@ def summarise(folder: Folder) -> dict[str, Any]:
     done = int(head.height)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
-        "status": "unfinished" if done < folder.trials else "met" if met else "not met",
+        "status": "unfinished" if done < folder.trials or waiting else "met" if met else "not met",
         "plant": folder.scenario.plant.kind,
         "seed": folder.seed,
         "plan": folder.plan,
         "trials": folder.trials,
         "flown": done,
+        "unjudged": waiting,
         "counts": counts,
         "reasons": reasons,
         "interval_confidence": CONFIDENCE,
