@@ -70,7 +70,7 @@ class Campaign:
             **flown.drawn,
             **flown.own,
         })  # fmt: skip
-        return frame.head(len(trials)).with_columns(pl.col(pl.Float64).fill_nan(None))
+        return frame.head(len(trials)).with_columns(pl.col(pl.Float64, pl.Float32).fill_nan(None))
 
     def draw(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """What these trials would fly with."""

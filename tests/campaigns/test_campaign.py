@@ -1,3 +1,4 @@
+import tomllib
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -201,3 +202,18 @@ def test_histories_are_those_of_the_runs(flown):
         log = runs.fly(made.ready, 3, trial).log
         np.testing.assert_allclose(t, log.t, rtol=1e-14)
         np.testing.assert_allclose(error[k], np.linalg.norm(log.error, axis=1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_what_a_trial_lacks_is_null_whatever_the_precision(monkeypatch, kind):
+    made = campaign.Campaign(scenario.study(scenario.from_tables(tomllib.loads(SHORT_CHAIN))), 3)
+    flown = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
+    lacking = flown.metrics._replace(settling_time=np.full(montecarlo.FEW, np.nan))
+    as_kind = replace(
+        flown,
+        metrics=jax.tree.map(lambda v: np.asarray(v, kind), lacking),
+        bad_time=flown.bad_time.astype(kind),
+    )
+    monkeypatch.setattr(montecarlo, "run", lambda *_, **__: as_kind)
+    frame = made.fly(range(5))
+    assert [frame[name].null_count() for name in ("bad_time", "settling_time", "window_error")] == [5, 5, 0]
