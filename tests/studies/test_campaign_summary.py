@@ -1,5 +1,7 @@
 """Shares of time in what is said of a campaign, and how its figures judge trials."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -44,3 +46,13 @@ def test_a_failed_trial_has_no_share_of_time():
     assert told["0.1"]["low"] < told["0.1"]["value"] < told["0.1"]["high"]
     none = campaign_summary._of_share(np.array([np.nan]), np.array([False]))
     assert none["0.5"]["value"] == 0.0
+
+
+def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch):
+    """As of one shard alone: its rows are not those of the first trials."""
+    frame = pl.DataFrame({"trial": [100, 101, 250], "window_error": [1.0, None, 3.0]})
+    monkeypatch.setattr(campaign_summary.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
+    monkeypatch.setattr(campaign_summary.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
+    tables = SimpleNamespace(controller=SimpleNamespace(t_f=1.0), plant=SimpleNamespace(kind="spacecraft"))
+    folder = SimpleNamespace(flights=None, scenario=tables)
+    assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == ([100, 250], 250)

@@ -385,9 +385,10 @@ def _of_time(verdict: Verdict) -> str:
 
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:
     """Errors over time of the first trials, and of that with the largest window error, flown again."""
-    shown, window = np.arange(min(DRAWN, frame.height)), frame["window_error"].to_numpy()
+    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
+    shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-    t, error = flying.history(folder.flights, np.append(shown, frame["trial"][hardest]).astype(np.uint32))
+    t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
     scenario = folder.scenario
-    worst = hardest, error[-1]
+    worst = int(trials[hardest]), error[-1]
     return plots.fan(t, error[:-1][finished[: shown.size]], worst, scenario.controller.t_f, scenario.plant.kind)
