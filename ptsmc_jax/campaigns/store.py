@@ -18,6 +18,8 @@ import tomli_w
 from ptsmc_jax.scenario import parsing
 
 JOURNAL = "journal.bin"  # of a run that is not finished
+SUMMARY = "summary.json"  # of one that is
+MADE_OF_RESULTS = ("figures/*.png", "report.html", "worst.csv", "why.csv")  # they would pass for those of the next one
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
@@ -55,7 +57,7 @@ def read_versions(folder: Path) -> dict[str, Any]:
 def previous(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> dict[str, Any] | None:
     """The summary of the same scenario with the same command, seed and what else made it (`versions`); None: none."""
     try:
-        return json.loads((folder / "summary.json").read_text()) if _same(folder, scenario, made_by) else None
+        return json.loads((folder / SUMMARY).read_text()) if _same(folder, scenario, made_by) else None
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -73,10 +75,20 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
     folder.mkdir(parents=True, exist_ok=True)
     if fresh:
         end(folder)
-        (folder / "summary.json").unlink(missing_ok=True)  # it would pass for this run's
+        forget(folder)
     record(folder, scenario, made_by)
     (folder / JOURNAL).touch()
     return folder / JOURNAL
+
+
+def forget(folder: Path) -> None:
+    """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's."""
+    for path in (folder / SUMMARY, *(path for made in MADE_OF_RESULTS for path in folder.glob(made))):
+        path.unlink(missing_ok=True)
+
+
+def _alike(new: Path, old: Path) -> bool:
+    return old.exists() and new.read_bytes() == old.read_bytes()
 
 
 def end(folder: Path) -> None:
@@ -132,7 +144,11 @@ def check_file(file: Path, force: bool, way: str = "--force") -> None:
 
 
 def write(folder: Path, fill: Callable[[Path], None]) -> None:
-    """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place."""
+    """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place.
+
+    Of another result that was there, known by its summary, figures and tables go; the new summary is moved last, since
+    it says that the result is whole.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
         making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -147,11 +163,13 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
                 return
             except OSError:  # another process was first, with the same run: shards begin at once
                 pass
-        for path in sorted(making.rglob("*")):
-            if path.is_file():
-                target = folder / path.relative_to(making)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(path, target)
+        files = sorted((path for path in making.rglob("*") if path.is_file()), key=lambda path: path.name == SUMMARY)
+        if (making / SUMMARY).exists() and not _alike(making / SUMMARY, folder / SUMMARY):
+            forget(folder)
+        for path in files:
+            target = folder / path.relative_to(making)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(path, target)
     finally:
         shutil.rmtree(making, ignore_errors=True)
 
@@ -163,7 +181,7 @@ def record(
     write_toml(folder / "scenario.toml", scenario)
     write_json(folder / "versions.json", versions(**made_by))
     if summary is not None:
-        write_json(folder / "summary.json", summary)
+        write_json(folder / SUMMARY, summary)
 
 
 def write_toml(path: Path, tables: Mapping[str, Any]) -> None:

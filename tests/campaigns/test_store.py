@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import os
 import tomllib
 
 import jax.numpy as jnp
@@ -43,6 +44,35 @@ def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path)
     store.write(tmp_path / "out", fill)
     assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
     assert (tmp_path / "out" / "figures" / "a.png").read_text() == "new"
+
+
+def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_path, monkeypatch):
+    """A page shows every figure that is there; a kill in between leaves nothing that passes for a whole result."""
+    moved, replace = [], os.replace
+    monkeypatch.setattr(os, "replace", lambda a, b: (moved.append(b.name), replace(a, b)))
+
+    def result(summary, *names):
+        def fill(folder):
+            (folder / "figures").mkdir()
+            for name in names:
+                (folder / name).write_text(summary)
+            (folder / "summary.json").write_text(summary)
+
+        return fill
+
+    out, others = tmp_path / "out", ("mine.txt", "report.html", "figures/mine.csv")
+    store.write(out, result("first", "tuned.toml", "figures/a.png", "figures/b.png"))
+    for name in others:
+        (out / name).write_text("kept")
+    before = tree(out)
+    store.write(out, result("first", "tuned.toml"))  # the same one, without figures
+    assert tree(out) == before
+    moved.clear()
+    store.write(out, result("second", "versions.json", "tuned.toml", "figures/b.png"))
+    assert set(tree(out)) == {
+        "mine.txt", "figures/mine.csv", "figures/b.png", "tuned.toml", "versions.json", "summary.json"
+    }  # fmt: skip
+    assert moved[-1] == "summary.json"
 
 
 def test_check_refuses_files_and_full_folders(tmp_path):

@@ -141,7 +141,10 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
     assert error.count("\n") == 1
     same(rows_of(flown), before)
     if "--metrics" not in options:  # with these it is another program
-        assert command("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")[0] == 0
+        again = ("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")
+        assert command(*again, "--shard", "1/2")[0] == 0
+        assert not (flown / "summary.json").exists()  # that of the campaign before, which would pass for this one's
+        assert command(*again)[0] == 0
         assert rows_of(flown)["trial"].to_list() == list(range(110))
 
 

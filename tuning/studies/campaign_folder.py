@@ -217,6 +217,7 @@ def begin(wanted: Folder, force: bool) -> None:
         if wanted.table is not None:
             parts = wanted.campaign.ready.parts
             (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
+        store.forget(path)  # what was another campaign's, or that of fewer trials
 
     store.write(path, fill)
 
