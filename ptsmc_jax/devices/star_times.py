@@ -16,10 +16,11 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, cholesky, filter_gains
+from ptsmc_jax.devices.ticks import rounding
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
-ROUNDING = 1e-9  # share of a period by which times may differ and still count as equal
+ROUNDING = 1e-9  # share of a period by which ages may differ and still count as equal
 LONGEST = 1000  # control periods of a pattern at most
 
 
@@ -35,12 +36,13 @@ class StarTimes:
     def age(self, sample: Any) -> Any:
         """How long before a control sample, given by its number, the star tracker's last sample was [s]."""
         t = sample * self.period
-        last = jnp.floor((t + ROUNDING * self.period) / self.interval) * self.interval
+        last = jnp.floor((t + rounding(self.period, t)) / self.interval) * self.interval
         return jnp.maximum(t - last, 0.0)
 
     def due(self, sample: Any) -> Any:
         """Whether it has sampled since the control sample before this one, given by its number."""
-        return self.age(sample) < (1.0 - ROUNDING) * self.period
+        # twice that by which a sample may count as early: its successor must not tell it again
+        return self.age(sample) < self.period - 2.0 * rounding(self.period, sample * self.period)
 
 
 def star_times(interval: float, period: float) -> StarTimes:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.devices.ticks import rounding
 from ptsmc_jax.numerics import attitude, elementary, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
@@ -26,7 +27,6 @@ AXES = ("x", "y", "z", "boresight")  # of the indices: body axes, and the half-c
 # half-cone to within 1/cos(pi/32) - 1 = 0.5 %, and is enlarged by as much.
 DIRECTIONS = 16
 ALONG = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-END_TOLERANCE = 1e-9  # share of a window: one that ends by less after an interval ends with it
 
 
 @pytree
@@ -232,7 +232,8 @@ def update(
     share = jnp.clip((begins - t) / length, 0.0, 1.0)  # of the interval that lies before the observation
     window_end = begins + (tally.windows + 1.0) * window
     until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
-    observed, closes = t_next > begins, (t_next > begins) & (window_end <= t_next + END_TOLERANCE * window)
+    observed = t_next > begins
+    closes = observed & (window_end <= t_next + rounding(window, t_next))
     first, last = error.at(share), error.at(until)
     # the observation's first moment counts; later intervals begin where the ones before have ended
     opened = guards.select(t <= begins, tally.window.including(first), tally.window)

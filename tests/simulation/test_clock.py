@@ -1,10 +1,11 @@
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation import clock, rollout
 from tests.helpers import ticks_of, vector
 
 
@@ -99,3 +100,22 @@ def test_graded_nodes_move_with_t_f_and_delta_by_their_exact_derivative():
         moved[0][k], moved[1][k] = point[k] - h, point[k] + h
         central = (nodes(*moved[1]) - nodes(*moved[0])) / (2 * h)
         np.testing.assert_allclose(slope, central, atol=1e-6)  # h^2 times third derivatives of up to 1e3
+
+
+@pytest.mark.parametrize("bits", [64, 32])
+def test_rounding_costs_no_period_whatever_the_precision(bits):
+    """With 32 bits a tenth of such flights handed over a period late, and as many were said to end before t_end."""
+    count, before = 1200, np.arange(1, 40)
+    period = np.array([0.01, 0.02, 0.05, 0.1, 0.25, 0.3])[:, None]
+    t_end, t_f, delta = np.broadcast_arrays(count * period, (count - 100) * period, before * period)
+
+    def handed_over(period, t_end, t_f, delta):
+        ticks = clock.Flight(period, t_end, count).ticks(t_f, delta)
+        return jnp.argmax(ticks.hold), rollout._gap(ticks, t_end), rollout._gap(ticks, t_end + 0.5 * period)
+
+    with jax.enable_x64(bits == 64):
+        many = jax.jit(jax.vmap(jax.vmap(handed_over)))
+        first, gap, real_gap = many(*(vector(np.broadcast_to(v, t_f.shape)) for v in (period, t_end, t_f, delta)))
+    np.testing.assert_array_equal(first, np.broadcast_to(count - 100 - before, t_f.shape))
+    assert np.isnan(gap).all()
+    assert np.isfinite(real_gap).all()
