@@ -233,6 +233,19 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite(los
     assert np.all(np.isfinite(found.c_slope))
 
 
+def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
+    """A thousand times beyond one, and within another: each says how far, where every trial ends."""
+    helpers.small_search(monkeypatch)
+    monkeypatch.setattr(worst, "SCREENED", 16)
+    out_of_reach, kept = Requirement("window_error", 1e-9), Requirement("effort", 1e4)
+    some = problem(window_error=out_of_reach.limit, effort=kept.limit)
+    evaluate = Evaluator(shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    found = optimise.search(evaluate, some, (out_of_reach, kept), np.array([3.0, 0.5]), optimise.Settings(1, 2, 1))
+    assert found.worst[0] > descent.BROKEN
+    assert found.worst[1] < 1.0
+    np.testing.assert_array_equal(found.worst, found.ended)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("tail", [None, 3])
 def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):

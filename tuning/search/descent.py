@@ -32,6 +32,7 @@ class Best:
     def __init__(self, share: np.ndarray, requirements: int, margin: float):
         self.margin, self.share = margin, share.copy()  # (gains,) where nothing better is known
         self.f = self.value = self.over = np.inf
+        self.failed = False  # whether a trial fails there, or has no value
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 
     @property
@@ -53,6 +54,7 @@ class Best:
         if np.isfinite(seen.f[first]) and (over[first], seen.f[first]) < self.rank:
             self.share, self.worst = share[first].copy(), worst[first]
             self.f, self.value, self.over = float(seen.f[first]), float(np.exp(seen.value[first])), float(over[first])
+            self.failed = bool(failures(seen.c)[first])
 
 
 class _EnoughError(Exception):

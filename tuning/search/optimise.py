@@ -12,7 +12,6 @@ import numpy as np
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm
 from tuning.search.cma_es import NEARBY
-from tuning.search.descent import BROKEN
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem
@@ -121,7 +120,7 @@ def search(
         gains=descents.gains,
         share=best.share,
         value=best.value,
-        worst=np.where(best.over >= BROKEN, np.inf, best.worst),
+        worst=np.where(best.failed, np.inf, best.worst),
         ended=best.worst,
         history=descents.history,
         problem=descents.problem,
