@@ -147,3 +147,20 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     # and where the search is stopped at its start, the distance says so
     lost = replace(found, share=evaluate.bounds.share(np.array([2.3, 3.0])))
     assert global_check.check(evaluate, lost, 0).distance > 0.5
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.985, True), (1.01, False)])
+def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, kept):
+    """Gains that keep a limit, but not all of the margin that a search keeps from it, keep the limit."""
+    monkeypatch.setattr(global_check, "GENERATIONS", 1)
+    monkeypatch.setattr(global_check, "POPULATION", 4)
+    evaluate = Evaluator(Bounds(("eta", "delta"), (3.0, 0.5), (3.0001, 0.5001)))  # all gains ask for one torque
+
+    def asked(limit: float) -> objective.Problem:
+        return problem(2, peak_torque=limit)
+
+    peak = float(evaluate.fly(asked(1.0), np.full((1, 2), 0.5)).beyond[0]) + 1.0
+    settings, limit = optimise.Settings(1, 2, 1, judged=False, margin=0.03), peak / share
+    found = optimise.search(evaluate, asked(limit), (), np.array([3.0, 0.5]), settings)
+    assert bool(found.worst[0] <= 1.0) is kept
+    assert global_check.check(evaluate, found, 0).kept is kept

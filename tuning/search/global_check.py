@@ -75,6 +75,6 @@ def check(
         gains=dict(zip(problem.names, at_best.gains[0].tolist(), strict=True)),
         value=best.value,
         distance=float(at_search.f[0]) - best.f,
-        kept=bool(at_best.c[0].max(initial=-1.0) <= SLACK),
+        kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # the limits themselves, as the search is judged
         rollouts=evaluate.rollouts - before,
     )
