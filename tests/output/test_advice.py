@@ -29,6 +29,25 @@ def test_what_to_change_is_said_with_the_numbers():
     assert not list(search_sentences.advice(summary(1.1, searched=1.2)))  # the search says that it found none
 
 
+@pytest.mark.parametrize(
+    ("tuned", "shown"),
+    [
+        ({"observer_gain": 50.0}, {"observer_gain"}),  # a plant with one input, or axes that ended alike
+        (
+            {"observer_gain": 45.0, "observer_gain_1": 50.0, "observer_gain_2": 40.0},
+            {"observer_gain_1", "observer_gain_2"},
+        ),
+    ],
+)
+def test_an_observer_tuned_axis_by_axis_is_shown(tuned, shown):
+    metric = {"rms": 1.0, "mean": 1.0, "max": 1.0}
+    flown = {"trials": 8, "counts": {"ok": 8}, "window_error": metric, "peak_torque": metric, "effort": metric}
+    each = {f"observer_gain_{k + 1}": 50.0 for k in range(len(shown))}
+    found = {"plant": "chain", "gains": each, "paper": {"gains": {"observer_gain": 10.0}, **flown}}
+    table = sentences.tuning({**found, "fresh": {"gains": tuned, **flown}})
+    assert {row[0] for row in table.rows if row[0].startswith("observer_gain")} == shown
+
+
 def test_a_campaign_does_not_fly_the_trials_of_a_search():
     from tuning.cli import main
 

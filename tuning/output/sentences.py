@@ -101,7 +101,7 @@ def tuning(summary: Summary) -> Table:
     gain_units = units(kind) | summary.get("gain_units", {})
     for gain in dict.fromkeys(name for group in groups.values() for name in group["gains"]):
         values = [group["gains"].get(gain, group["gains"].get(base(gain))) for group in groups.values()]
-        if len(set(values)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["gains"]):
+        if len(set(values)) > 1 and not (gain == "observer_gain" and "observer_gain_1" in summary["fresh"]["gains"]):
             rows.append((gain, *(digits(v, ".6g") for v in values), gain_units[base(gain)]))
     trials = summary["fresh"]["trials"]
     for label, metric, statistic in (
