@@ -56,6 +56,18 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
     assert not once.met
 
 
+def test_progress_after_a_search_says_whether_it_kept_the_limits(monkeypatch):
+    small_search(monkeypatch, 8)
+    monkeypatch.setattr(worst, "SCREENED", 2)
+    for limit, kept in ((0.01, False), (50.0, True)):
+        text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {limit}")
+        told = []
+        loaded = scenario.from_tables(tomllib.loads(text))
+        tuner.tune(loaded, 0, lambda *said, told=told: told.append(said), trusted=False, tries=1)
+        (over,) = (said[4] for said in told if said[0] == "judging on fresh trials")
+        assert (over == 0.0) is kept
+
+
 @pytest.mark.parametrize(
     ("metric", "values", "reached", "over"),
     [

@@ -49,6 +49,7 @@ class Search:
     problem: Problem  # with the hardest trials
     rounds: int = 0  # searches again with harder trials
     margin: float = MARGIN  # that was kept from the limits
+    over: float = 0.0  # how far the best point is beyond a limit less that margin, as progress tells it
     hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
     counts: list[confirm.Count] = field(default_factory=list)  # of requirements on a share, on other trials
     seconds: dict[str, float] = field(default_factory=dict)  # that each step of the search took
@@ -126,6 +127,7 @@ def search(
         problem=descents.problem,
         rounds=rounds.count,
         margin=margin,
+        over=best.over,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         seconds=report.seconds,

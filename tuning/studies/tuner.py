@@ -158,7 +158,7 @@ def tune(
     shortest = _shortest(posed, judged)
     trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
     if trusted and not outcome.interrupted:
-        report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, 0.0)
+        report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, outcome.over)
         trust_in_it = _trust(posed, judged)
         profiles = trust_in_it.profiles
         beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not profiles[name].flat})
@@ -194,7 +194,7 @@ def _search_and_judge(
     outcome = look(posed.own, scenario.search.starts, prepare=partial(_prepare, scenario))
     earlier = list[Try]()
     while True:
-        report("judging on fresh trials", 0, 0, outcome.value, 0.0)
+        report("judging on fresh trials", 0, 0, outcome.value, outcome.over)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
         over = _over(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
