@@ -431,6 +431,23 @@ def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
     assert ends[0][0] < 1e-3
 
 
+def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
+    """By delta alone, t_f as short as it can be, a limit might be broken: later ones are looked at."""
+    some = replace(problem(2), names=("t_f", "delta"))
+    evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
+    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
+    own = np.array([15.13, 0.79])  # handed over at 14.34 s, between samples 71 and 72
+    share = evaluate.bounds.share(own)
+    run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
+    moved = [np.asarray(evaluate.bounds.gains(jnp.asarray(one))) for one in run._with_the_hand_over_on_a_sample(some)]
+    on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
+    np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
+    with_delta = sorted(delta for t_f, delta in moved if abs(t_f - own[0]) < 1e-9)
+    np.testing.assert_allclose(with_delta, [0.73, 0.93], atol=1e-9)
+    with_t_f = sorted(t_f for t_f, delta in moved if abs(delta - own[1]) < 1e-9)
+    np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + descents.LATER), atol=1e-9)
+
+
 def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
     some = replace(problem(), names=THREE.names)
     own = np.array([3.0, 5.0, 2e-3])

@@ -28,6 +28,7 @@ EXPLORED, AVERAGED = 32, 16  # trials on which most starts are given up; at leas
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
+LATER = 4  # samples from the one before the hand-over on, to which it is moved with t_f
 MANY = 512  # points swept where there are no slopes
 
 SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
@@ -305,13 +306,17 @@ class Descents:
         named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
         t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)
         samples = (t_f - named["delta"]) / period
+        before, behind = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
+        moves = [(at, t_f - sample * period) for sample in sorted({before, behind})]
+        if "t_f" in named:  # it moves instead: where it is as short as limits allow, another delta may break one
+            of_t_f = problem.names.index("t_f")
+            moves += [(of_t_f, sample * period + named["delta"]) for sample in range(before, before + LATER)]
         shares = []
-        for sample in sorted({math.floor(samples + 1e-9), math.ceil(samples - 1e-9)}):
-            delta = t_f - sample * period
-            if bounds.lower[at] * (1 - 1e-9) <= delta <= bounds.upper[at]:
+        for k, time in moves:
+            if bounds.lower[k] * (1 - 1e-9) <= time <= bounds.upper[k]:
                 gains, share = self.gains.copy(), self.share.copy()
-                gains[at] = delta
-                share[at] = bounds.share(gains)[at]
+                gains[k] = time
+                share[k] = bounds.share(gains)[k]
                 shares.append(share)
         return shares
 
