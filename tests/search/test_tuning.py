@@ -321,6 +321,41 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert np.asarray(c).max() <= 0.0
 
 
+@pytest.mark.parametrize("second", ["better", "worse"])
+def test_where_going_on_with_harder_trials_leads_beyond_a_limit_it_starts_over(monkeypatch, second):
+    """Going on is made to end at gains that break the limit; starting over may find others, and nothing worse."""
+    helpers.small_search(monkeypatch)
+    monkeypatch.setattr(worst, "SCREENED", 16)
+    some, wanted = problem(peak_torque=1.4), [Requirement("peak_torque", 1.4)]
+    evaluate = Evaluator(shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    lost = np.array([[1.0, 0.0]])
+    seeds = []
+
+    def end_lost(run, harder):
+        bad = descent.Best(lost[0], 1, run._margin)
+        bad.offer(lost, evaluate.fly(run.tightened(harder), lost))
+        run._take(bad, run.tightened(harder), 0, afresh=True)
+
+    def explore(run, harder, starts, seed, own=descents.Descents.explore):
+        seeds.append(seed)
+        return own(run, harder, starts, seed)
+
+    def descend(run, harder, shares, own=descents.Descents.descend):
+        own(run, harder, shares)
+        if second == "worse" and len(seeds) == 2:
+            run._best.over = np.inf
+
+    joins = iter([True])  # once, nothing in fact
+    monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
+    monkeypatch.setattr(descents.Descents, "again", end_lost)
+    monkeypatch.setattr(descents.Descents, "explore", explore)
+    monkeypatch.setattr(descents.Descents, "descend", descend)
+    found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 10, 1))
+    assert seeds == [1, 2]
+    assert bool(found.worst[0] <= 1.0) is (second == "better")
+    assert np.array_equal(found.share, lost[0]) is (second == "worse")
+
+
 @pytest.mark.long
 def test_starts_begin_with_the_first_one_and_differ():
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))

@@ -230,6 +230,19 @@ class Descents:
         self._instead(problem, [(start, end.share) for start, end in ranked])
         self._finish(problem)
 
+    def start_over(self, problem: Problem, starts: int, seed: int) -> None:
+        """From other starts, with what has joined the problem; what was found of it before stays unless this is better.
+
+        Where harder trials have joined, going on from what was found for easier ones may end where no step is better.
+        """
+        found, better = (self.best, self._problem, self._from, self._ends), False
+        try:
+            self.descend(problem, self.explore(problem, starts, seed))
+            better = self.best.rank < found[0].rank
+        finally:  # interrupted too
+            if not better:
+                self._best, self._problem, self._from, self._ends = found
+
     def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]], fixed: Sequence[int] = ()) -> None:
         """Descend from each of these (start, shares); the best point found takes the place of the best so far."""
         for k, (start, share) in enumerate(ends):

@@ -103,12 +103,10 @@ def search(
             descents.descend(rounds.problem, shares)
         else:
             descents.evolve(rounds.problem, descents.share)
-        while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
-            tell(f"{ROUND}, round {rounds.count}")
-            if sloped:
-                descents.again(rounds.problem)
-            else:
-                descents.evolve(rounds.problem, descents.share, NEARBY)
+        _go_on(rounds, descents, tell, sloped=sloped)
+        if sloped and starts > 1 and rounds.count and descents.best.over > 0.0:
+            descents.start_over(rounds.problem, starts, settings.seed + 1)
+            _go_on(rounds, descents, tell, sloped=sloped)
         if settings.judged:
             rounds.judge(descents.gains, tell)
     except KeyboardInterrupt:
@@ -133,3 +131,13 @@ def search(
         seconds=report.seconds,
         interrupted=interrupted,
     )
+
+
+def _go_on(rounds: Rounds, descents: Descents, tell: Callable[[str], None], *, sloped: bool) -> None:
+    """Search on from what was found while harder trials join, or until these are out of reach."""
+    while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
+        tell(f"{ROUND}, round {rounds.count}")
+        if sloped:
+            descents.again(rounds.problem)
+        else:
+            descents.evolve(rounds.problem, descents.share, NEARBY)
