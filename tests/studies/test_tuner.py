@@ -68,6 +68,12 @@ def test_progress_after_a_search_says_whether_it_kept_the_limits(monkeypatch):
         assert (over == 0.0) is kept
 
 
+def test_every_column_of_a_history_has_a_name_of_its_own():
+    tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
+    columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])
+    assert columns == ["step", "start", "goal_t_f", "eta", "t_f", "peak_torque_over_limit"]
+
+
 @pytest.mark.parametrize(
     ("metric", "values", "reached", "over"),
     [

@@ -1,7 +1,7 @@
 """The files of a tuning run: summary, history, tuned scenario, figures."""
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -161,17 +161,21 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     """Fill a result folder; known_by: see `identity`."""
     store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
     store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
-    objective = scenario.search.objective
-    goal = objective if objective == "t_f" else f"{objective}_window_error"
-    over = [f"{m}_over_limit" for m in tuning.search.problem.rows]
     rows = [
         [step, row.start, row.value, *row.gains, *row.worst]
         for path in _paths(tuning.search.history)
         for step, row in enumerate(path)
     ]
-    store.write_csv(folder / "history.csv", ["step", "start", goal, *gain_names.named(scenario), *over], rows)
+    store.write_csv(folder / "history.csv", history_columns(scenario, tuning.search.problem.rows), rows)
     if figures:
         style.save(figures_of(scenario, tuning), folder / "figures")
+
+
+def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
+    """Names of the columns of `history.csv`; limited: metrics that the last ones tell as shares of limits."""
+    objective = scenario.search.objective
+    goal = "goal_t_f" if objective == "t_f" else f"{objective}_window_error"  # t_f is a gain's name too
+    return ["step", "start", goal, *gain_names.named(scenario), *(f"{metric}_over_limit" for metric in limited)]
 
 
 def _paths(history: Sequence[Step]) -> list[list[Step]]:
