@@ -35,14 +35,16 @@ class StarTimes:
 
     def age(self, sample: Any) -> Any:
         """How long before a control sample, given by its number, the star tracker's last sample was [s]."""
-        t = sample * self.period
-        last = jnp.floor((t + rounding(self.period, t)) / self.interval) * self.interval
-        return jnp.maximum(t - last, 0.0)
+        return jnp.maximum(sample * self.period - self._last(sample) * self.interval, 0.0)
 
     def due(self, sample: Any) -> Any:
         """Whether it has sampled since the control sample before this one, given by its number."""
-        # twice that by which a sample may count as early: its successor must not tell it again
-        return self.age(sample) < self.period - 2.0 * rounding(self.period, sample * self.period)
+        return self._last(sample) > self._last(sample - 1)  # none twice, none never, however times are rounded
+
+    def _last(self, sample: Any) -> Any:
+        """Number of the star tracker's last sample."""
+        t = sample * self.period
+        return jnp.floor((t + rounding(self.period, t)) / self.interval)
 
 
 def star_times(interval: float, period: float) -> StarTimes:

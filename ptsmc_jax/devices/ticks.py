@@ -23,4 +23,4 @@ def rounding(period: Any, t: Any) -> Any:
 
     With 64 bits the latter is less; with 32 a period of 0.01 s is known to 4e-5 of it after half a minute.
     """
-    return 1e-9 * period + 4.0 * jnp.finfo(jnp.result_type(float)).eps * t
+    return 1e-9 * period + 4.0 * jnp.finfo(jnp.result_type(float)).eps * jnp.abs(t)

@@ -1,6 +1,7 @@
 """Shares of time in what is said of a campaign, and how its figures judge trials."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -54,5 +55,5 @@ def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch
     monkeypatch.setattr(campaign_summary.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
     monkeypatch.setattr(campaign_summary.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
     tables = SimpleNamespace(controller=SimpleNamespace(t_f=1.0), plant=SimpleNamespace(kind="spacecraft"))
-    folder = SimpleNamespace(flights=None, scenario=tables)
+    folder: Any = SimpleNamespace(flights=None, scenario=tables)
     assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == ([100, 250], 250)
