@@ -185,8 +185,8 @@ def _flown(
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
     """Verdicts, quantiles with intervals and figures of a campaign, from its rows.
 
-    Exit status: 0 every requirement met (without any: no trial failed or missed t_f), 1 not so or not all trials flown
-    yet, 2 bad input, among it rows that are damaged.
+    Exit status: 0 every requirement met (without any: no trial failed or missed t_f), 1 not so, or not all trials flown
+    and margins judged yet, 2 bad input, among it rows that are damaged.
     """
     _configured(folder)
     from tuning.studies import campaign_folder
