@@ -322,10 +322,10 @@ def _number(value: float | None) -> str:
 
 def campaign_counts(summary: Summary) -> Iterator[str]:
     """How the trials ended, and why."""
-    if summary["status"] == "unfinished":
+    if summary["flown"] < summary["trials"]:
         yield f"NOT finished: {summary['flown']} of {summary['trials']} trials are flown"
-        for name in summary.get("unjudged", ()):
-            yield f"{name} is asked for and NOT judged yet: the same `ptsmc montecarlo` again judges it"
+    for name in summary.get("unjudged", ()):
+        yield f"NOT finished: {name} is asked for and not judged yet; the same `ptsmc montecarlo` again judges it"
     counts = ", ".join(f"{count} {status}" for status, count in summary["counts"].items() if count)
     of = f"the plan {summary['plan']} and seed" if summary.get("plan") else "seed"
     yield f"{summary['flown']} trials of {of} {summary['seed']}: {counts}"
