@@ -21,6 +21,7 @@ class Ticks(NamedTuple):
 def rounding(period: Any, t: Any) -> Any:
     """By how much times about t [s] may differ and still count as equal [s]: 1e-9 of a period, and what numbers lose.
 
-    With 64 bits the latter is less; with 32 a period of 0.01 s is known to 4e-5 of it after half a minute.
+    With 64 bits the latter is less; with 32 a period of 0.01 s is known to 4e-5 of it after half a minute. Times may be
+    negative, of samples that are counted from the hand-over.
     """
     return 1e-9 * period + 4.0 * jnp.finfo(jnp.result_type(float)).eps * jnp.abs(t)
