@@ -16,8 +16,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, cholesky, filter_gains
-from ptsmc_jax.devices.ticks import rounding
-from ptsmc_jax.numerics import matrices
+from ptsmc_jax.numerics import guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 ROUNDING = 1e-9  # share of a period by which ages may differ and still count as equal
@@ -44,7 +43,7 @@ class StarTimes:
     def _last(self, sample: Any) -> Any:
         """Number of the star tracker's last sample."""
         t = sample * self.period
-        return jnp.floor((t + rounding(self.period, t)) / self.interval)
+        return jnp.floor((t + guards.rounding(self.period, t)) / self.interval)
 
 
 def star_times(interval: float, period: float) -> StarTimes:

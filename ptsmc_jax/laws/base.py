@@ -135,7 +135,8 @@ class PrescribedTimeLaw(Law):
         """Which periods, from t to t_next [s], the hold's gains rule: with implicit sampling by where they end."""
         if not self.implicit:
             return hold
-        return hold | (t_next > self.hand_over - 1e-6 * (t_next - t))  # rounding must not cost a period
+        by_rounding = guards.rounding(t_next - t, t_next)  # which must not cost a period
+        return hold | (t_next > self.hand_over - by_rounding)
 
     def remaining_share(self, now: Sample) -> Scalar:
         """Share r of the time to t_f that is left at the end of the period that begins [-]; 1 in hold.

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.ticks import Ticks, rounding
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
 
@@ -84,7 +85,7 @@ class Flight:
         """Control periods for this prescribed time and delta [s]."""
         nodes = _not_above(jnp.arange(self.count + 1) * self.period, self.t_end)
         t, t_next = nodes[:-1], nodes[1:]
-        hold = t >= t_f - delta - rounding(self.period, t_f)  # which must not cost a period
+        hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # which must not cost a period
         return Ticks(t, t_next, hold, jnp.arange(self.count, dtype=jnp.int32), jnp.ones_like(t))
 
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.ticks import rounding
 from ptsmc_jax.numerics import attitude, elementary, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
@@ -233,7 +232,7 @@ def update(
     window_end = begins + (tally.windows + 1.0) * window
     until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
     observed = t_next > begins
-    closes = observed & (window_end <= t_next + rounding(window, t_next))
+    closes = observed & (window_end <= t_next + guards.rounding(window, t_next))
     first, last = error.at(share), error.at(until)
     # the observation's first moment counts; later intervals begin where the ones before have ended
     opened = guards.select(t <= begins, tally.window.including(first), tally.window)

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from ptsmc_jax import programs
-from ptsmc_jax.devices.ticks import Ticks, rounding
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import continuous, sampled
@@ -67,7 +68,7 @@ def simulate(
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     """First time without samples [s], where the clock was made for shorter t_f or delta than it got; NaN: none."""
     first, last = ticks.t[0], ticks.t_next[-1]
-    ends = jnp.where(last < t_end - rounding(t_end, t_end), last, jnp.nan)
+    ends = jnp.where(last < t_end - guards.rounding(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
