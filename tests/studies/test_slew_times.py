@@ -102,6 +102,13 @@ def test_usual_times_go_from_half_to_twice_the_scenarios():
     assert slew_times.usual_times(scenario.from_tables({})) == (15.0, 21.0, 30.0, 42.0, 60.0)
 
 
+def test_a_study_is_known_by_all_digits_of_its_times():
+    """Of six digits, others' results were shown as already done."""
+    known = scenario.from_tables({})
+    listed = [slew_times.identity(known, 0, times)["times"] for times in ((100.0001, 20), (20.0, 100.0002), (20, 30))]
+    assert listed == ["20,100.0001", "20,100.0002", "20,30"]
+
+
 def test_costs_are_those_that_the_scenario_has():
     def costs(**tables):
         return slew_times._costs(scenario.from_tables(tables))

@@ -133,7 +133,7 @@ def _costs(scenario: Scenario) -> list[str]:
 
 def identity(scenario: Scenario, seed: int, times: Sequence[float]) -> dict[str, Any]:
     """What `versions.json` knows a finished or interrupted study by; times in [s]."""
-    listed = ",".join(f"{t_f:g}" for t_f in sorted(times))
+    listed = ",".join(str(float(t_f)).removesuffix(".0") for t_f in sorted(times))  # every digit
     return {"command": "pareto", "seed": seed, "against": T_F, "times": listed, **own.digests(scenario)}
 
 
