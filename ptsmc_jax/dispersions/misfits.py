@@ -92,6 +92,14 @@ def _check_wheel(given: Given, parts: Parts) -> None:
     UnfitError.check(fit, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
 
 
+def _check_jitter(given: Given, parts: Parts) -> None:
+    """No control period is longer than the window over which pointing is averaged."""
+    if parts.pointing is not None:
+        most = 0.5 * (float(parts.pointing.window) / float(parts.period) - 1.0)
+        fit = given["timing_jitter"][:, 0] <= most + 1e-9
+        UnfitError.check(fit, lambda row: f"at most {most:.6g}, by which no control period exceeds pointing.window")
+
+
 def _check_coupling(given: Given, parts: Parts) -> None:
     """The body can be, with the inertia that a row gives or else the nominal one."""
     rows = given["mode_coupling"].reshape(-1, _modes(parts), 3)
@@ -144,6 +152,7 @@ OF_MISFITS: dict[str, Quantity] = {
         lambda parts: jnp.zeros(1) if parts.jitter is None else jnp.reshape(parts.jitter, 1),
         lambda parts, share: replace(parts, jitter=share[0]),
         fitting(lambda rows: (rows >= 0.0) & (rows < 0.5), "a share of the control period from 0 to below 0.5"),
+        check_with=_check_jitter,
     ),
     "mode_frequency": Quantity(
         lambda parts: numbered("mode_frequency_", _modes(parts)),

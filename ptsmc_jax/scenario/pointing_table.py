@@ -37,8 +37,11 @@ class Pointing(Table, frozen=True):
             raise wrong("pointing.after", self.after, latest)
         sampled = scenario.loop.mode == "sampled"
         least, what = (scenario.loop.period, "loop.period") if sampled else (LONGEST_STEP, "the longest step")
+        jitter = getattr(scenario.dispersion, "timing_jitter", None)
+        if sampled and jitter is not None:  # in which a period may end late that began early
+            least, what = least * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"
         if self.window < least * (1 - 1e-9):
-            raise wrong("pointing.window", self.window, f"at least {what}, {least}")
+            raise wrong("pointing.window", self.window, f"at least {what}, {least:.9g}")
 
     def build(self, scenario: Any) -> Any:
         """`pointing.Pointing`, with the limits of which shares of time are asked for."""

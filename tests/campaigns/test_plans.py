@@ -267,6 +267,7 @@ loop = { mode = "sampled", period = 0.1 }
 hardware = { attitude_noise = 1e-5, rate_noise = 1e-5 }
 filter = { kind = "steady_state", bandwidth = 1.0 }
 wheels = { kind = "pyramid", torque_limit = 2.0 }
+pointing = { window = 0.16 }
 """
 COUPLING = [f"mode_coupling_1{i}" for i in (1, 2, 3)]
 OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
@@ -282,6 +283,8 @@ MISFIT = [
     (FAILURE, [(2.0, 4.0), (2.0, 5.0)], f"= 2, 5 in row 1, {ONE_WHEEL}"),
     (FAILURE, [(2.0, 0.0), (2.0, -3.0)], f"= 2, -3 in row 1, {ONE_WHEEL}"),
     (FAILURE, [(2.0, 1.0), (2.0, 1.5)], f"= 2, 1.5 in row 1, {ONE_WHEEL}"),
+    (["timing_jitter"], [(0.3,), (0.31,)],
+     "timing_jitter 0.31 in row 1, but must have at most 0.3, by which no control period exceeds pointing.window"),
     (COUPLING, [(1.5, 0.0, 0.0), (5.0, 0.0, 0.0)],
      f"mode_coupling_11 to mode_coupling_13 = 5, 0, 0 in row 1, {NO_BODY}positive definite (its smallest "
      "principal moment is -15 kg m^2))"),

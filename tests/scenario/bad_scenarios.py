@@ -289,6 +289,11 @@ BAD = [
         "dispersion.timing_jitter.smallest is 0.2",
         "at most 0.1, the largest",
     ),
+    (
+        SAMPLED + "pointing.window = 0.05\ndispersion.timing_jitter = { largest = 0.1 }",
+        "pointing.window is 0.05",
+        "at least the longest control period with its jitter, 0.06",
+    ),
     ("dispersion.mode_frequency = {}", "dispersion.mode_frequency needs flexible modes", "no [flexible] table"),
     (
         FLEXIBLE + "dispersion.mode_coupling = { kind = 'relative_uniform', half_width = 0.99 }",
