@@ -20,7 +20,7 @@ from tests import helpers
 from tests.helpers import FIRST_FLIGHT, chain_parts, parts, vector
 from tuning.output import search_sentences
 from tuning.search import cma_es, confirm, descent, descents, gains, objective, optimise, rounds, shares, starts, worst
-from tuning.search.evaluate import Evaluator, Sloped
+from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.studies import judging, posing, tune_files
 
 TURNED = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -244,6 +244,22 @@ def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
     assert found.worst[0] > descent.BROKEN
     assert found.worst[1] < 1.0
     np.testing.assert_array_equal(found.worst, found.ended)
+
+
+@pytest.mark.parametrize("far", [0.5, 1e7])
+def test_a_failed_trial_is_worse_than_any_that_ends_however_far_beyond_its_limit(far):
+    """Two trials at two points: nearer the limit with one that fails, farther with none."""
+    c = np.asarray([[[0.4 * far, objective.FAILED - 1.0]], [[far, far]]])
+    seen = Measured(np.zeros((2, 1)), np.asarray([1.0, 2.0]), c, np.zeros(2))
+    share = np.asarray([[0.2], [0.8]])
+    for order in ([0, 1], [1, 0]):
+        best = descent.Best(np.zeros(1), 1, 0.0)
+        for k in order:
+            best.offer(share[k : k + 1], seen.at(k))
+        assert best.share == share[1]
+        assert not best.failed
+    best.offer(share, seen)
+    assert best.share == share[1]
 
 
 @pytest.mark.long

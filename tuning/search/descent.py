@@ -11,7 +11,7 @@ from tuning.search.evaluate import Measured, Sloped
 from tuning.search.objective import ended, failures
 
 SLACK = 1e-4  # of a limit that an admissible point may use
-BROKEN = 1e3  # metric / limit by which a trial that fails is over, beside those that end
+BROKEN = 1e3  # metric / limit by which a trial that fails is over, as progress tells it, beside those that end
 CLOSE = 1e-5  # change of F at which a descent ends
 BOLD, CAREFUL = 1.0, 4.0  # a first step that may lead across the bounds into a better valley, and one that stays
 # change of F between two bounds of a gain: where the loop chatters slopes are many orders larger, and say nothing
@@ -24,21 +24,30 @@ def largest(c: np.ndarray, margin: float) -> np.ndarray:
 
 
 class Best:
-    """The best point so far: an admissible one by its F, another one by how far it is over.
+    """The best point so far: an admissible one by its F, another one by how many trials fail, then how far it is over.
 
-    A trial that fails counts as `BROKEN` beyond its limit: more of them are worse, and what the others do still counts.
+    However far beyond a limit, a trial that ends is better than one that fails.
     """
 
     def __init__(self, share: np.ndarray, requirements: int, margin: float):
         self.margin, self.share = margin, share.copy()  # (gains,) where nothing better is known
-        self.f = self.value = self.over = np.inf
-        self.failed = False  # whether a trial fails there, or has no value
+        self.f = self.value = self.over = self.lost = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 
     @property
-    def rank(self) -> tuple[float, float]:
+    def failed(self) -> bool:
+        """Whether a trial fails there, or has no value."""
+        return 0.0 < self.lost < np.inf
+
+    @property
+    def beyond(self) -> tuple[float, float]:
+        """How many trials fail there, or have no value, and how far it is over: none of it where it is admissible."""
+        return self.lost, self.over
+
+    @property
+    def rank(self) -> tuple[float, float, float]:
         """The less, the better."""
-        return self.over, self.f
+        return self.lost, self.over, self.f
 
     @property
     def so_far(self) -> tuple[float, float]:
@@ -49,12 +58,13 @@ class Best:
         """Keep the best of these points, (points, gains), if it is better; admissible is what keeps the margin."""
         worst = largest(seen.c, self.margin)
         over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
-        over = np.where(np.isfinite(seen.f), over + BROKEN * failures(seen.c), np.inf)
-        first = int(np.lexsort((seen.f, over))[0])
-        if np.isfinite(seen.f[first]) and (over[first], seen.f[first]) < self.rank:
+        lost = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
+        over = over + BROKEN * lost
+        first = int(np.lexsort((seen.f, over, lost))[0])
+        if np.isfinite(seen.f[first]) and (lost[first], over[first], seen.f[first]) < self.rank:
             self.share, self.worst = share[first].copy(), worst[first]
-            self.f, self.value, self.over = float(seen.f[first]), float(np.exp(seen.value[first])), float(over[first])
-            self.failed = bool(failures(seen.c)[first])
+            self.f, self.value = float(seen.f[first]), float(np.exp(seen.value[first]))
+            self.lost, self.over = float(lost[first]), float(over[first])
 
 
 class _EnoughError(Exception):

@@ -181,8 +181,8 @@ class Descents:
         for count, steps in rungs:
             self._descend_in_lockstep(problem, {k: racers[k] for k in ranked[:count]}, steps, what, afresh=afresh)
             afresh = False
-            ended = [k for k in ranked if k in self._ends]
-            ranked = sorted(ended, key=lambda k: charged(self._ends[k].f, self._ends[k].over, STEEP))
+            ends = {k: self._ends[k] for k in ranked if k in self._ends}
+            ranked = sorted(ends, key=lambda k, ends=ends: (ends[k].lost, charged(ends[k].f, ends[k].over, STEEP)))
         return ranked
 
     def _descend_in_lockstep(
@@ -274,7 +274,7 @@ class Descents:
         on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
         if on_samples.size:
             best = self._best_of(tightened, on_samples)
-            self._take(best, tightened, 0, afresh=best.over <= self.best.over)
+            self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
 
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.so_far)
@@ -305,7 +305,7 @@ class Descents:
             self._best = next((best for best in reversed(together) if self._as_good(best)), current)
 
     def _as_good(self, best: Best) -> bool:
-        return best.over <= self.best.over and best.f <= self.best.f + SAME
+        return best.beyond <= self.best.beyond and best.f <= self.best.f + SAME
 
     def _with_the_hand_over_on_a_sample(self, problem: Problem) -> list[np.ndarray]:
         """The best gains with the nearest hand-overs that are flown as they are trained; none where all are.
