@@ -42,7 +42,8 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
     np.testing.assert_allclose(found.search.margin, 1 - reached / (1.02 * second.over["peak_torque"]), rtol=1e-3)
     np.testing.assert_allclose(found.search.worst, 1 - found.search.margin, rtol=1e-3)  # the limit is active
     goes_on = {step.start: step.gains for step in reversed(found.search.history)}  # each start's first gains
-    for one, start in zip((first, second), sorted(goes_on)[-2:], strict=True):
+    assert sorted(goes_on) == [0, 1, 2, 3, 4, 5]  # two of each search: near those gains there may be none
+    for one, start in zip((first, second), (2, 4), strict=True):
         np.testing.assert_allclose(goes_on[start], [*one.gains.values()], rtol=1e-5)  # they are told in six digits
     assert [step.start for step in found.search.history] == sorted(step.start for step in found.search.history)
     told = [one for one in search_sentences.search(tune_files.summary(found)) if "went on" in one]

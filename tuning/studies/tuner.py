@@ -127,8 +127,8 @@ def tune(
 ) -> Tuning:
     """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw.
 
-    Where these break a limit that the search kept, it goes on from the gains it found with more distance from the
-    limits, and is judged on others.
+    Where these break a limit that the search kept, it goes on from the gains it found, and from as many starts as
+    before, with more distance from the limits, and is judged on others.
 
     Args:
         scenario: what is tuned.
@@ -191,7 +191,8 @@ def _search_and_judge(
 ) -> tuple[_Judged, list[Try]]:
     """Search and judge; again, with more distance from the limits, where fresh trials break what the search kept."""
     look = partial(posed.search, posed.problem, report=report)
-    outcome = look(posed.own, scenario.search.starts, prepare=partial(_prepare, scenario))
+    starts = scenario.search.starts  # of a further search too: near the gains found there may be none that keep more
+    outcome = look(posed.own, starts, prepare=partial(_prepare, scenario))
     earlier = list[Try]()
     while True:
         report("judging on fresh trials", 0, 0, outcome.value, outcome.over)
@@ -201,7 +202,8 @@ def _search_and_judge(
             return judged, earlier
         earlier.append(Try(judged.seed, judged.gains, outcome.margin, over))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # on the trials of the search
-        more = look(outcome.gains, 1, margin=1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over))
+        margin = 1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over)
+        more = look(outcome.gains, starts, margin=margin)
         outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
 
 
