@@ -2,6 +2,7 @@
 
 import csv
 import json
+import tomllib
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
 from tuning.output import sentences
-from tuning.studies import judging, slew_times
+from tuning.studies import judging, posing, slew_times
 
 
 def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
@@ -50,6 +51,20 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert "--against t_f --times 4,8" in page.text
     assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
     assert "already done" in command("pareto", "c.toml", "--against", "t_f", "--times", "8,4", "--out", "cost")[1]
+
+
+def test_each_time_is_searched_for_itself(monkeypatch):
+    """Not from the gains of others alone, which may lie in another valley."""
+    small_search(monkeypatch, 8)
+    searched, search = [], posing.Posed.search
+
+    def note(posed, problem, own, starts, *asked, **told):
+        searched.append((float(problem.parts.controller.t_f), starts > 1))
+        return search(posed, problem, own, starts, *asked, **told)
+
+    monkeypatch.setattr(posing.Posed, "search", note)
+    slew_times.trace(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 0, (4.0, 6.0, 8.0))
+    assert searched == [(8.0, True), (4.0, True), (6.0, True)]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """What a faster slew costs: the best gains for each of some prescribed times, judged on fresh trials.
 
-One program flies every time: the shortest and the longest are searched from scratch, and each other one starts from
-what its neighbours found, down the ladder of times and up again, as the front against the torque does.
+One program flies every time: each is searched from scratch, since the gains found for others may lie in another valley
+than its best ones, and then starts from what its neighbours found, down the ladder of times and up again, as the front
+against the torque does.
 """
 
 from collections.abc import Sequence
@@ -107,6 +108,10 @@ def trace(
         shares.append(outcome.share)
         # the hardest trials that joined are asked for at every time
         ladder = [replace(outcome.problem, parts=one.parts) for one in ladder]
+    for k in range(len(times) - 2, 0, -1):
+        report = headed(tell, f"{times[k]:g} s")
+        outcome = posed.search(ladder[k], posed.own, pareto.FEWER, (), judged=False, report=report)
+        shares.append(pareto.uninterrupted(outcome).share)
     best = pareto.climbed(ladder, shares, posed, tell)
     fresh_seed, slews = judging.seed_of_judge(seed), []
     ready = study(judging.as_flown(base), reach=posing.reach(base, base.search, t_f=times[-1]))
