@@ -13,12 +13,15 @@ from tuning.search.shares import Bounds
 
 
 class Valley(Evaluator):
-    """F = x'A x, x a share of the bounds less 0.5, with a'x >= b; no numbers beyond `wall` in the first gain."""
+    """F = x'A x, x a share of the bounds less 0.5, with a'x >= b; no numbers beyond `wall` in the first gain.
 
-    def __init__(self, matrix, along=None, least=0.0, wall=1.0):
+    Short of `lost` in it a trial fails that does not count in F.
+    """
+
+    def __init__(self, matrix, along=None, least=0.0, wall=1.0, lost=-1.0):
         one = (1.0,) * len(matrix)
         super().__init__(Bounds(("eta", "delta", "observer_gain")[: len(matrix)], one, one))
-        self.matrix, self.along, self.least, self.wall = matrix, along, least, wall
+        self.matrix, self.along, self.least, self.wall, self.lost = matrix, along, least, wall, lost
         self.seen = []
 
     def fly(self, problem, share):
@@ -26,6 +29,7 @@ class Valley(Evaluator):
         self.seen.append(x)
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))
         over = np.zeros(len(share)) - 1.0 if self.along is None else self.least - x @ self.along
+        over = np.where(x[:, 0] < self.lost, objective.FAILED - 1.0, over)
         return Measured(share, f, over[:, None, None], f)
 
 
@@ -65,6 +69,14 @@ def test_a_limit_is_followed_to_the_optimum_on_it(seed):
     assert best.over == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # SLACK beyond the limit is allowed
     assert best.f <= optimum + 5.0 * cma_es.GAINED
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gains_with_a_trial_that_fails_lead_nowhere(seed):
+    """F falls on where one that is no part of it fails."""
+    best, _ = refined(Valley(np.eye(2), lost=0.2), [0.4, 0.1], seed)
+    assert not best.failed
+    assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * cma_es.GAINED
 
 
 def test_a_single_gain_is_refined_too():

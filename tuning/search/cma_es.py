@@ -7,7 +7,7 @@ from cmaes import CMA
 
 from tuning.search.descent import SLACK, Best
 from tuning.search.evaluate import Evaluator, Measured
-from tuning.search.objective import Problem
+from tuning.search.objective import Problem, failures
 from tuning.search.starts import STEEP, merit
 
 GENERATIONS = 40  # at most: `PATIENCE` ends it earlier
@@ -43,7 +43,7 @@ def evolve(
         merits = np.nan_to_num(merit(seen, STEEP), nan=WORST, posinf=WORST)
         evolution.tell(list(zip(share, merits.tolist(), strict=True)))
         over = np.maximum(seen.beyond - SLACK, 0.0)
-        first = int(np.lexsort((seen.f, over))[0])
+        first = int(np.lexsort((seen.f, over, failures(seen.c)))[0])
         best.offer(share[first : first + 1], seen.at(first))
         keep(seen.at(first))
         record.append(best.f if best.over == 0.0 else np.inf)

@@ -1,5 +1,6 @@
 """Where a search starts: points spread over the bounds, and the most promising of them that lie far apart."""
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from tuning.search.evaluate import Evaluator, Measured, Sloped
-from tuning.search.objective import Problem
+from tuning.search.objective import FAILED, Problem, failures
 from tuning.search.progress import Report
 
 SWEPT = 64  # points flown, among which starts are chosen
@@ -92,8 +93,11 @@ def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
 
 
 def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
-    """(points,) F, with what the trials that end are beyond a limit charged, so many times as hard."""
-    return charged(flown.f, flown.beyond, times)
+    """(points,) F, with what the trials that end are beyond a limit charged so many times as hard, and each that fails.
+
+    F knows of those alone that are averaged, and where t_f is minimised of none.
+    """
+    return charged(flown.f + math.log(FAILED) * failures(flown.c), flown.beyond, times)
 
 
 def charged(f: Any, beyond: Any, times: float) -> Any:
