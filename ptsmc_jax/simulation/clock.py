@@ -19,11 +19,6 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
 
-def _not_below(t: Array, limit: Scalar | float) -> Array:
-    """max(t, limit), with the derivative of `limit` where they are equal: a length of 0 then has derivative 0."""
-    return jnp.where(t > limit, t, limit)
-
-
 def _not_above(t: Array, limit: Scalar) -> Array:
     """min(t, limit), with the derivative of `limit` where they are equal."""
     return jnp.where(t < limit, t, limit)
@@ -60,9 +55,11 @@ class Anchored:
         sample = jnp.arange(-self.before, self.after, dtype=jnp.int32)
         # one array of nodes, so that one interval ends where, to the last bit, the next begins
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1) * self.period
-        nodes = _not_above(_not_below(nominal, 0.0), self.t_end)
+        # a sample that rounding alone puts after t = 0 is the one there: else two of them, and slopes between their two
+        begun = nominal > rounding(self.period, t_f)
+        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end)
         t, t_next = nodes[:-1], nodes[1:]
-        partial = jnp.where(nominal[:-1] < 0.0, (t_next - t) / self.period, 1.0)
+        partial = jnp.where(begun[:-1], 1.0, (t_next - t) / self.period)
         return Ticks(t, t_next, sample >= 0, sample, partial)
 
 

@@ -44,6 +44,27 @@ def test_anchored_ticks_are_continuous_where_delta_is_a_multiple_of_the_period(p
     np.testing.assert_allclose(np.sum(np.asarray(slopes[1] - slopes[0])), 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(("t_f", "delta"), [(12.0, 0.7), (30.3, 0.9), (12.0, 0.8), (30.0, 0.7)])
+def test_rounding_makes_no_sample_just_after_the_first_one(t_f, delta):
+    """12.0 - 0.7 is 8e-17 s beyond 113 periods: a run had two samples at t = 0, slopes of its peak half of each."""
+    anchored = clock.anchored(0.1, t_f + 4.03, t_f, 6.0)
+
+    @jax.jit  # whose rounding is another one
+    def starts(delta):
+        return ticks_of(anchored, vector(t_f), delta).t
+
+    @jax.jit
+    def lengths(delta):
+        ticks = ticks_of(anchored, vector(t_f), delta)
+        return ticks.t_next - ticks.t
+
+    at = vector(delta)
+    flown = np.asarray(lengths(at))[np.asarray(lengths(at)) > 0]
+    np.testing.assert_allclose(flown, [0.1] * round((t_f + 4.0) / 0.1) + [0.03], atol=1e-12)
+    for function in (starts, lengths):  # slopes are those of a slightly larger delta
+        np.testing.assert_array_equal(jax.jacfwd(function)(at), jax.jacfwd(function)(at + 1e-6))
+
+
 def test_a_partial_first_period_takes_part_of_its_noise_from_the_next_sample():
     ticks = ticks_of(clock.anchored(0.1, 15.0, 10.0, 8.0), vector(10.0), vector(1.07))
     first = int(np.flatnonzero(np.asarray(ticks.t_next) > 0)[0])
