@@ -56,7 +56,7 @@ class Anchored:
         # one array of nodes, so that one interval ends where, to the last bit, the next begins
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1) * self.period
         # a sample that rounding alone puts after t = 0 is the one there: else two of them, and slopes between their two
-        begun = nominal > rounding(self.period, t_f)
+        begun = nominal > guards.rounding(self.period, t_f)
         nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end)
         t, t_next = nodes[:-1], nodes[1:]
         partial = jnp.where(begun[:-1], 1.0, (t_next - t) / self.period)
