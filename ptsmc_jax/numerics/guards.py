@@ -77,4 +77,9 @@ def rounding(period: Any, t: Any) -> Any:
     With 64 bits the latter is less; with 32 a period of 0.01 s is known to 4e-5 of it after half a minute. Times may be
     negative, of samples that are counted from the hand-over.
     """
-    return 1e-9 * period + 4.0 * jnp.finfo(jnp.result_type(float)).eps * jnp.abs(t)
+    return 1e-9 * period + resolution() * jnp.abs(t)
+
+
+def resolution() -> float:
+    """By how much numbers of the type in use may be off in a few operations, relative [-]: 4 eps."""
+    return 4.0 * float(jnp.finfo(jnp.result_type(float)).eps)

@@ -17,13 +17,13 @@ from ptsmc_jax.batching.dependence import dependence
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.attitude_filter import Estimate
 from ptsmc_jax.laws.base import Law, Sample
+from ptsmc_jax.numerics import guards
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE
 
-ROUNDING = 1e-9  # of a period, which must not cost one: as `clock.Flight` has it
 UNIT = 1e-12  # a quaternion whose square is off by less is taken as it is
 KNOWN = 0.25  # |q|^2 of an attitude that has been set
 
@@ -283,7 +283,7 @@ def _commanding(computer: Board, law: Law, observer: Observer) -> None:
     def command(parameters: Any, t: Any, tracking: Any, d_hat: Any, last_memory: Any, *read: Any) -> dict[str, Any]:
         known, period = parameters["law"], parameters["period"]
         now, reference = computer.state_of(read[: len(computer.seen)]), parameters["reference"](t)
-        hold = t >= known.hand_over - ROUNDING * period
+        hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
 
         def decided() -> Any:
             return known.command(last_memory, Sample(t, hold, period), now, reference, d_hat, parameters["bound"](t))

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from ptsmc_jax.numerics import guards
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
 
 WIDTH = 110  # of a line
@@ -14,7 +15,7 @@ RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p "
     "out before now y0 y1 yn j0 j1 jn gamma main index div exp log sin cos tan sqrt pow abs larger smaller "
-    "sign_of".split()
+    "sign_of resolution".split()
 )
 INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13), "rem": ("%", 13), "lt": ("<", 10),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
@@ -227,7 +228,8 @@ class Printer:
 
     def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
-            return number(node.value, node.kind), ATOM
+            own = node.kind == REAL and node.value == guards.resolution()  # of the type that C is compiled with
+            return "resolution()" if own else number(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
         if node.op in ATOMS or (id(node) in self.kept and not inside):

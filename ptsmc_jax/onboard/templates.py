@@ -167,6 +167,9 @@ typedef ptsmc_real real;
 HELPERS = {
     "larger": "static real larger(real a, real b)\n{\n    return a > b ? a : b;\n}\n",
     "smaller": "static real smaller(real a, real b)\n{\n    return a < b ? a : b;\n}\n",
+    "resolution": "/* By how much numbers of the type in use may be off, relative: four times what 1 and the next are\n"
+    "   apart. */\nstatic real resolution(void)\n{\n"
+    "    return sizeof(real) < sizeof(double) ? R(4.76837158203125e-07) : R(8.881784197001252e-16);\n}\n",
     "sign_of": "static real sign_of(real x)\n{\n    return x > R(0) ? R(1) : (x < R(0) ? R(-1) : R(0));\n}\n",
     "larger_whole": "static int32_t larger_whole(int32_t a, int32_t b)\n{\n    return a > b ? a : b;\n}\n",
     "smaller_whole": "static int32_t smaller_whole(int32_t a, int32_t b)\n{\n    return a < b ? a : b;\n}\n",

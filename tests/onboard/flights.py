@@ -6,6 +6,7 @@ from tests.tree import ROOT
 
 LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 LAW = {"t_f": 5.0, "delta": 0.5}
+BETWEEN = {"t_f": 5.3, "delta": 0.6}  # single precision puts the hand-over behind its sample
 NOISE = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
 MISFITS = {**SPREAD, "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
@@ -31,7 +32,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "raw": flight(),
     "filter": flight(**FILTER),
     "wheels": flight(**FILTER, wheels={"torque_limit": 2.0, "momentum_limit": 2.0}, spacecraft={"inertia": FULL},
-                     dispersion=MISFITS),
+                     dispersion=MISFITS, controller=BETWEEN),
     "chain": CHAIN,
     "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
                              reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
@@ -46,7 +47,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "implicit": flight(controller={"sampling": "implicit"}),
     "chain of order 4": {**CHAIN, "plant": {"kind": "chain", "order": 4, "x0": [1.0, 0.0, 0.0, 0.0]},
                          "hardware": {}, "dispersion": {}, "controller": {"t_f": 5.0, "delta": 1.0}},
-    "implicit chain": {**CHAIN, "controller": {**LAW, "sampling": "implicit"}},
+    "implicit chain": {**CHAIN, "controller": {**BETWEEN, "sampling": "implicit"}},
     "delay, limit, quantised": flight(hardware={"delay": 2, "torque_limit": 3.0, "torque_step": 1e-3},
                                       controller={"delta": 1.0}),
     "lag and rate limit": flight(

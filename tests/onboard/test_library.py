@@ -216,9 +216,10 @@ def test_limits_are_told(exported):
 
 
 @needs_compiler
-def test_single_precision_flies_as_well(exported):
+@pytest.mark.parametrize("name", ["wheels", "implicit chain"])
+def test_single_precision_flies_as_well(exported, name):
     """Statistics to three digits: see `benchmarks/exported_c.py`; one run's peak, and its error at t_f."""
-    made, library = exported("wheels", "float")
+    made, library = exported(name, "float")
     single = InTheLoop(library, made.ready.parts).software
     ours, theirs = runs.fly(made.ready, 3, 2), runs.fly(made.ready, 3, 2, single)
     for name in ("peak_torque", "window_error", "effort"):
