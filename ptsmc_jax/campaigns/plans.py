@@ -168,7 +168,7 @@ def _all(columns: list[str]) -> str:
 
 
 def _refused(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
-    shown = "empty" if value is None else value
+    shown = "empty" if value is None else value.to_list() if isinstance(value, pl.Series) else value
     return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")
 
 

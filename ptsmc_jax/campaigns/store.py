@@ -57,9 +57,10 @@ def read_versions(folder: Path) -> dict[str, Any]:
 def previous(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> dict[str, Any] | None:
     """The summary of the same scenario with the same command, seed and what else made it (`versions`); None: none."""
     try:
-        return json.loads((folder / SUMMARY).read_text()) if _same(folder, scenario, made_by) else None
+        summary = json.loads((folder / SUMMARY).read_text()) if _same(folder, scenario, made_by) else None
     except (OSError, ValueError, RecursionError):
         return None
+    return summary if isinstance(summary, dict) and "status" in summary else None
 
 
 def begun(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:

@@ -237,6 +237,7 @@ BAD = [
     ({"torque_limit": [1.0, None]}, "has torque_limit empty in row 1, but must have a finite number"),
     ({"torque_limit": ["1.0", "much"]}, "has torque_limit much in row 1, but must have a finite number"),
     ({"torque_limit": [True]}, "has torque_limit True in row 0, but must have a finite number"),
+    ({"torque_limit": [[1.0, 2.0]]}, "has torque_limit [1.0, 2.0] in row 0, but must have a finite number"),
     ({"torque_limit": [1.0, 0.0]}, "has torque_limit 0 in row 1, but must have a number greater than 0"),
     ({"attitude_noise": [-1e-5]}, "has attitude_noise -1e-05 in row 0, but must have numbers of at least 0"),
     (Q | {"initial_q4": [1.0, 0.9]}, "has initial_q1 to initial_q4 = 0, 0, 0, 0.9 in row 1, but must have a unit "

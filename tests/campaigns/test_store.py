@@ -245,7 +245,7 @@ def finished(folder, tables):
 
 
 @pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json"])
-@pytest.mark.parametrize("content", [None, "", "{", "\x00"])
+@pytest.mark.parametrize("content", [None, "", "{", "\x00", "[]", "{}"])
 def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, content):
     tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
     finished(tmp_path / "out", tables)
@@ -302,8 +302,8 @@ def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path
     assert not store.begun(folder, {"controller": {"eta": 3.1}}, TOLD)
     assert store.previous(folder, tables, TOLD) is None
     assert store.begin(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
-    (folder / "summary.json").write_text("{}")
-    assert store.previous(folder, tables, TOLD) == {}
+    (folder / "summary.json").write_text('{"status": "interrupted"}')
+    assert store.previous(folder, tables, TOLD) == {"status": "interrupted"}
     assert store.begin(folder, tables, TOLD, fresh=False)
     assert (folder / "summary.json").exists()
     assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
