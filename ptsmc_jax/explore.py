@@ -214,7 +214,7 @@ def units(kind: str = "spacecraft") -> dict[str, str]:
     """The unit of each metric of this kind of plant; raises ValueError where there is no such kind."""
     if kind not in catalogues.CATALOGUES:
         raise ValueError(f"there is no kind of plant {kind!r}; allowed are {', '.join(catalogues.CATALOGUES)}")
-    return {name: entry.unit for name, entry in catalogues.CATALOGUES[kind].items()}
+    return catalogues.units(kind)
 
 
 def _check_whole_number(name: str, value: object, least: int = 0) -> None:

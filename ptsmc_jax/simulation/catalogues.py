@@ -101,3 +101,8 @@ MARGINS = {
     "delay_margin": ("s", "further delay to the border of stability", True),
     "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1", False),
 }
+
+
+def units(kind: str) -> dict[str, str]:
+    """The unit of each metric of this kind of plant."""
+    return {name: entry.unit for name, entry in CATALOGUES[kind].items()}

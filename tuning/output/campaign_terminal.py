@@ -107,7 +107,7 @@ def why(inputs: list[dict[str, Any]], kind: str) -> None:
             for row in rows[:4]
         ]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
-        unit = catalogues.CATALOGUES[kind][metric].unit if metric in catalogues.CATALOGUES[kind] else ""
+        unit = catalogues.units(kind).get(metric, "")  # of one of one's own none is known
         terminal.say(f"{metric} {_of(value, unit)} in trial {trial}: {', '.join(texts) or nothing}")
 
 

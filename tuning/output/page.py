@@ -18,7 +18,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 from tuning.output import (
     cells,
@@ -100,7 +100,7 @@ def read(folder: Path) -> Result:
     if str(command) not in SECTIONS:
         raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command left")
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8")) if command != "map" else {}
+        summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8")) if command != "map" else {}
         path = folder / "scenario.toml"
         scenario = parsing.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
@@ -258,7 +258,7 @@ def _distance(verdict: dict[str, Any]) -> str:
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     if "slews" in result.summary:
         return _slew_times(result)
-    summary, units = result.summary, {name: entry.unit for name, entry in CATALOGUES[result.kind].items()}
+    summary, units = result.summary, catalogues.units(result.kind)
     requirement = result.scenario.get("requirements", {}).get("peak_torque")
     limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
     caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."

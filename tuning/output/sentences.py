@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 from tuning.output import pointing_sentences
 from tuning.output.cells import Summary, Table, digits, lost, valued
@@ -45,7 +46,7 @@ def with_unit(name: str, kind: str) -> str:
     >>> with_unit("largest_peak_torque", "spacecraft"), with_unit("delay_margin", "chain"), with_unit("status", "chain")
     ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
     """
-    units = {metric: entry.unit for metric, entry in CATALOGUES[kind].items()}
+    units = catalogues.units(kind)
     units |= {"torque": units["peak_torque"], "delay_margin": "s"}
     units |= {"initial_angle": "rad"} if kind == "spacecraft" else {}
     unit = units.get(re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name), "-")

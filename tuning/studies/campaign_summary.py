@@ -136,8 +136,9 @@ def _drawn(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
 def units(folder: Folder) -> dict[str, str]:
     """Units of a campaign's metrics and of what was drawn, as far as they are known, by column."""
-    metrics = {name: entry.unit for name, entry in catalogues.CATALOGUES[folder.scenario.plant.kind].items()}
-    return metrics | ({} if folder.ready is None else quantities.units(folder.ready.parts))
+    return catalogues.units(folder.scenario.plant.kind) | (
+        {} if folder.ready is None else quantities.units(folder.ready.parts)
+    )
 
 
 def _alike(quantiles: dict[str, Any], trials: int) -> list[str]:
@@ -213,7 +214,7 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
     """Write the summary and the figures into the campaign's folder."""
 
     def fill(making: Path) -> None:
-        store.write_json(making / "summary.json", summary)
+        store.write_json(making / store.SUMMARY, summary)
         if figures:
             style.save(figures_of(folder, summary), making / "figures")
 
@@ -317,7 +318,6 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
     finished = flying.finished(frame)
     of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
-
     unit_of = units(folder)
 
     def column(name: str, values: np.ndarray) -> plots.Column:

@@ -56,7 +56,7 @@ def summary(reproduction: Reproduction) -> dict[str, Any]:
 def write(folder: Path, reproduction: Reproduction, figures: bool) -> None:
     """Fill a result folder."""
     store.write_json(folder / "versions.json", store.versions("reproduce", 0))
-    store.write_json(folder / "summary.json", summary(reproduction))
+    store.write_json(folder / store.SUMMARY, summary(reproduction))
     (folder / "claims.md").write_text(_markdown(reproduction), encoding="utf-8")
     (folder / "scenarios").mkdir()
     for name, (_, _, tables) in claims.CASES.items():
