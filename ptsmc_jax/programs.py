@@ -1,7 +1,7 @@
 """`jax.jit`, with compiled programs that outlive the process: loading one takes a tenth of tracing and lowering it.
 
-Kept beside the compile cache where `configure(programs=True)` asks for it, as the `ptsmc` command does. A session in
-which code may be patched should not ask: what a program is made of is known here from files alone. Any doubt, a file
+Kept beside the compile cache where `configure(keep_programs=True)` asks for it, as the `ptsmc` command does. A session in
+which code may be patched should not ask: a program is told from another by the files of its code alone. Any doubt, a file
 cut short among them, falls back to compiling.
 """
 
