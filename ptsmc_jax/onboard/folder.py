@@ -55,7 +55,7 @@ def flown(scenario: Scenario) -> Scenario:
 
     Raises ScenarioError of a continuous loop, of a filter of the command, and of failures that it would be told of.
     """
-    if scenario.loop.mode != "sampled":
+    if not scenario.sampled:
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
     filtering = getattr(scenario.hardware, "command_filter", None)
     if filtering is not None:

@@ -88,7 +88,7 @@ def estimate_noise(scenario: Scenario) -> float:
     is E = e^(-l h / J). Of that first-order filter of a difference is left J sigma / h (1 - E) (2 / (1 + E))^(1/2).
     """
     gains, loop = getattr(scenario.observer, "gain", None), scenario.loop
-    if scenario.observer.kind not in ("nonlinear", "prescribed_time") or gains is None or loop.mode != "sampled":
+    if scenario.observer.kind not in ("nonlinear", "prescribed_time") or gains is None or not scenario.sampled:
         return 0.0
     known: Any = scenario
     if scenario.motion == "spacecraft":

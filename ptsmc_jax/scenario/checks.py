@@ -35,8 +35,8 @@ def _check_requirements(scenario: Scenario) -> None:
             raise ScenarioError(f"requirements.{key} needs noise in [hardware]: the law sees the true state")
         if isinstance(value, tables.Limit):
             _check_limit(key, value)
-        if key in catalogues.MARGINS and scenario.loop.mode != "sampled":
-            raise ScenarioError(f'requirements.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+        if key in catalogues.MARGINS:
+            scenario.need_samples(f"requirements.{key}")
         if key in catalogues.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
             raise ScenarioError(
                 f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
@@ -70,8 +70,7 @@ def _check_sensors(scenario: Scenario) -> None:
     """Sensors of one's own are all that there are, and sample."""
     if scenario.sensors is None:
         return
-    if scenario.loop.mode != "sampled":
-        raise ScenarioError(f'[sensors] needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    scenario.need_samples("[sensors]")
     for key in (*scenario.devices.noises, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:
@@ -82,10 +81,9 @@ def _check_sensors(scenario: Scenario) -> None:
 
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
-    t_f, delta, window, sampled = controller.t_f, hand_over(scenario), scenario.window, loop.mode == "sampled"
-    if not controller.prescribed and not sampled:
-        kind = errors.show(scenario.controller.kind)
-        raise ScenarioError(f'controller.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
+    t_f, delta, window = controller.t_f, hand_over(scenario), scenario.window
+    if not controller.prescribed:
+        scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
@@ -93,31 +91,31 @@ def _check_loop(scenario: Scenario) -> None:
         raise wrong("loop.t_end", loop.t_end, f"at least controller.t_f + loop.window, {t_f + window}")
     if scenario.end < t_f + window - 1e-9:
         raise wrong("loop.window", window, f"at most loop.t_end - controller.t_f, {scenario.end - t_f}")
-    if sampled and delta < loop.period * (1 - 1e-9):
-        raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
-    if sampled and scenario.end / loop.period > MOST_STEPS:
-        raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
-    if sampled:
+    if scenario.sampled:
         _check_periods(scenario)
     elif window < SHORTEST_WINDOW * t_f:
         raise wrong(
             "loop.window", window, f"at least {SHORTEST_WINDOW * t_f:.6g}, controller.t_f times {SHORTEST_WINDOW}"
         )
-    if not sampled:
-        for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
-            if getattr(scenario.hardware, key) is not None:
-                raise ScenarioError(f'hardware.{key} needs the sampled loop, but loop.mode is "{loop.mode}"')
-        for name, on in (("wheels", scenario.reaction_wheels is not None), ("filter", scenario.estimator.on)):
-            if on:
-                raise ScenarioError(f'[{name}] needs the sampled loop, but loop.mode is "{loop.mode}"')
-        if any(term.sampled_only for term in scenario.terms):
-            kind = next(errors.show(term.kind) for term in scenario.terms if term.sampled_only)
-            raise ScenarioError(f'disturbance.kind = {kind} needs the sampled loop, but loop.mode is "{loop.mode}"')
+    for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
+        if getattr(scenario.hardware, key) is not None:
+            scenario.need_samples(f"hardware.{key}")
+    for name, on in (("wheels", scenario.reaction_wheels is not None), ("filter", scenario.estimator.on)):
+        if on:
+            scenario.need_samples(f"[{name}]")
+    for term in scenario.terms:
+        if term.sampled_only:
+            scenario.need_samples(f"disturbance.kind = {errors.show(term.kind)}")
 
 
 def _check_periods(scenario: Scenario) -> None:
     """What is counted in periods, or holds some, against the period and the run."""
     loop, window, filtering = scenario.loop, scenario.window, scenario.devices.command_filter
+    delta = hand_over(scenario)
+    if delta < loop.period * (1 - 1e-9):
+        raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
+    if scenario.end / loop.period > MOST_STEPS:
+        raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
     if filtering is not None and filtering.corner >= math.pi / loop.period:
         highest = f"below pi / loop.period = {math.pi / loop.period:.6g}, the Nyquist frequency"
         raise wrong("hardware.command_filter.corner", filtering.corner, highest)
@@ -171,8 +169,7 @@ def _check_misfits(scenario: Scenario) -> None:
         return [key for key in keys if getattr(dispersion, key, None) is not None]
 
     for key in asked("actuator_scale", "actuator_misalignment", "timing_jitter"):
-        if scenario.loop.mode != "sampled":
-            raise ScenarioError(f'dispersion.{key} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+        scenario.need_samples(f"dispersion.{key}")
     for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
         given = any(getattr(devices, one) is not None for one in devices.levels.get(name, ()))
         if asked(key) and not given:

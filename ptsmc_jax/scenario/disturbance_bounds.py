@@ -57,7 +57,7 @@ def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
 def observer_rate(scenario: Any) -> float:
     """Rate l / J of an observer whose gain is not given [1/s]: the paper's, 10 without a body, at most one a period."""
     rate = 10.0 if scenario.moments[0] is None else RATE
-    return min(rate, 1.0 / scenario.loop.period) if scenario.loop.mode == "sampled" else rate
+    return min(rate, 1.0 / scenario.loop.period) if scenario.sampled else rate
 
 
 def observer_gain(scenario: Any) -> float:

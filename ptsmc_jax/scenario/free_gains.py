@@ -20,7 +20,7 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     free = tune.free
     if free is None:
         law = scenario.controller
-        first, rest = law.free(sampled=scenario.loop.mode == "sampled")
+        first, rest = law.free(sampled=scenario.sampled)
         others = [name for name in scenario.gains if name not in (*law.gains, *scenario.observer.gains)]
         free = (*first, *scenario.observer.gains, *rest, *others)
     level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
@@ -137,7 +137,7 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
     A bound says something where it is the usual one, or beyond it.
     """
     tune = scenario.tune
-    if scenario.loop.mode != "sampled" or tune is None:
+    if not scenario.sampled or tune is None:
         return None
     gain = scenario.gains[name]
     words = gain.below if side == "lower" else gain.above

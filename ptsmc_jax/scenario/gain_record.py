@@ -27,7 +27,7 @@ class Choice(NamedTuple):
     @property
     def sampled(self) -> bool:
         """Whether the loop is sampled."""
-        return self.scenario.loop.mode == "sampled"
+        return self.scenario.sampled
 
     @property
     def shortest_delta(self) -> float:

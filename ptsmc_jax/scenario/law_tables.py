@@ -13,7 +13,7 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_tables import BASELINES
-from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
@@ -53,14 +53,13 @@ class PrescribedTable(LawTable, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """Implicit sampling needs samples."""
-        if self.implicit and scenario.loop.mode != "sampled":
-            mode = scenario.loop.mode
-            raise ScenarioError(f'controller.sampling = "implicit" needs the sampled loop, but loop.mode is "{mode}"')
+        if self.implicit:
+            scenario.need_samples('controller.sampling = "implicit"')
 
     def filled(self, scenario: Any, inputs: int) -> Any:
         """With a hand-over that is one, too."""
-        made, loop = super().filled(scenario, inputs), scenario.loop
-        shortest = max(0.05, loop.period) if loop.mode == "sampled" else 0.05
+        made = super().filled(scenario, inputs)
+        shortest = max(0.05, scenario.loop.period) if scenario.sampled else 0.05
         return msgspec.structs.replace(made, delta=shortest) if made.delta is None else made
 
     def build(self, scenario: Any, model: Any) -> Any:

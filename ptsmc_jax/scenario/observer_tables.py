@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario import disturbance_bounds
-from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_bounds import dead_beat, size
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.own import Code, Own, build
@@ -114,9 +114,8 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
 
     def times(self, scenario: Any) -> tuple[float, float]:
         """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
-        loop = scenario.loop
         t_o = scenario.controller.t_f / 3 if self.t_o is None else self.t_o
-        shortest = max(0.05, loop.period if loop.mode == "sampled" else 0.0)
+        shortest = max(0.05, scenario.loop.period if scenario.sampled else 0.0)
         return t_o, min(shortest, t_o / 4) if self.delta_o is None else self.delta_o
 
     def written(self, scenario: Any) -> Any:
@@ -225,9 +224,7 @@ class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """An observer of one's own is written for samples, and needs the sampled loop."""
-        mode = scenario.loop.mode
-        if mode != "sampled":
-            raise ScenarioError(f'observer.kind = "own" needs the sampled loop, but loop.mode is "{mode}"')
+        scenario.need_samples('observer.kind = "own"')
 
     def build(self, scenario: Any, model: Any) -> Any:
         """What the code names."""

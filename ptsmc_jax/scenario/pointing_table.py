@@ -35,7 +35,7 @@ class Pointing(Table, frozen=True):
         if not left - self.after >= needed:
             latest = f"at most {left - 2.0 * self.window:.6g}, two windows of {self.window:g} s before loop.t_end"
             raise wrong("pointing.after", self.after, latest)
-        sampled = scenario.loop.mode == "sampled"
+        sampled = scenario.sampled
         least, what = (scenario.loop.period, "loop.period") if sampled else (LONGEST_STEP, "the longest step")
         jitter = getattr(scenario.dispersion, "timing_jitter", None)
         if sampled and jitter is not None:  # in which a period may end late that began early
@@ -55,7 +55,7 @@ class Pointing(Table, frozen=True):
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
         # where no limit needs it, their number is 0 whatever the period, and one program flies them all
-        kept = scenario.loop.mode == "sampled" and any(name.startswith(catalogues.RELATIVE) for name in timed)
+        kept = scenario.sampled and any(name.startswith(catalogues.RELATIVE) for name in timed)
         # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
         samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
         return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

@@ -38,7 +38,7 @@ def resolve(scenario: Scenario) -> Scenario:
     loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
     window = loop.window
     if window is None:
-        window = max(USUAL_WINDOW, loop.period) if loop.mode == "sampled" else USUAL_WINDOW
+        window = max(USUAL_WINDOW, loop.period) if scenario.sampled else USUAL_WINDOW
     t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
     loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
     scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)

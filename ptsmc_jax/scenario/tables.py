@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario.device_tables import NoFilter
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Table, Truth
@@ -129,6 +130,16 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Defaults that depend on other keys, by table; given: keys of [plant] that are there, law: its kind."""
         return {}
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the loop is sampled."""
+        return self.loop.mode == "sampled"
+
+    def need_samples(self, what: str) -> None:
+        """Raise ScenarioError in the continuous loop; what: the table, or the key, that needs the sampled one."""
+        if not self.sampled:
+            raise ScenarioError(f'{what} needs the sampled loop, but loop.mode is "{self.loop.mode}"')
 
     @property
     def terms(self) -> tuple[Any, ...]:

@@ -77,7 +77,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         hurried = _on_the_papers_way(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
-    if loop.mode == "continuous":
+    if not scenario.sampled:
         for key in {"plant.system", "flexible.frequency"} & set(frequencies):
             frequencies[key] *= 2.0  # 0.15 rad a step: of a system nothing else is known, and modes ring for long
         return _grid(scenario, reach, setup, saves, frequencies, visited), 1
@@ -143,7 +143,7 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
         return ScenarioError(f"{key} says that it is too fast: {asks}")
     if key == "controller.eta":  # over a short t_f: eta itself may have no room below
         eta = f"with controller.eta = {scenario.controller.eta}"
-        shorter = ", or loop.period shorter" if scenario.loop.mode == "sampled" else ""
+        shorter = ", or loop.period shorter" if scenario.sampled else ""
         return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
     value = getattr(getattr(scenario, table), name, None)
     if value is None:  # of a term in a sum

@@ -64,7 +64,7 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
 
     delta is a period or more, and half of t_f or less where a period is; the observer's gain is that of this body.
     """
-    shortest = scenario.loop.period if scenario.loop.mode == "sampled" else 0.0
+    shortest = scenario.loop.period if scenario.sampled else 0.0
     delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
     gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
     if scenario.motion == "chain":

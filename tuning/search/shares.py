@@ -99,6 +99,6 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
 
 def _hops(scenario: Scenario, parts: Parts) -> bool:
     """Whether the sign may be so narrow that it hops, by a bound that is nobody's but the usual one."""
-    if scenario.loop.mode != "sampled" or not parts.controller.prescribed:
+    if not scenario.sampled or not parts.controller.prescribed:
         return False
     return scenario.search.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]

@@ -79,7 +79,7 @@ def check(scenario: Scenario) -> None:
         raise ScenarioError(
             f'plant.kind is {kind}, but must be "spacecraft": the laws to compare with are for attitudes'
         )
-    if scenario.loop.mode != "sampled":
+    if not scenario.sampled:
         mode = errors.show(scenario.loop.mode)
         raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws fly there')
 
@@ -166,13 +166,11 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
 def perturbed(flown: Scenario) -> dict[str, Scenario]:
     """The scenario with what its law is not told of: another inertia, a control period of delay; those that can fly."""
     assert isinstance(flown, SpacecraftScenario)
-    body, device = flown.spacecraft, flown.hardware
-    inertia = np.asarray(body.inertia if body.true_inertia is None else body.true_inertia)
-    delay = (getattr(device, "delay", None) or 0) + 1
+    inertia = np.asarray(flown.true_inertia)
     changes: list[dict[str, Any]] = [
         {"spacecraft__true_inertia": ((1.0 + OFF) * inertia).tolist()},
         {"spacecraft__true_inertia": ((1.0 - OFF) * inertia).tolist()},
-        {"hardware__delay": delay},
+        {"hardware__delay": flown.devices.delay_periods + 1},
     ]
     others = {}
     for name, change in zip(UNTOLD, changes, strict=True):

@@ -91,12 +91,12 @@ def limit_of(name: str, scenario: Scenario) -> float | None:
 
 def as_flown(scenario: Scenario) -> Scenario:
     """The scenario on the flight clock; a continuous loop as it is."""
-    return replace(scenario, loop__clock="flight") if scenario.loop.mode == "sampled" else scenario
+    return replace(scenario, loop__clock="flight") if scenario.sampled else scenario
 
 
 def judged_on(flown: Scenario) -> str:
     """What a scenario was flown on to be judged, in words."""
-    if flown.loop.mode != "sampled":
+    if not flown.sampled:
         return "the continuous loop"
     if getattr(flown.controller, "implicit", False):
         return "flight clock, the sign solved for"

@@ -115,8 +115,8 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
 
     Raises ScenarioError where no pair at all is allowed.
     """
-    if PERIOD in (x.key, y.key) and scenario.loop.mode != "sampled":
-        raise ScenarioError(f'{PERIOD} needs the sampled loop, but loop.mode is "{scenario.loop.mode}"')
+    if PERIOD in (x.key, y.key):
+        scenario.need_samples(PERIOD)
     base = changed(scenario, tune=None)  # its bounds would not fit every pair
     pairs = [(a, b) for b in y.values for a in x.values]
     studies: list[Study | str] = []
@@ -180,7 +180,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     parts = common(ready.parts)
-    if ready.scenario.loop.mode == "sampled" and parts.controller.prescribed:
+    if ready.scenario.sampled and parts.controller.prescribed:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
             # the factor on the gain of the worst axis up to which the loop is stable; below 1 where it is not
@@ -195,11 +195,10 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
-    second_order = getattr(scenario.plant, "order", 2) == 2
-    papers_loop = scenario.loop.mode == "sampled" and scenario.controller.prescribed
-    if {x.key, y.key} != {PERIOD, DELTA} or not (papers_loop and second_order):
+    papers_loop = scenario.sampled and scenario.controller.prescribed and scenario.order == 2
+    if {x.key, y.key} != {PERIOD, DELTA} or not papers_loop:
         return {}
-    eta, delay = scenario.controller.eta, getattr(scenario.hardware, "delay", None) or 0
+    eta, delay = scenario.controller.eta, scenario.devices.delay_periods
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
     implicit, border = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"

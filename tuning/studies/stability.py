@@ -22,7 +22,7 @@ _NO_SIGN = "the exact sign has no slope: these margins are those of the loop wit
 
 def find(scenario: Scenario) -> tuple[Study, Course]:
     """Margins of a scenario, along its nominal run. Raises ScenarioError without the sampled loop, or slopes of it."""
-    if scenario.loop.mode != "sampled":
+    if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     course = run_margins.along(ready.parts)
@@ -40,7 +40,7 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable"; where the
     nominal run does not come to rest none are left in hold, and its `swing` stands there.
     """
-    if ready.scenario.loop.mode != "sampled":
+    if not ready.scenario.sampled:
         return None
     left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
     if np.isnan(left.modulus[-1]).any():

@@ -122,14 +122,14 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
 
 
 def _trust(trust: Trust, tuning: Tuning) -> dict[str, Any]:
-    loop, sensed = tuning.tuned.loop, tuning.tuned.hardware is not None
+    ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
     for name, profile in trust.profiles.items():
         if profile.flat:
             influence[name] = "none"
         elif name not in tuning.at_bound:
             influence[name] = "optimum inside its bounds"
-        elif loop.mode == "continuous" and not sensed and gain_names.base(name) in ("delta", "observer_gain"):
+        elif ideal and gain_names.base(name) in ("delta", "observer_gain"):
             influence[name] = "no trade-off: without sampling and noise more of it only helps"
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]

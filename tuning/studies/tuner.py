@@ -268,7 +268,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
     Of the sampled loop, where what is minimised is an error.
     """
     beyond, tuned = dict[str, Beyond](), judged.scenario
-    if tuned.loop.mode != "sampled" or tuned.search.objective == T_F:
+    if not tuned.sampled or tuned.search.objective == T_F:
         return beyond
     for name, side in at_bound.items():
         value = free_gains.beyond(tuned, gains.base(name), side)
@@ -300,5 +300,5 @@ def _prepare(scenario: Scenario) -> None:
     """Begin to compile what judges a scenario's gains."""
     flown = study(judging.as_flown(scenario))
     montecarlo.prepare(flown.parts, flown.dispersion)
-    if scenario.loop.mode == "sampled":
+    if scenario.sampled:
         run_margins.judged_jit.prepare(flown.parts)
