@@ -103,9 +103,9 @@ def _check_loop(scenario: Scenario) -> None:
     for name, on in (("wheels", scenario.reaction_wheels is not None), ("filter", scenario.estimator.on)):
         if on:
             scenario.need_samples(f"[{name}]")
-    for term in scenario.terms:
+    for place, term in scenario.placed_terms.items():
         if term.sampled_only:
-            scenario.need_samples(f"disturbance.kind = {errors.show(term.kind)}")
+            scenario.need_samples(f"{place}.kind = {errors.show(term.kind)}")
 
 
 def _check_periods(scenario: Scenario) -> None:

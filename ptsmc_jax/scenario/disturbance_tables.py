@@ -32,10 +32,9 @@ class DisturbanceTable(Kind, frozen=True):
 
     sampled_only: ClassVar[bool] = False
 
-    @property
-    def together(self) -> tuple[Any, ...]:
-        """The disturbances that act at once."""
-        return (self,)
+    def placed(self, name: str) -> dict[str, Any]:
+        """The disturbances that act at once, by where a file has them; name: of this table."""
+        return {name: self}
 
     def quickest(self) -> float:
         """How fast it changes [rad/s]."""
@@ -205,10 +204,9 @@ class SumDisturbance(Kind, frozen=True):
     kind: Literal["sum"] = "sum"
     terms: Annotated[tuple[Any, ...], Meta(description=TERMS)] = ()
 
-    @property
-    def together(self) -> tuple[Any, ...]:
+    def placed(self, name: str) -> dict[str, Any]:
         """The terms of the sum."""
-        return self.terms
+        return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
     def filled(self, scenario: Any, inputs: int) -> Any:
         """The sum, each term of it with its lists where they are absent."""

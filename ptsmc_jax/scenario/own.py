@@ -76,13 +76,12 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
     """The tables that may name code, by where they stand: also those of a sum, and of what is drawn."""
     for name in scenario.__struct_fields__:
         table = getattr(scenario, name)
-        terms = getattr(table, "terms", None)
-        if name == "dispersion" and table is not None:
+        if name == "disturbance":
+            yield from table.placed(name).items()
+        elif name == "dispersion" and table is not None:
             yield "dispersion.own", table.own
-        elif terms is None:
-            yield name, table
         else:
-            yield from ((f"{name}.terms[{k}]", term) for k, term in enumerate(terms))
+            yield name, table
 
 
 def digest_name(key: str) -> str:

@@ -16,6 +16,7 @@ from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals.disturbances import Sum
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -23,13 +24,10 @@ from ptsmc_jax.simulation.rollout import Parts
 def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
     """Raise ScenarioError where a part of one's own fails at t = 0, or returns what a run cannot go on with."""
     tables = {name: getattr(scenario, name, None) for name in ("reference", "sensors", "observer", "controller")}
-    terms = scenario.terms
-    signals = (parts.disturbance,) if len(terms) == 1 else getattr(parts.disturbance, "terms", ())
-    acting = iter(signals)
-    for k, term in enumerate(terms):
+    acting = iter(parts.disturbance.terms if isinstance(parts.disturbance, Sum) else (parts.disturbance,))
+    for place, term in scenario.placed_terms.items():
         if isinstance(term, Own):
-            name = "disturbance" if len(terms) == 1 else f"disturbance.terms[{k}]"
-            _disturbance(parts, next(one for one in acting if isinstance(one, term.made)), _Asked(name, term))
+            _disturbance(parts, next(one for one in acting if isinstance(one, term.made)), _Asked(place, term))
     for name, table in tables.items():
         if isinstance(table, Own):
             _OF[name](parts, _Asked(name, table))

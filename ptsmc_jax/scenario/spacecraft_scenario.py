@@ -202,9 +202,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Attitudes that are given once, devices that fit, and modes that a body can have however they are drawn."""
         attitude_keys.quaternion(self.initial, "initial")
         self.reference.check()
-        several = len(self.terms) > 1 or self.disturbance.kind == "sum"
-        for k, term in enumerate(self.terms):
-            term.check(f"disturbance.terms[{k}]" if several else "disturbance")
+        for place, term in self.placed_terms.items():
+            term.check(place)
         self.devices.check(self)
         self.estimator.check(self)
         if self.wheels is not None:

@@ -83,10 +83,8 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 
     def check_plant(self) -> None:
         """Refuse lists that are not as long as there are inputs, or states."""
-        several = len(self.terms) > 1
-        for k, term in enumerate(self.terms):
-            self._check_each(f"disturbance.terms[{k}]" if several else "disturbance", term)
-        self._check_each("observer", self.observer)
+        for place, table in {**self.placed_terms, "observer": self.observer}.items():
+            self._check_each(place, table)
         self.devices.check(self)
 
     def _check_each(self, name: str, table: Kind) -> None:

@@ -144,7 +144,12 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     @property
     def terms(self) -> tuple[Any, ...]:
         """The disturbances that act together."""
-        return self.disturbance.together
+        return tuple(self.placed_terms.values())
+
+    @property
+    def placed_terms(self) -> dict[str, Any]:
+        """These by where a file has them: "disturbance", or "disturbance.terms[0]" and so on."""
+        return self.disturbance.placed("disturbance")
 
     @property
     def inputs(self) -> int:

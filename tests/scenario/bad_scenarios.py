@@ -333,6 +333,11 @@ BAD = [
         "disturbance.terms[1].amplitude is [1]",
         "three numbers",
     ),
+    (
+        CHAIN + "disturbance = { kind = 'sum', terms = [{ kind = 'constant', amplitude = [1, 2] }] }",
+        "disturbance.terms[0].amplitude is [1.0, 2.0]",
+        "a list of 1 number",
+    ),
     ("disturbance = { kind = 'gravity_gradient', orbit_rate = 0 }", "disturbance.orbit_rate is 0", "greater than 0"),
     (
         "disturbance = { kind = 'gravity_gradient', mrp = [0, 0, 0], rotvec_deg = [0, 0, 0] }",

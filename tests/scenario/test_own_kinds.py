@@ -169,6 +169,15 @@ class Turning(ptsmc.Reference):
 """
 
 
+@pytest.mark.parametrize("beside", ["none", "random_walk"])
+def test_a_disturbance_is_looked_at_beside_one_that_is_no_signal(here, beside):
+    """The sum of the two is then the disturbance itself."""
+    (here / "other.py").write_text(HEAD + OTHER)
+    terms = [{"kind": "own", "code": "other.py:Wave"}, {"kind": beside}]
+    ready = scenario.study(scenario.from_tables({**CHAIN, "disturbance": {"kind": "sum", "terms": terms}}))
+    assert type(ready.parts.disturbance).__name__ == "Wave"
+
+
 def test_a_disturbance_and_an_observer_do_what_they_say(here):
     """The built-in sum of two sinusoids flies alike; the observer's memory is what a loop by hand makes of the log."""
     (here / "other.py").write_text(HEAD + OTHER)
