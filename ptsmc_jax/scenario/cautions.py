@@ -14,7 +14,7 @@ COARSE = np.deg2rad(5.0)  # of noise [rad], from which on it is likely another u
 
 def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
-    bounds = disturbance_bounds.of(scenario, scenario.inputs)
+    bounds = disturbance_bounds.of(scenario)
     bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
     return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario)]
 

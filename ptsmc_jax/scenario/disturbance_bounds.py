@@ -23,9 +23,9 @@ class Bounds(NamedTuple):
     rate: np.ndarray  # (m,) of d' [the same per second]
 
 
-def of(scenario: Any, inputs: int) -> tuple[float, float] | None:
-    """K and c of the disturbance of a plant with so many inputs; None: it is one's own, and its code was not run."""
-    found = [term.bounds(scenario, inputs) for term in scenario.terms]
+def of(scenario: Any) -> tuple[float, float] | None:
+    """K and c of a scenario's disturbance; None: it is one's own, and its code was not run."""
+    inputs, found = scenario.inputs, [term.bounds(scenario) for term in scenario.terms]
     if any(one is None or one.size.shape != (inputs,) for one in found):  # of another length: `checks` refuses it
         return None
     largest = sum((one.size for one in found), np.zeros(inputs)) + _drawn_bias(scenario)
@@ -88,7 +88,7 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
 
 
-def along_the_run(scenario: Any, signal: Any, inputs: int) -> Bounds:
+def along_the_run(scenario: Any, signal: Any) -> Bounds:
     """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
     The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
@@ -103,6 +103,7 @@ def along_the_run(scenario: Any, signal: Any, inputs: int) -> Bounds:
         acting = np.asarray(jax.vmap(signal)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
     except Exception:  # which `own_checks` refuses before a flight, in one sentence
         acting = np.zeros(0)
+    inputs = scenario.inputs
     if acting.shape != (POINTS, inputs) or not np.all(np.isfinite(acting)):
         return Bounds(np.zeros(inputs), np.zeros(inputs))
     return Bounds(np.max(np.abs(acting), axis=0), np.max(np.abs(np.gradient(acting, t, axis=0)), axis=0))

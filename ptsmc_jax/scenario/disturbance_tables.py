@@ -44,9 +44,9 @@ class DisturbanceTable(Kind, frozen=True):
         """What it adds up to at most until `end` [s], in N m s; nothing of what stays small however long it acts."""
         return 0.0
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds | None:
+    def bounds(self, scenario: Any) -> Bounds | None:
         """Largest size and rate of each component, also where it is drawn; None: not known before its code is run."""
-        return Bounds(np.zeros(inputs), np.zeros(inputs))
+        return Bounds(np.zeros(scenario.inputs), np.zeros(scenario.inputs))
 
     def check(self, name: str) -> None:
         """Raise ScenarioError where its keys contradict each other; name: of its table."""
@@ -78,7 +78,7 @@ class ConstantDisturbance(DisturbanceTable, frozen=True):
         """It acts all the time."""
         return float(np.linalg.norm(np.abs(self.amplitude) * end))
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+    def bounds(self, scenario: Any) -> Bounds:
         """Its size; it does not change."""
         size = np.abs(self.amplitude) * disturbance_bounds.drawn_factor(scenario)
         return Bounds(size, np.zeros_like(size))
@@ -116,7 +116,7 @@ class SinusoidDisturbance(DisturbanceTable, frozen=True):
         lasting = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
         return float(np.linalg.norm(np.abs(self.amplitude) * lasting) + np.linalg.norm(self.bias) * end)
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+    def bounds(self, scenario: Any) -> Bounds:
         """|bias| + |amplitude|, and |amplitude frequency|: of any phase."""
         swing = np.abs(self.amplitude) * disturbance_bounds.drawn_factor(scenario)
         if not len(swing) == len(self.frequency) == len(self.bias):
@@ -153,7 +153,7 @@ class GravityGradient(Attitude, DisturbanceTable, frozen=True):
         elif self.sequence is not None:
             raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+    def bounds(self, scenario: Any) -> Bounds:
         """See `disturbance_bounds.gravity_gradient`."""
         return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)
 
@@ -178,7 +178,7 @@ class RandomWalk(DisturbanceTable, frozen=True):
     density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
     sampled_only: ClassVar[bool] = True
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds:
+    def bounds(self, scenario: Any) -> Bounds:
         """Three sigma at the end of the run, and `disturbance_bounds.walk_rate`."""
         density = np.asarray(self.density)
         wandered = disturbance_bounds.SIGMAS * density * np.sqrt(scenario.loop.t_end)
@@ -208,9 +208,9 @@ class SumDisturbance(Kind, frozen=True):
         """The terms of the sum."""
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
-    def filled(self, scenario: Any, inputs: int) -> Any:
+    def filled(self, scenario: Any) -> Any:
         """The sum, each term of it with its lists where they are absent."""
-        each = tuple(term.filled(scenario, inputs) for term in self.terms)
+        each = tuple(term.filled(scenario) for term in self.terms)
         return msgspec.structs.replace(self, terms=each)
 
 
@@ -271,9 +271,9 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
         """What its method `fastest` says; 0 before its code is run."""
         return 0.0 if self.waits else float(build(self).fastest())
 
-    def bounds(self, scenario: Any, inputs: int) -> Bounds | None:
+    def bounds(self, scenario: Any) -> Bounds | None:
         """See `disturbance_bounds.along_the_run`."""
-        return None if self.waits else disturbance_bounds.along_the_run(scenario, build(self), inputs)
+        return None if self.waits else disturbance_bounds.along_the_run(scenario, build(self))
 
     def build(self, inertia: Any) -> Any:
         """What the code names."""

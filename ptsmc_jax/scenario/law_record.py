@@ -29,9 +29,9 @@ class LawTable(Kind, frozen=True):
         """Its gains that are free where a scenario does not say, those before and those after the observer's."""
         return self.free_by_default, self.free_if_sampled if sampled else ()
 
-    def filled(self, scenario: Any, inputs: int) -> Any:
+    def filled(self, scenario: Any) -> Any:
         """With the bounds of Assumption 1 where they are absent and what the disturbance reaches is known."""
-        found = disturbance_bounds.of(scenario, inputs)
+        found = disturbance_bounds.of(scenario)
         if found is None:
             return self
         follows = dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True))

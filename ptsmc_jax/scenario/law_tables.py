@@ -56,9 +56,9 @@ class PrescribedTable(LawTable, frozen=True):
         if self.implicit:
             scenario.need_samples('controller.sampling = "implicit"')
 
-    def filled(self, scenario: Any, inputs: int) -> Any:
+    def filled(self, scenario: Any) -> Any:
         """With a hand-over that is one, too."""
-        made = super().filled(scenario, inputs)
+        made = super().filled(scenario)
         shortest = max(0.05, scenario.loop.period) if scenario.sampled else 0.05
         return msgspec.structs.replace(made, delta=shortest) if made.delta is None else made
 

@@ -35,15 +35,15 @@ def resolve(scenario: Scenario) -> Scenario:
     Raises ScenarioError where the body is none, from whose inertia some follow.
     """
     scenario.check_body()
-    loop, t_f, m = scenario.loop, scenario.controller.t_f, scenario.inputs
+    loop, t_f = scenario.loop, scenario.controller.t_f
     window = loop.window
     if window is None:
         window = max(USUAL_WINDOW, loop.period) if scenario.sampled else USUAL_WINDOW
     t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
     loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
-    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario, m), loop=loop)
-    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario, m))
-    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario, m)).resolved()
+    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario), loop=loop)
+    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario))
+    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario)).resolved()
 
 
 def complete(scenario: Scenario) -> Scenario:

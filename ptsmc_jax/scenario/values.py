@@ -51,11 +51,11 @@ class Kind(Table, frozen=True):
         """With its keys that follow from others of a checked scenario."""
         return self
 
-    def filled(self, scenario: Any, inputs: int) -> Any:
+    def filled(self, scenario: Any) -> Any:
         """With its lists where they are absent."""
         scale = self.scale(scenario)
-        absent = {key: (scale * value,) * inputs for key, value in self.each.items() if getattr(self, key) is None}
-        return msgspec.structs.replace(self, **absent)
+        lists = {key: (scale * value,) * scenario.inputs for key, value in self.each.items()}
+        return msgspec.structs.replace(self, **{k: v for k, v in lists.items() if getattr(self, k) is None})
 
 
 Kinds = Mapping[str, type[Table]]  # of a table by name, the default first

@@ -239,11 +239,11 @@ def test_the_disturbance_that_is_built_keeps_within_its_bounds():
     """Along a whole run of the wobbly gravity gradient, which the bounds must hold for."""
     tables = {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-2}, "initial": {"rate": [0.05, 0.0, 0.02]}}
     said = scenario.from_tables(tables)
-    known = disturbance_bounds.of(said, said.inputs)
+    known = disturbance_bounds.of(said)
     assert known is not None
     size, rate = known
     signal, _ = build.disturbance(said, rigid_body.spacecraft([10.0, 12.0, 14.0]))
-    found = disturbance_bounds.along_the_run(said, signal, 3)
+    found = disturbance_bounds.along_the_run(said, signal)
     assert 0.2 * size < found.size.max() <= size
     assert found.rate.max() <= rate
 

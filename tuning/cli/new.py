@@ -161,7 +161,7 @@ class _File:
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
         table: Any = struct(**needed)
         if isinstance(table, Kind):
-            table = table.filled(self.resolved, self.resolved.inputs)
+            table = table.filled(self.resolved)
             table = table.written(self.resolved)
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
