@@ -71,9 +71,9 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     run: code of one's own may be run, for its keys.
     """
     _check_shape(raw)
-    names = {"requirements", *(key for layout in TABLES.values() for key in layout)}
+    known = {"requirements", *(key for layout in TABLES.values() for key in layout)}
     for name, table in raw.items():
-        if name in names and not isinstance(table, Mapping):
+        if name in known and not isinstance(table, Mapping):
             raise wrong(name, table, "a table")
     kind = _plant_kind(raw.get("plant", {}))
     kind_of_scenario, layout = SCENARIOS[kind], TABLES[kind]
@@ -86,8 +86,7 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
         if not isinstance(raw[name], Mapping):
             place = _place(name, layout)
             raise ScenarioError(f"{name} = {brief(raw[name])} stands outside a table; {place}")
-        names = (*layout, "requirements")
-        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, names, '[{}]')}")
+        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, (*layout, 'requirements'), '[{}]')}")
 
     plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
     law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
@@ -138,14 +137,11 @@ def _plant_kind(plant: Mapping[str, Any]) -> str:
 
 def _place(key: str, layout: Mapping[str, Any]) -> str:
     """Where a key that stands outside a table may belong."""
-    homes = {field: name for name, table in layout.items() for struct in _structs(table)
-            for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
+    homes = {field: name for name, table in layout.items()
+             for struct in (table.values() if isinstance(table, Mapping) else [table])
+             for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
     closest = difflib.get_close_matches(key, homes, n=1, cutoff=0.0)[0]
     return f"the nearest known key is {homes[closest]}.{closest}"
-
-
-def _structs(table: type[Table] | Kinds) -> list[type[Table]]:
-    return [struct for struct in table.values() if struct is not None] if isinstance(table, Mapping) else [table]
 
 
 def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -263,9 +259,7 @@ def _dispersion(raw: Mapping[str, Any], kind: str, run: bool) -> Table:
     struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
     tables = {}
     for key, table in raw.items():
-        if key not in struct.__struct_fields__:
-            known = nearest(key, struct.__struct_fields__, "dispersion.{}")
-            raise ScenarioError(f"dispersion.{key} is not a known key; {known}")
+        _check_known("dispersion", key, struct)
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
         tables[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], run)
@@ -334,12 +328,17 @@ def _fits(value: Any, kind: Any) -> bool:
 
 def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
     hints = typing.get_type_hints(struct, include_extras=True)
-    known = struct.__struct_fields__
     for key in raw:
-        if key not in known:
-            raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
+        _check_known(name, key, struct)
     said = {key: _in_words(f"{name}.{key}", value, struct, hints[key]) for key, value in raw.items()}
     return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in said.items()})
+
+
+def _check_known(name: str, key: str, struct: type[Table]) -> None:
+    """Raise ScenarioError where the table of this name has no such key."""
+    known = struct.__struct_fields__
+    if key not in known:
+        raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
 
 
 def _key(key: str, value: Any, kind: Any) -> Any:
