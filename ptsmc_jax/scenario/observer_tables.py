@@ -51,12 +51,22 @@ class NoObserver(ObserverTable, frozen=True):
         return Physics(model, vector(scenario.controller.disturbance_bound))
 
 
-_DEAD_BEAT = {
-    "observer_gain": GainBounds(dead_beat, above="a dead-beat observer: nothing of its error is left after a period")
-}
+class LinearTable(ObserverTable, frozen=True):
+    """An observer with the key `gain`, that of l(w) in (53), or its constant part."""
+
+    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
+    gains: ClassVar[Mapping[str, GainBounds]] = {
+        "observer_gain": GainBounds(
+            dead_beat, above="a dead-beat observer: nothing of its error is left after a period"
+        )
+    }
+
+    def scale(self, scenario: Any) -> float:
+        """The default gain: in proportion to the body's inertia, and limited by the period."""
+        return disturbance_bounds.observer_gain(scenario)
 
 
-class NonlinearObserver(ObserverTable, frozen=True):
+class NonlinearObserver(LinearTable, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
@@ -66,12 +76,6 @@ class NonlinearObserver(ObserverTable, frozen=True):
 
     kind: Literal["nonlinear"] = "nonlinear"
     gain: ThreePositive | None = None
-    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
-    gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
-
-    def scale(self, scenario: Any) -> float:
-        """The default gain: in proportion to the body's inertia, and limited by the period."""
-        return disturbance_bounds.observer_gain(scenario)
 
     def build(self, scenario: Any, model: Any) -> Any:
         """`observers.nonlinear`."""
@@ -90,7 +94,7 @@ class EachNonlinearObserver(NonlinearObserver, frozen=True):
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
-class PrescribedTimeObserver(ObserverTable, frozen=True):
+class PrescribedTimeObserver(LinearTable, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
@@ -105,12 +109,6 @@ class PrescribedTimeObserver(ObserverTable, frozen=True):
     t_o: Positive | None = None
     delta_o: Positive | None = None
     gain: ThreePositive | None = None
-    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
-    gains: ClassVar[Mapping[str, GainBounds]] = _DEAD_BEAT
-
-    def scale(self, scenario: Any) -> float:
-        """The default gain: in proportion to the body's inertia, and limited by the period."""
-        return disturbance_bounds.observer_gain(scenario)
 
     def times(self, scenario: Any) -> tuple[float, float]:
         """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
