@@ -133,7 +133,7 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
     campaign = Campaign(ready, seed, own, plan.without(same))
     if plan.angle is not None:
         rows = drawn if drawn is not None and not campaign.plan_given else campaign.draw(range(plan.count))
-        plans.check_angle(plan, rows[plans.ANGLE].to_numpy(), where)
+        plans.check_angle(plan.angle, rows[plans.ANGLE].to_numpy(), where)
     return campaign
 
 

@@ -150,15 +150,13 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     return Plan(given, whose_draws[TRIAL], whose_draws[SEED], angle, table.height)
 
 
-def check_angle(plan: Plan, flown: np.ndarray, where: str = "the plan") -> None:
+def check_angle(said: np.ndarray, flown: np.ndarray, where: str) -> None:
     """Raise RefusedError where the initial angles (rows,) that a plan says are not those that follow from the rest."""
-    if plan.angle is None:
-        return
-    off = np.abs(flown - plan.angle) > 1e-5 * np.maximum(1.0, np.abs(plan.angle))
+    off = np.abs(flown - said) > 1e-5 * np.maximum(1.0, np.abs(said))
     if off.any():
         k = int(np.argmax(off))
         raise RefusedError(
-            f"{where} has {ANGLE} {plan.angle[k]:g} in row {k}, but must have {flown[k]:.9g} there, which follows from "
+            f"{where} has {ANGLE} {said[k]:g} in row {k}, but must have {flown[k]:.9g} there, which follows from "
             "the rest, or no such column"
         )
 

@@ -174,9 +174,9 @@ def _legend_below(figure: Figure, entries: int, columns: int) -> None:
     figure.legend(loc="outside lower left", ncols=columns, fontsize=9, markerscale=1.0)
 
 
-def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float, unit: str = "s") -> Figure:
+def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
     """When each trial settles against where it starts; label -> (initial angles [deg], settling times, NaN: never)."""
-    figure, axes = figure_of("When it settles, by where it starts", f"settling time [{unit}]")
+    figure, axes = figure_of("When it settles, by where it starts", "settling time [s]")
     for (label, (angle, time)), (colour, marker) in zip(sets.items(), _looks(len(sets)), strict=True):
         settled, name = np.isfinite(time), label.replace("_", " ")
         name = name if np.all(settled) else f"{name}: {np.count_nonzero(~settled)} never"

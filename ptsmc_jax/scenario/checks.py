@@ -37,7 +37,7 @@ def _check_requirements(scenario: Scenario) -> None:
             _check_limit(key, value)
         if key in catalogues.MARGINS:
             scenario.need_samples(f"requirements.{key}")
-        if key in catalogues.MARGINS and getattr(scenario.controller, "sign_width", None) == 0.0:
+        if key in catalogues.MARGINS and scenario.exact_sign:
             raise ScenarioError(
                 f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
                 "allowed is a width greater than 0"

@@ -52,3 +52,9 @@ class LawTable(Kind, frozen=True):
         names = [f.name for f in dataclasses.fields(made) if f.name != "model" and not f.metadata.get("static")]
         own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
         return made(model, **{name: vector(value) for name, value in own.items()})
+
+
+def common_keys(law: LawTable) -> dict[str, Any]:
+    """The keys that every law has, with this one's values."""
+    names = ("t_f", "disturbance_rate_bound", "disturbance_bound", "initial_estimate_error")
+    return {name: getattr(law, name) for name in names}

@@ -16,14 +16,14 @@ WIDEST = 1e4  # times the noise of s: hardly a switching term any more
 QUIET = (1e-5, 1e-1)  # widths of the smooth sign without noise, in the units of s
 
 
-def dead_beat_gain(scenario: Any, left: float = LEFT) -> float:
-    """Gain l [N m s], the same on all axes, from which on at most this share of the observer's error is left.
+def dead_beat_gain(scenario: Any) -> float:
+    """Gain l [N m s], the same on all axes, from which on at most `LEFT` of the observer's error is left.
 
-    After one period, and of the error about the axis of the largest principal moment J: l h / J = ln(1 / left), which
-    is 9.9 for 5e-5. A larger gain has no influence. Without a body J = 1.
+    After one period, and of the error about the axis of the largest principal moment J: l h / J = ln(1 / LEFT) = 9.9. A
+    larger gain has no influence. Without a body J = 1.
     """
     _, largest = scenario.moments
-    return math.log(1.0 / left) * (1.0 if largest is None else largest) / scenario.loop.period
+    return math.log(1.0 / LEFT) * (1.0 if largest is None else largest) / scenario.loop.period
 
 
 def largest_k1(scenario: Any) -> float:
@@ -42,13 +42,13 @@ def largest_k1(scenario: Any) -> float:
     return scenario.reaching * reaching
 
 
-def narrowest_that_matters(noise: float, share: float = SHARE) -> float:
+def narrowest_that_matters(noise: float) -> float:
     """Width of the smooth sign below which it is as good as the exact one under this noise, in the units of s.
 
     The mean slope at s = 0 of tanh((s + n) / width), n Gaussian, is the exact sign's (2 / pi)^(1/2) / noise but for
-    this share: 1 - (pi^2/24) (width / noise)^2.
+    `SHARE`: 1 - (pi^2/24) (width / noise)^2.
     """
-    return math.sqrt(24.0 * share) / math.pi * noise
+    return math.sqrt(24.0 * SHARE) / math.pi * noise
 
 
 def widths(scenario: Any) -> tuple[float, float]:

@@ -142,6 +142,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
             raise ScenarioError(f'{what} needs the sampled loop, but loop.mode is "{self.loop.mode}"')
 
     @property
+    def exact_sign(self) -> bool:
+        """Whether the law switches by the exact sign, which has no slope."""
+        return getattr(self.controller, "sign_width", None) == 0.0
+
+    @property
     def terms(self) -> tuple[Any, ...]:
         """The disturbances that act together."""
         return tuple(self.placed_terms.values())

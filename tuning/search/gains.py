@@ -7,9 +7,9 @@ from typing import Any
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.scenario import disturbance_bounds, keys
-from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
+from ptsmc_jax.scenario.law_record import common_keys
 from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
@@ -77,9 +77,8 @@ def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
     if not table.prescribed:
-        common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
-        law = {"kind": "prescribed_time", **error, **common, "delta": own["delta"]}
+        law = {"kind": "prescribed_time", **error, **common_keys(table), "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
     return in_scenario(scenario, own)
 

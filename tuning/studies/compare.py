@@ -16,8 +16,8 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
 from ptsmc_jax.scenario import cautions, errors, own, parsing, replace, study, systems, tables
-from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_record import common_keys
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
@@ -52,7 +52,7 @@ class Contender:
     @property
     def met(self) -> bool:
         """Every requirement met, and no trial failed or missed t_f."""
-        return all(v.met for v in self.verdicts) and bool(np.all(self.trials.ok))
+        return judging.met(self.verdicts, self.trials)
 
 
 @dataclass(frozen=True)
@@ -128,19 +128,19 @@ class Rivals:
 def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
     table, tune = scenario.controller, scenario.search
-    common = {key: getattr(table, key) for key in BaselineTable.__struct_fields__}
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     posed = {}
     for name, law in rivals.named.items():
-        if law["kind"] != "own" and scenario.controller.kind == name:
+        if law["kind"] != "own" and table.kind == name:
             posed[name] = scenario
         elif name == OURS:
             posed[name] = _posed(gains.papers(scenario), tune, same)
         else:
             fields = LAWS["spacecraft"][law["kind"]].__struct_fields__
-            shared = [key for key in ("sign_width",) if key in fields and hasattr(table, key)]
-            width = {key: getattr(table, key) for key in shared}
-            posed[name] = _posed(replace(scenario, tune=None, controller={**law, **common, **width}), tune, same)
+            both = "sign_width" in fields and hasattr(table, "sign_width")
+            width = {"sign_width": table.sign_width} if both else {}
+            law = {**law, **common_keys(table), **width}
+            posed[name] = _posed(replace(scenario, tune=None, controller=law), tune, same)
     return posed
 
 
@@ -346,15 +346,14 @@ def _rows(scenario: Scenario, summary: Mapping[str, Any]) -> tuple[list[str], li
 
 
 def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
-    unit = catalogues.CATALOGUE["settling_time"].unit
     sets = {law: contender.trials for law, contender in comparison.contenders.items()}
     ours = comparison.contenders[OURS]
     t_f = ours.flown.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
-         for law, t in sets.items()}, t_f, unit,
+         for law, t in sets.items()}, t_f,
     )  # fmt: skip
-    limit = next((v.limit for v in ours.verdicts if v.metric == "peak_torque"), None)
+    limit = judging.limit_of("peak_torque", ours.flown)
     yield "tradeoff", study_plots.tradeoff(
         {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
          if t.finished.any()}, limit,

@@ -58,6 +58,11 @@ def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Ver
     return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
 
 
+def met(verdicts: Sequence[Verdict], trials: Trials) -> bool:
+    """Whether every requirement is met, and no trial failed or missed t_f."""
+    return all(v.met for v in verdicts) and bool(np.all(trials.ok))
+
+
 def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | None]:
     """RMS window error of the trials that were flown to the end, None if none was, and its interval."""
     errors = np.asarray(trials.metrics.window_error)[trials.finished]
@@ -71,7 +76,7 @@ def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, An
         "rms": np.nan if rms is None else rms,
         "interval": interval,
         "failures": int(np.sum(~trials.ok)),
-        "meets": all(v.met for v in verdicts_of(scenario, trials, fresh_seed)) and bool(np.all(trials.ok)),
+        "meets": met(verdicts_of(scenario, trials, fresh_seed), trials),
     }
 
 

@@ -83,7 +83,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         margins=margin_rows.ask(ready, bounds.names, seed),
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
-    exact = getattr(scenario.controller, "sign_width", None) == 0.0 and "sign_width" not in bounds.names
+    exact = scenario.exact_sign and "sign_width" not in bounds.names
     return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed)
 
 

@@ -86,7 +86,6 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         return {label: {name: _number(getattr(left, name)[k]) for name in fields} for k, label in enumerate(labels)}
 
     t_f = float(ready.parts.controller.t_f)
-    exact = getattr(ready.scenario.controller, "sign_width", None) == 0.0
     return {
         "stable": bool(hold.stable.all()),
         "worst": {name: _number(v) for name, v in course.worst().items()},
@@ -102,7 +101,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
-        "said": _NO_SIGN if exact else None,
+        "said": _NO_SIGN if ready.scenario.exact_sign else None,
         **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }

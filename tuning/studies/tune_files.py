@@ -17,7 +17,7 @@ from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
 from tuning.search import own_parts, trust
 from tuning.search.descents import Step
-from tuning.studies.judging import judged_on
+from tuning.studies import judging
 from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
@@ -81,7 +81,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "paper_is": gain_names.paper_is(tuning.tuned),
         "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
-        "judged_on": judged_on(tuning.tuned),
+        "judged_on": judging.judged_on(tuning.tuned),
         "cautions": cautions.of(tuning.tuned),
         "search": {
             "objective": tuning.tuned.search.objective,
@@ -200,7 +200,6 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
-    limit = next((v.limit for v in tuning.verdicts if v.metric == "peak_torque"), None)
     unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
     goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
@@ -217,7 +216,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
                 name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
                 for name, trials in tuning.fresh.items()
             },
-            limit,
+            judging.limit_of("peak_torque", scenario),
             kind,
             tuning.floors["tuned"],
         ),

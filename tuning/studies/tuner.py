@@ -94,7 +94,7 @@ class Tuning:
     @property
     def met(self) -> bool:
         """Whether the fresh trials meet every requirement, and none of them failed."""
-        return all(v.met for v in self.verdicts) and bool(np.all(self.fresh["tuned"].ok))
+        return judging.met(self.verdicts, self.fresh["tuned"])
 
     @property
     def status(self) -> str:
@@ -218,9 +218,8 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
     """The shortest t_f that the limit on the torque would allow; None without one, or where t_f itself is tuned."""
-    ready = posed.ready
-    limit = next((r.limit for r in ready.requirements if r.metric == "peak_torque"), None)
-    if limit is None or T_F in posed.problem.names or not ready.parts.controller.prescribed:
+    limit = judging.limit_of("peak_torque", judged.scenario)
+    if limit is None or T_F in posed.problem.names or not judged.scenario.controller.prescribed:
         return None
     return shortest_time(judged.scenario, limit, judged.seed, judged.trials.trial)
 
