@@ -61,7 +61,7 @@ class LinearTable(ObserverTable, frozen=True):
         )
     }
 
-    def scale(self, scenario: Any) -> float:
+    def scale_of_each(self, scenario: Any) -> float:
         """The default gain: in proportion to the body's inertia, and limited by the period."""
         return disturbance_bounds.observer_gain(scenario)
 
@@ -174,7 +174,7 @@ class FiniteTimeObserver(ObserverTable, frozen=True):
 
     each: ClassVar[Mapping[str, float]] = {"gain": 20.0}
 
-    def scale(self, scenario: Any) -> float:
+    def scale_of_each(self, scenario: Any) -> float:
         """The bound on the disturbance's rate."""
         return scenario.controller.disturbance_rate_bound or 1e-3 * size(scenario)
 

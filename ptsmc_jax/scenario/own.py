@@ -148,8 +148,9 @@ def _with_keys(table: Any, found: Any) -> Any:
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
-        if field.name in table.__struct_fields__ and field.name not in common:
-            raise ValueError(f"a field of the class {found.__name__} is called {field.name}, which has its meaning")
+        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # tables have it
+            taken = f"a field of the class {found.__name__} is called {field.name}, which has its meaning already"
+            raise ValueError(f"{taken}; allowed is another name")
         gain = field.metadata.get("gain")
         key_types.append((field.name, *_key(field, gain)))
         meaning = "" if gain is None else " ".join(gain.meaning.split())

@@ -41,9 +41,9 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
 class Kind(Table, frozen=True):
     """A kind of a table, which may have lists of one number for each input of the plant."""
 
-    each: ClassVar[Mapping[str, float]] = {}  # such lists, and what they hold where they are absent, times `scale`
+    each: ClassVar[Mapping[str, float]] = {}  # such lists: their default numbers, times `scale_of_each`
 
-    def scale(self, scenario: Any) -> float:
+    def scale_of_each(self, scenario: Any) -> float:
         """What the numbers of `each` are multiplied by."""
         return 1.0
 
@@ -53,7 +53,7 @@ class Kind(Table, frozen=True):
 
     def filled(self, scenario: Any) -> Any:
         """With its lists where they are absent."""
-        scale = self.scale(scenario)
+        scale = self.scale_of_each(scenario)
         lists = {key: (scale * value,) * scenario.inputs for key, value in self.each.items()}
         return msgspec.structs.replace(self, **{k: v for k, v in lists.items() if getattr(self, k) is None})
 

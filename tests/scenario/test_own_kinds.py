@@ -260,6 +260,7 @@ BAD = [
     (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
     ("Mine = [3]", {}, "a list, which is not derived from", "ptsmc_jax.AccelerationLaw"),
     (changed("width: float", "code: float"), {}, "a field of the class Mine is called code", "has its meaning"),
+    (changed("width: float", "check: float"), {}, "a field of the class Mine is called check", "has its meaning"),
     ("Mine = 3", {}, "a int, which is not derived from", "ptsmc_jax.AccelerationLaw"),
     ("class Mine:\n    pass", {}, "a class Mine, which is not derived from", "ptsmc_jax.AccelerationLaw"),
     ("Other = 3", {}, "mine.py has no such name", "FILE.py:NAME"),
