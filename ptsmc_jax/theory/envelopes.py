@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 
-Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
 
 GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): what the smooth sign gives away per component, in units of its width

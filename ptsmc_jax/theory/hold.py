@@ -15,10 +15,10 @@ from ptsmc_jax import programs
 from ptsmc_jax.formulas import surface_roots
 from ptsmc_jax.laws.closed_forms import ChainMotion
 from ptsmc_jax.numerics import guards, integrators
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes, solutions
 
-Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
 
 

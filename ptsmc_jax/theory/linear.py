@@ -26,14 +26,12 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, assumed_torque, boot, decide, schedule
 from ptsmc_jax.simulation.sampled import PeriodMotion
 from ptsmc_jax.theory.carries import Carry, Local
-
-Scalar = Float[Array, ""]
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
 _WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # of Lagrange's polynomials

@@ -13,14 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.theory import crossings, linear
 from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
-
-Scalar = Float[Array, ""]
 
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 

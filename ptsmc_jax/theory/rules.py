@@ -4,8 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude
-
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Scalar
 
 
 def first_torque(

@@ -14,10 +14,12 @@ from ptsmc_jax.laws.closed_forms import exact_chain as exact_chain
 from ptsmc_jax.laws.closed_forms import exact_error as exact_error
 from ptsmc_jax.laws.closed_forms import from_modes, modes
 from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Setup
 
-Scalar = Float[Array, ""]
 Vector = Float[Array, " n"]
+
+VISITED = 64  # times on either part of a run
 
 
 def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, floor: Scalar) -> tuple[Vector, Vector]:
@@ -79,17 +81,17 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
 
 
-def visited(parts: Setup, points: int = 64) -> tuple[Array, Any]:
-    """Targets and states of a second-order run, (2 points,) each: along the exact motion, then on the target.
+def visited(parts: Setup) -> tuple[Array, Any]:
+    """Targets and states of a second-order run, (2 VISITED,) each: along the exact motion, then on the target.
 
     States in the states' own units; half of the times close in on the hand-over.
     """
-    return _visited(bare(parts), points)
+    return _visited(bare(parts))
 
 
-@programs.jit(static_argnames="points")
-def _visited(parts: Setup, points: int) -> tuple[Array, Any]:
-    law, share = parts.controller, jnp.linspace(0.0, 1.0, points)
+@programs.jit
+def _visited(parts: Setup) -> tuple[Array, Any]:
+    law, share = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
     none = jnp.zeros(parts.plant.inputs)
 
     def on_the_way(t: Scalar) -> tuple[Any, Any]:
