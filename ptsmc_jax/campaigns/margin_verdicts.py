@@ -72,7 +72,7 @@ def differ(dispersion: Dispersion) -> bool:
 
 def nearness(value: Any, limit: Any, name: str) -> Any:
     """As `requirements.over`, but negative values stay: margins far from their limit can be put in order, too."""
-    return 2.0 - value / limit if MARGINS[name][2] else value / limit
+    return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 
 def worst(
@@ -140,7 +140,7 @@ def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np
 
 def _over(name: str, values: Any) -> Any:
     """The worst along the last axis."""
-    return values.min(axis=-1) if MARGINS[name][2] else values.max(axis=-1)
+    return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
 @programs.jit

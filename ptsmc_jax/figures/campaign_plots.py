@@ -60,7 +60,7 @@ def fan(
         t_f: the prescribed time [s].
         kind: of the plant.
     """
-    unit = CATALOGUES[kind]["terminal_error"][0]
+    unit = CATALOGUES[kind]["terminal_error"].unit
     figure, axes = figure_of(f"Error of {len(errors)} trials, median in white", f"2-norm of the error [{unit}]")
     for share, grey in BANDS:
         low, high = np.percentile(errors, [50.0 - share / 2, 50.0 + share / 2], axis=0)
@@ -129,7 +129,7 @@ def torque_by_angle(
         limit: of the torque [N m], if one is asked for.
         kind: of the plant, whose units are those of its metrics.
     """
-    unit, attitude = CATALOGUES[kind]["peak_torque"][0], kind == "spacecraft"
+    unit, attitude = CATALOGUES[kind]["peak_torque"].unit, kind == "spacecraft"
     figure, axes = figure_of("Peak torque by how far the trial starts", f"peak torque [{unit}]")
     _points(axes, np.degrees(angle) if attitude else angle, torque, outcome, totals)
     axes.set_xlabel("initial angle [deg]" if attitude else "initial |x_1| [x1]")

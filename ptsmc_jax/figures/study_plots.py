@@ -150,7 +150,7 @@ def tradeoff(
         kind: of the plant, whose units are those of its metrics.
         floor: RMS error that no controller can beat.
     """
-    error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
+    error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     for (label, (errors, torques)), (colour, marker) in zip(arrays.items(), _looks(len(arrays)), strict=True):
@@ -280,7 +280,7 @@ def accuracy_map(
         borders: lines to draw, by label: (x, y).
         kind: of the plant, whose units are those of its metrics.
     """
-    error_unit, unit = (CATALOGUES[kind][name][0] for name in ("window_error", "peak_torque"))
+    error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     titles = {
         "window_error": f"RMS window error [{error_unit}]",
         "linear_window_error": f"its share from noise, linear theory [{error_unit}]",

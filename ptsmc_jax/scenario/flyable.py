@@ -69,12 +69,10 @@ def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
 
 def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """What a scenario asks of its loop."""
-    required = {name: value for name, value in scenario.requirements.items() if name in catalogues.MARGINS}
     return tuple(
-        Requirement(
-            name, float(typing.cast(float, value)), catalogues.MARGINS[name][0], at_least=catalogues.MARGINS[name][2]
-        )
-        for name, value in required.items()
+        Requirement(name, float(typing.cast(float, value)), margin.unit, at_least=margin.at_least)
+        for name, value in scenario.requirements.items()
+        if (margin := catalogues.MARGINS.get(name)) is not None
     )
 
 

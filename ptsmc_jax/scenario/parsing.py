@@ -284,7 +284,7 @@ def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> flo
     """A limit as a number in the metric's unit, also from one in words: "0.05 deg"."""
     allowed = NotNegative if metric in catalogues.MAY_BE_ZERO else Positive
     if isinstance(value, str):
-        value = _in_unit(key, value, {**metrics, **catalogues.MARGINS}[metric][0], keys.allowed(allowed))
+        value = _in_unit(key, value, {**metrics, **catalogues.MARGINS}[metric].unit, keys.allowed(allowed))
     return _value(key, value, allowed)
 
 

@@ -94,12 +94,20 @@ UNITS: dict[str, dict[str, float]] = {
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 
-# margins of the loop, see `margins`: name: (unit, what it is, whether a requirement is the least that is allowed)
+
+class Margin(NamedTuple):
+    """A margin of the loop, see `margins`."""
+
+    unit: str
+    meaning: str
+    at_least: bool = True  # a requirement is the least that is allowed
+
+
 MARGINS = {
-    "gain_margin": ("dB", "factor on the gain, up or down, to the border of stability", True),
-    "phase_margin": ("deg", "phase, either way, to the border of stability", True),
-    "delay_margin": ("s", "further delay to the border of stability", True),
-    "modulus_margin": ("dB", "largest sensitivity, 1 / the distance of L from -1", False),
+    "gain_margin": Margin("dB", "factor on the gain, up or down, to the border of stability"),
+    "phase_margin": Margin("deg", "phase, either way, to the border of stability"),
+    "delay_margin": Margin("s", "further delay to the border of stability"),
+    "modulus_margin": Margin("dB", "largest sensitivity, 1 / the distance of L from -1", at_least=False),
 }
 
 

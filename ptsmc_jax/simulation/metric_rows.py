@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.simulation import pointing
-from ptsmc_jax.simulation.catalogues import WITHIN
+from ptsmc_jax.simulation.catalogues import AXES, WITHIN
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, integral_in_window
 
 
@@ -150,7 +150,7 @@ def _pointing_rows(
 
     absolute, mean, relative, drift: names of the indices; measured: the error is that of a measurement.
     """
-    keeper = f"{absolute}_{pointing.AXES[0]}"
+    keeper = f"{absolute}_{next(iter(AXES))}"
 
     def begin(start: Start, criteria: Criteria) -> pointing.Tally | None:
         if criteria.pointing is None or (measured and not start.measured):
@@ -163,7 +163,7 @@ def _pointing_rows(
             return tally
         path = error()
         limits = [
-            [jnp.asarray(observed.limits.get(f"{index}_{axis}", jnp.inf)) for axis in pointing.AXES]
+            [jnp.asarray(observed.limits.get(f"{index}_{axis}", jnp.inf)) for axis in AXES]
             for index in (absolute, mean, relative)
         ]
         limits = jnp.stack([jnp.stack(of_axes) for of_axes in limits])
@@ -187,7 +187,7 @@ def _pointing_rows(
         f"{WITHIN}{mean}": lambda tally, criteria: _share_of_windows(tally.means_beyond, tally, criteria),
         f"{WITHIN}{relative}": lambda tally, criteria: _share_of_windows(tally.relative_beyond, tally, criteria),
     }
-    rows = {f"{name}_{axis}": row(index, k) for name, index in indices.items() for k, axis in enumerate(pointing.AXES)}
+    rows = {f"{name}_{axis}": row(index, k) for name, index in indices.items() for k, axis in enumerate(AXES)}
     return {**rows, keeper: replace(rows[keeper], begin=begin, update_after_t_f=update)}
 
 

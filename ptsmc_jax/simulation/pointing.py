@@ -20,8 +20,6 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 Vector = Float[Array, "3"]
 
-AXES = ("x", "y", "z", "boresight")  # of the indices: body axes, and the half-cone
-
 # Directions across the boresight, over half a turn, into which an error is projected. The largest projection gives a
 # half-cone to within 1/cos(pi/32) - 1 = 0.5 %, and is enlarged by as much.
 DIRECTIONS = 16

@@ -234,7 +234,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
             np.testing.assert_array_equal(first[0], first[1])
             np.testing.assert_allclose(near[1][first[0]], near[0][first[0]], rtol=1e-9)
             for name in names:
-                way = -1.0 if catalogues.MARGINS[name][2] else 1.0
+                way = -1.0 if catalogues.MARGINS[name].at_least else 1.0
                 np.testing.assert_allclose((way * found[name]).max(), (way * each[name]).max(), rtol=1e-9)
                 assert (way * each[name]).max() > way * nominal[name]
                 beyond = way * np.stack([found[name], each[name]]) > way * limits[name]

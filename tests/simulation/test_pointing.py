@@ -215,7 +215,7 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     begins = 5.25
     expected = brute_force(t[late], errors(0.0)[late], of_spline(spline), begins, 0.33, 6.5)
     found = {
-        index: np.array([getattr(result.metrics, f"{index}_{axis}") for axis in pointing.AXES]) for index in expected
+        index: np.array([getattr(result.metrics, f"{index}_{axis}") for axis in catalogues.AXES]) for index in expected
     }
     close(found, expected, 1e-7)  # rates by differences
     assert 1e-3 < found["ape"][3] < 0.1
@@ -294,7 +294,7 @@ def test_indices_have_slopes(flown):
 
 def test_every_index_is_a_metric_of_a_scenario_that_observes_it(flown):
     ready, _ = flown
-    named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in pointing.AXES}
+    named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in catalogues.AXES}
     assert named | {"within_ape_boresight", "within_rpe_boresight", "within_rke_x"} <= set(ready.catalogue)
     assert not {"within_ape_x", "within_ake_boresight"} & set(ready.catalogue)
     quiet = scenario.replace(ready.scenario, hardware=None, requirements=None)

@@ -50,7 +50,7 @@ def _untold(name: str, change: str) -> Value:
 
 def _hold(name: str) -> Value:
     """A margin in hold, of the worst axis; where it is asked for, the worst that was judged."""
-    unit = MARGINS[name][0]
+    unit = MARGINS[name].unit
 
     def of(law: Summary) -> float | None:
         verdict = {v["metric"]: v for v in law["verdicts"]}.get(name)

@@ -75,7 +75,7 @@ def tuned(worst: Mapping[str, Any] | None) -> Iterator[str]:
             continue
         yield f"margins that the tuned gains leave {place}: {_shown(margins)}"
         few = " and ".join(
-            f"{enough:g} {MARGINS[name][0]} of {_short(name)}"
+            f"{enough:g} {MARGINS[name].unit} of {_short(name)}"
             for name, enough in ENOUGH.items()
             if margins[name] is not None and margins[name] < enough
         )
@@ -94,7 +94,7 @@ def _swings(swing: Mapping[str, Any]) -> str:
 def _shown(margins: Mapping[str, Any]) -> str:
     """The margins that are limited, in words."""
     limited = [name for name in MARGINS if margins[name] is not None]
-    return ", ".join(f"{_short(name)} {margins[name]:.3g} {MARGINS[name][0]}" for name in limited)
+    return ", ".join(f"{_short(name)} {margins[name]:.3g} {MARGINS[name].unit}" for name in limited)
 
 
 def _short(name: str) -> str:

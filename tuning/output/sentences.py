@@ -84,7 +84,7 @@ def run_verdicts(summary: Summary, kind: str) -> list[Summary]:
     """The verdicts of one run, as those over many trials are told."""
     units = {**CATALOGUES[kind], **MARGINS}
     return [
-        {"metric": name, "worst": summary.get(name), "at_least": False, **entry, "unit": units[name][0], "trials": 1,
+        {"metric": name, "worst": summary.get(name), "at_least": False, **entry, "unit": units[name].unit, "trials": 1,
          "failures": int(not entry["met"])}
         for name, entry in summary["verdicts"].items()
     ]  # fmt: skip

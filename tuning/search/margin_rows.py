@@ -95,7 +95,7 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
         loops, _ = run_margins.judged_loops(parts)
     values = margins.of_each(loops, with_delay="delay_margin" in asked.metrics).each()
     shares = [
-        over(values[name].reshape(-1), wanted, at_least=MARGINS[name][2])
+        over(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
     ]
     near = jnp.stack([jnp.where(jnp.isnan(share), WITHOUT, share) for share in shares])

@@ -200,7 +200,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
-    unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"][0]
+    unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"].unit
     goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
     figures = {
