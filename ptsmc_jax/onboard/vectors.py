@@ -68,7 +68,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         applied = computer.applied[0]
         period = period_of(tick)._replace(star_x=star_x)
         (target, d_hat, u, s, w, _), computer = decide(parts, k2, period, computer, there)
-        drive, queue = actuators.command(acting, u, w, now.t, period.told, now.noise_weight)
+        drive, queue = actuators.command(acting, u, w, now.t, period.assumed_length, now.noise_weight)
         if walk is not None:
             walk = walk + parts.walk_rate * dt * draws.normals(walk_key, parts.plant.inputs, now.sample)
         motion = PeriodMotion(parts, now.t, x, drive, walk)

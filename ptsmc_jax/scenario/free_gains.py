@@ -42,7 +42,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
     if not set(free) <= {*tables.FREE, *own}:
-        raise wrong("tune.free", free, tables.FREE_TOLD)
+        raise wrong("tune.free", free, tables.FREE_ALLOWED)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
         if name not in ("observer_gain", *_OTHERS, *own):

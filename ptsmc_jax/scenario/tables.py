@@ -63,8 +63,8 @@ class Limit(Table, frozen=True):
 
 FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains),
         "observer_gain", "filter_bandwidth", "command_corner")  # besides those of a law of one's own  # fmt: skip
-FREE_TOLD = f"a list of some of {', '.join(FREE)}"
-FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_TOLD)]
+FREE_ALLOWED = f"a list of some of {', '.join(FREE)}"
+FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOWED)]
 
 
 class Tune(Table, frozen=True):

@@ -49,7 +49,7 @@ class Period(NamedTuple):
     now: Ticks
     dt_before: Scalar  # length of the one before [s]
     matrix: Array  # `Observer.update_matrix` of that length
-    whole: Scalar  # length of a whole one [s]
+    full_length: Scalar  # of a whole one [s]
     star_x: Any = None  # `star_state` of the one before
 
     @property
@@ -58,9 +58,9 @@ class Period(NamedTuple):
         return self.now.t_next - self.now.t
 
     @property
-    def told(self) -> Scalar:
+    def assumed_length(self) -> Scalar:
         """The length [s] that flight software goes by: it does not know that the run ends within its last period."""
-        starts = jnp.where(self.now.noise_weight < 1.0, self.length, self.whole)
+        starts = jnp.where(self.now.noise_weight < 1.0, self.length, self.full_length)
         return jnp.where(self.length > 0.0, starts, 0.0)
 
 
@@ -127,7 +127,7 @@ def command(
     """The law's torque (m,) [N m], its sliding variable and its memory."""
     now, has_length = period.now, period.length > 0.0
     # a length that one may divide by, also in a period that has none
-    sample = Sample(now.t, now.hold, jnp.where(has_length, period.told, period.whole))
+    sample = Sample(now.t, now.hold, jnp.where(has_length, period.assumed_length, period.full_length))
     u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
     return u, s, guards.select(has_length, memory, computer.law)
 
@@ -155,7 +155,7 @@ def decide(
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
     command_filter = computer.command_filter
     if parts.command_filter is not None:
-        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.told)
+        u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.assumed_length)
         command_filter = guards.select(period.length > 0.0, command_filter, computer.command_filter)
     decision = Decision(target, d_hat, u, s, parts.observer.model.velocity(seen))
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)

@@ -126,7 +126,7 @@ class _Loop(NamedTuple):
             parts, self.k2, period, computer, parts.plant.visible(state.x), hardware.actuators
         )
         drive, queue = actuators.command(
-            hardware.actuators, decision.u, decision.w, now.t, period.told, now.noise_weight
+            hardware.actuators, decision.u, decision.w, now.t, period.assumed_length, now.noise_weight
         )
         if decision.channels is not None:
             drive = drive._replace(c=decision.channels)

@@ -113,7 +113,9 @@ def _computed(
     actuators, dt = parts.effective_actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     model = carry.model._replace(h=carry.acting.h)
-    drive, queue = actuators.command(model, decision.u, decision.w, period.now.t, period.told, period.now.noise_weight)
+    drive, queue = actuators.command(
+        model, decision.u, decision.w, period.now.t, period.assumed_length, period.now.noise_weight
+    )
     computer = computer._replace(applied=assumed_torque(actuators, drive, dt))
     return decision, computer, actuators.end(model, drive, queue, dt)._replace(h=None)
 
@@ -226,7 +228,7 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
-def whole(ticks: Ticks, period: Any) -> Any:
+def is_full(ticks: Ticks, period: Any) -> Any:
     """Which periods of a run are whole ones, (periods,) bool; of times in [s], NumPy's or JAX's."""
     return ticks.t_next - ticks.t > (1.0 - 1e-6) * period
 
@@ -235,7 +237,7 @@ def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
     ticks = run.period.now
     in_hold = ticks.hold if hold else parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
-    long_enough = whole(jax.tree.map(np.asarray, ticks), np.asarray(parts.period))
+    long_enough = is_full(jax.tree.map(np.asarray, ticks), np.asarray(parts.period))
     return np.flatnonzero(long_enough & (np.asarray(in_hold) == hold))
 
 

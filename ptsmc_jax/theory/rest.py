@@ -39,7 +39,7 @@ class History(NamedTuple):
 
 def history(parts: Parts, run: linear.Nominal) -> History:
     """The commands [N m] of a nominal run."""
-    return History(run.command, linear.whole(run.period.now, parts.period) & run.period.now.hold)
+    return History(run.command, linear.is_full(run.period.now, parts.period) & run.period.now.hold)
 
 
 class Swing(NamedTuple):

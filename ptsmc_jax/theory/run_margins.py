@@ -64,13 +64,13 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     it is no farther off than at the hand-over.
     """
     ticks, law = run.period.now, parts.controller
-    whole = linear.whole(ticks, parts.period)
+    full = linear.is_full(ticks, parts.period)
     off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
-    size, hold = jnp.linalg.norm(off, axis=1), whole & ticks.hold
+    size, hold = jnp.linalg.norm(off, axis=1), full & ticks.hold
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])
     last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
-    before = whole & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
+    before = full & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
     left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
     nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)
     return jnp.append(jnp.where(jnp.any(before), nearest, last), last)

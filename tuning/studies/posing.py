@@ -43,16 +43,16 @@ class Posed:
         *,
         judged: bool = True,
         margin: float = 0.0,
-        **told: Callable,
+        **callbacks: Callable,
     ) -> Search:
         """Look for the best gains of this problem from these gains, (gains,), and so many starts in all.
 
-        asked: what is kept, where it is other than the scenario asks for; judged, margin: see `Settings`; told: what
-        `search` reports to, and prepares.
+        asked: requirements that are kept, where they are not the scenario's; judged, margin: see `Settings`;
+        callbacks: `report` and `prepare` of `search`.
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
         settings = Settings(starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margin)
-        return search(self.evaluate, problem, asked, gains, settings, **told)
+        return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
     def named(self, share: np.ndarray) -> dict[str, float]:
         """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
