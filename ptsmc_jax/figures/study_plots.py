@@ -261,6 +261,21 @@ def slew_times(slews: Sequence[Any], units: Mapping[str, str], limits: Mapping[s
     return figure
 
 
+def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequence[np.ndarray]) -> None:
+    """The numbers of a grid (y, x) as colours; alike: the grids that share its scale, itself among them."""
+    known = np.concatenate([one.ravel() for one in alike])
+    known = known[np.isfinite(known) & (known > 0)]
+    low, high = (known.min(), min(known.max(), known.min() * WIDEST)) if known.size else (1e-12, 1.0)
+    norm = matplotlib.colors.LogNorm(low, max(high, 1.01 * low))
+    if x.logarithmic:
+        logarithmic(axes, "x")
+    if y.logarithmic:
+        logarithmic(axes, "y")
+    mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
+    bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")
+    plain_ticks(bar.ax.yaxis)
+
+
 @styled
 def accuracy_map(
     x: MapAxis,
@@ -291,20 +306,10 @@ def accuracy_map(
     rows = (len(drawn) + 1) // 2
     figure = Figure(figsize=(10.0, 4.2 * rows), layout="constrained")
     many = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
+    column, row = np.meshgrid(x.values, y.values)
     for axes, name in zip(many, drawn, strict=False):
         kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
-        alike = np.concatenate([grids[other].ravel() for other in drawn if kind_of_number in other])
-        alike = alike[np.isfinite(alike) & (alike > 0)]
-        low, high = (alike.min(), min(alike.max(), alike.min() * WIDEST)) if alike.size else (1e-12, 1.0)
-        norm = matplotlib.colors.LogNorm(low, max(high, 1.01 * low))
-        if x.logarithmic:
-            logarithmic(axes, "x")
-        if y.logarithmic:
-            logarithmic(axes, "y")
-        mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grids[name]), norm=norm, cmap="cividis")
-        bar = figure.colorbar(mesh, ax=axes, extend="max" if alike.size and alike.max() > high else "neither")
-        plain_ticks(bar.ax.yaxis)
-        column, row = np.meshgrid(x.values, y.values)
+        _coloured(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
         axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
         limits = axes.get_xlim(), axes.get_ylim()
         for (label, line), style in zip(borders.items(), ("-", "--", ":"), strict=False):
