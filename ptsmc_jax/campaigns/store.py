@@ -1,4 +1,4 @@
-"""Result folders: what is refused, what lies in each, written so that a folder is whole or not there."""
+"""Result folders: which are refused, and their files, written so that a folder is complete or not there."""
 
 import csv
 import importlib.metadata

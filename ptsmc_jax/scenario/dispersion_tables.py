@@ -11,10 +11,10 @@ from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Table
 class Numbers(Table, frozen=True):
     """How numbers are drawn, about what the scenario says."""
 
-    width: ClassVar[str] = "std"  # the key that says how far
-    degrees: ClassVar[bool] = False  # which is in degrees
-    widest: ClassVar[float] = 0.0  # how far a vector of three goes, in times that: all but one in 10 000
-    farthest: ClassVar[float] = 3.0  # how far a number goes that bounds are to hold for, in times that: three sigma
+    width: ClassVar[str] = "std"  # the key that holds the spread
+    degrees: ClassVar[bool] = False  # it is in degrees
+    widest: ClassVar[float] = 0.0  # size that vectors of three stay below, all but one in 10 000, over the spread
+    farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for, over the spread: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
         """The width of so many numbers, of which a single one of the table stands for all; in rad for degrees."""

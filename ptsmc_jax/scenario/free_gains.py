@@ -121,14 +121,11 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
         return () if filtering is None else (filtering.corner,)
     if scenario.sensors is not None and name in scenario.sensors.gains:
         return (float(getattr(scenario.sensors, name.removeprefix("sensors_"))),)
-    law = name in scenario.controller.gains
-    value = getattr(scenario.controller if law else scenario.observer, name if law else _field(name), None)
+    if name in scenario.controller.gains:
+        value = getattr(scenario.controller, name, None)
+    else:
+        value = getattr(scenario.observer, name.removeprefix("observer_"), None)
     return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)
-
-
-def _field(name: str) -> str:
-    """The key of an observer that a gain's name stands for."""
-    return name.removeprefix("observer_")
 
 
 def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:

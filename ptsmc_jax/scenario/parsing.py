@@ -164,7 +164,7 @@ def as_parsed(scenario: Scenario) -> dict[str, Any]:
 
 
 def stated(scenario: Scenario) -> dict[str, Any]:
-    """Tables for a file without what the scenario's file did not say, and nobody changed since."""
+    """Tables for a file, without the defaults: keys that the scenario's file does not state and nobody has changed."""
     tables = dump(scenario)
     for (*place, key), value in scenario.defaulted.items():
         table: Any = tables
@@ -176,7 +176,7 @@ def stated(scenario: Scenario) -> dict[str, Any]:
 
 
 def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
-    """What tables hold and raw ones do not, by the path of its key."""
+    """The values of these tables whose keys the raw tables do not have, by the path of the key."""
     unsaid: dict[tuple[str, ...], Any] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):

@@ -52,7 +52,7 @@ def complete(scenario: Scenario) -> Scenario:
 
 
 def settled(scenario: Scenario) -> Scenario:
-    """The scenario with its defaults as if they were said: what is replaced in it moves no others."""
+    """The scenario with its defaults as stated values: replacing a key then moves no default that depends on it."""
     return msgspec.structs.replace(scenario, defaulted={})
 
 

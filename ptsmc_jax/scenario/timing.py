@@ -74,7 +74,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
     if setup.plant.unknown_pace:
-        hurried = _on_the_papers_way(setup.with_t_f(vector(reach.smallest_t_f)))
+        hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if not scenario.sampled:
@@ -159,8 +159,8 @@ def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
     return controller.boundary_layer(observer.error_bound().largest, visited)
 
 
-def _on_the_papers_way(setup: Setup) -> Setup:
-    """The parts under the paper's law, whose way is known: for any other one it says which states a run comes by."""
+def _with_papers_law(setup: Setup) -> Setup:
+    """The parts under the paper's law, whose exact motion stands for the states that a run under any law visits."""
     law = setup.controller
     if law.prescribed:
         return setup

@@ -59,7 +59,7 @@ class Period(NamedTuple):
 
     @property
     def assumed_length(self) -> Scalar:
-        """The length [s] that flight software goes by: it does not know that the run ends within its last period."""
+        """The length that flight software assumes [s]: it does not know that the run ends within its last period."""
         starts = jnp.where(self.now.noise_weight < 1.0, self.length, self.full_length)
         return jnp.where(self.length > 0.0, starts, 0.0)
 

@@ -1,4 +1,4 @@
-"""Several works side by side, each in a thread of its own, whose questions are answered together."""
+"""Tasks in threads of their own, whose questions are collected and answered in batches."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -8,7 +8,7 @@ Ask = Callable[[Any], Any]
 
 
 class _Task:
-    """A work in its thread, and what it asks."""
+    """A task in its thread, and what it asks."""
 
     def __init__(self, work: Callable[[Ask], None], turn: threading.Condition):
         self._work, self._turn = work, turn
@@ -44,11 +44,11 @@ class _Task:
 
 
 def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int) -> None:
-    """Do all of the works, `width` at a time; each asks one question after the other by what it is called with.
+    """Run all of these functions, at most `width` at a time; each asks one question at a time by calling its argument.
 
-    answer: gets the questions of all that are at work, in the works' order, once each of them waits or has ended; it is
-    called in this thread. What a work raises is raised here, and what `answer` raises, an interrupt among it, in the
-    works that wait for it first: when this returns, or raises, none is at work any more.
+    answer: called in this thread with the questions of all that run, in their order, once each of them waits or has
+    ended. What one of them raises is raised here. What `answer` raises, a KeyboardInterrupt too, is first raised in
+    those that wait for it: when this returns, or raises, none of them runs any more.
     """
     turn = threading.Condition()
     waiting, active, raised = [_Task(work, turn) for work in works], list[_Task](), None

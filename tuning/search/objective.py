@@ -30,10 +30,10 @@ DRAWN = 128  # trials whose coordinates are drawn in one call
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """What metrics of the training trials are judged by. The first `averaged` trials count in the objective.
+    """What metrics of the training trials are judged by. The first `averaged` trials make up the objective.
 
-    A limit on every trial is one on each trial that is `counted`. A limit on a share of the trials is one on each of
-    those that are `among` its own, but for the `may_break` that are farthest beyond it, and on each that is `counted`.
+    A limit must be kept by every trial that is `counted`. One with a quantile must also be kept by the trials that are
+    `among` its sample, except for the `may_break` of them that exceed it most.
     """
 
     limits: Leaf | np.ndarray  # (requirements,) in the metrics' units

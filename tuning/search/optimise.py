@@ -25,7 +25,7 @@ HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would b
 
 @dataclass(frozen=True)
 class Settings:
-    """How a search goes about it."""
+    """How a search is run."""
 
     starts: int  # from which it descends
     steps: int  # points that may be looked at from each of them
@@ -76,7 +76,7 @@ def search(
         problem: what is minimised over the training trials.
         requirements: those of its limits.
         own: (gains,) the scenario's gains, the first start.
-        settings: how the search goes about it.
+        settings: how it is run.
         report: is called after every step.
         prepare: is called once the search's own programs are being compiled, for those of what comes after it.
     """

@@ -38,7 +38,7 @@ def starting_points(
 
 
 def held_by_limits(at: Sloped) -> list[int]:
-    """For each limit that is nearly reached at a point the gain that it hangs on most, but for the last two gains."""
+    """For each limit that is nearly active at a point, the gain that it depends on most; at least two stay free."""
     nearest = at.c[0].argmax(axis=1)
     held: list[int] = []
     for row in np.argsort(-at.c[0].max(axis=1)):
