@@ -1,5 +1,6 @@
 """Whether a limit for a share of the trials will hold: counted on trials that no search has seen, as it is judged."""
 
+import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -76,12 +77,10 @@ def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) 
 
 def allowed(requirement: Requirement, fresh: int, trials: int) -> int | None:
     """How many of `trials` may break the limit for the verdict on `fresh` others to be met with `SURE`."""
-    low, high = -1, trials
-    while high - low > 1:
-        middle = (low + high) // 2
-        sure = probability(requirement, fresh, trials, middle) >= SURE
-        low, high = (middle, high) if sure else (low, middle)
-    return low if low >= 0 else None
+    too_many = bisect.bisect_left(
+        range(trials), True, key=lambda beyond: probability(requirement, fresh, trials, beyond) < SURE
+    )
+    return too_many - 1 if too_many else None
 
 
 def count(

@@ -389,6 +389,5 @@ def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
     t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
-    scenario = folder.scenario
-    worst = int(trials[hardest]), error[-1]
-    return plots.fan(t, error[:-1][finished[: shown.size]], worst, scenario.controller.t_f, scenario.plant.kind)
+    flown, worst = folder.scenario, (int(trials[hardest]), error[-1])
+    return plots.fan(t, error[:-1][finished[: shown.size]], worst, flown.controller.t_f, flown.plant.kind)

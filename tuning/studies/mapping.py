@@ -95,8 +95,8 @@ def axis(text: str, option: str) -> Axis:
         raise UsageError(wanted) from None
     if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
         raise UsageError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
-    wide = low > 0 and high > WIDE * low
-    values = np.geomspace(low, high, count) if wide else np.linspace(low, high, count)
+    spaced = np.geomspace if Axis(key, (low, high)).logarithmic else np.linspace
+    values = spaced(low, high, count)
     if key in WHOLE_NUMBERS:
         values = np.unique(np.round(values))
     return Axis(key, tuple(float(f"{v:.6g}") for v in values))
