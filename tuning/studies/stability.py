@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.numerics import attitude
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -109,8 +110,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
 
 def _start(ready: Study) -> float:
     """How far the nominal run starts from its reference [deg]."""
-    along = abs(float(np.dot(ready.parts.initial.q, ready.parts.reference(jnp.zeros(())).q)))
-    return float(np.rad2deg(2.0 * np.arccos(min(along, 1.0))))
+    return float(np.rad2deg(attitude.angle(ready.parts.initial.q, ready.parts.reference(jnp.zeros(())).q)))
 
 
 def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
