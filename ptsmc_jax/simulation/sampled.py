@@ -125,6 +125,8 @@ class _Loop(NamedTuple):
         decision, computer = self.software.decide(
             parts, self.k2, period, computer, parts.plant.visible(state.x), hardware.actuators
         )
+        # the error is judged by where the reference is, not by where flight software takes it to be
+        target = decision.target if next_offset is None else parts.reference(now.t)
         drive, queue = actuators.command(
             hardware.actuators, decision.u, decision.w, now.t, period.assumed_length, now.noise_weight
         )
@@ -139,11 +141,11 @@ class _Loop(NamedTuple):
         if self.run.record:
             wheels = None if actuators.wheels is None else actuators.wheels_at(drive, jnp.zeros_like(dt))
             signals = decision.d_hat, torques.delivered[0], decision.u, decision.s
-            row = run_state.row(self.run, now.t, state.x, decision.target, signals, dt > 0.0, walk, wheels)
+            row = run_state.row(self.run, now.t, state.x, target, signals, dt > 0.0, walk, wheels)
         motion = PeriodMotion(parts, now.t, state.x, drive, walk)
         seen = None if parts.sensors is None else computer.seen
         flown = Flown(motion.at(now.t_next), motion.at, torques, dt / parts.substeps, seen)
-        state = run_state.advance(self.run, state, now, decision.target, flown)
+        state = run_state.advance(self.run, state, now, target, flown)
         applied = None if actuators.holds else assumed_torque(actuators, drive, nominal_dt)
         computer = computer._replace(applied=applied)
         actuator_state = actuators.end(hardware.actuators, drive, queue, dt)

@@ -217,6 +217,18 @@ def test_samples_that_come_early_or_late_by_hand():
     assert np.abs(np.diff(times) / h - 1.0).max() > 0.2
 
 
+def test_a_late_sample_is_judged_by_where_the_reference_is():
+    """Flight software takes the reference of the nominal time; the error is to that of the true one."""
+    tables = {key: FLIGHT[key] for key in ("controller", "initial", "loop")}
+    spin = {"kind": "spin", "rate": [0.0, 0.0, 0.2]}
+    tables |= {"reference": spin, "dispersion": CHAIN["dispersion"]}
+    run = runs.fly(scenario.study(scenario.from_tables(tables)), 3, 2)
+    log = run.log
+    np.testing.assert_allclose(log.reference.q[:, 2], np.sin(0.1 * log.t), rtol=0, atol=1e-14)
+    later = max(np.linalg.norm(log.error[log.t > 5.0], axis=1))
+    np.testing.assert_allclose(run.metrics["hold_error"], max(later, run.metrics["terminal_error"]), rtol=1e-12)
+
+
 IN_TIME = [
     pytest.param({**CHAIN, "hardware": {"state_noise": [1e-4, 1e-4]}}, id="chain with noise"),
     pytest.param(FLIGHT, id="flexible spacecraft with noise", marks=pytest.mark.long),
