@@ -1,5 +1,6 @@
 """The common look of all figures, and how they are written."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -51,9 +52,16 @@ class _Decades(matplotlib.ticker.LogLocator):
     """1, 2 and 5 times each power of ten; the powers alone where there are more than four, or too little room."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / 3)  # three numbers a power
+        room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
         self.set_params(subs=(1.0,) if vmax > min(MANY, room) * vmin else (1.0, 2.0, 5.0))
         return super().tick_values(vmin, vmax)
+
+    def _space(self, vmin: float, vmax: float) -> float:
+        """Of a power of ten with its three numbers, in what Matplotlib counts as a tick's: the longer, the more."""
+        if vmin <= 0.0 or self.axis.axis_name == "y":
+            return 3.0
+        powers = range(math.floor(math.log10(vmin)), math.ceil(math.log10(vmax)) + 1)
+        return max(3.0, 0.3 + 0.7 * max(len(f"{10.0**power:g}") for power in powers))
 
 
 def plain_ticks(line: Axis) -> None:
