@@ -118,3 +118,13 @@ def test_the_papers_law_flies_in_place_of_another_on_every_plant(kind):
     papers = gains.papers(flown)
     assert (papers.controller.kind, papers.controller.t_f, papers.controller.eta) == ("prescribed_time", 12.0, 3.0)
     assert getattr(papers.controller, "error", "multiplicative") == "multiplicative"
+
+
+@pytest.mark.parametrize(("most", "said"), [(0.0633, 1), (0.0, 0)])
+def test_a_command_that_actuators_cut_is_said_where_nothing_was_required_of_it(most, said):
+    """A peak torque of twice the actuators' limit stood in the table without a word."""
+    summary = tuned(None, {"ok": 64})
+    summary["fresh"] |= {"saturated": {"mean": 0.0059, "max": most}}
+    lines = list(sentences.accuracy(summary))
+    assert len(lines) == said
+    assert all("for 0.59 % of a fresh trial on average and 6.3 % at most" in line for line in lines)

@@ -152,6 +152,10 @@ def accuracy(summary: Summary) -> Iterator[str]:
             worse = f"the tuned gains are less accurate than {paper}: they leave {1.0 / times:.3g} times the error"
             yield f"{worse}{_between(within, '.3g')}{but}"
     yield from paper_refused(summary)
+    cut = fresh.get("saturated")
+    if cut and cut["max"]:
+        often = f"{100 * cut['mean']:.2g} % of a fresh trial on average and {100 * cut['max']:.2g} % at most"
+        yield f"limits of the actuators cut the command of the tuned gains, for {often}"
     trained, fresh = summary["training"]["window_error"], fresh["window_error"]
     before = summary.get("before")
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
