@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, TIME, figure_of, styled
+from ptsmc_jax.figures.style import LIMIT, STYLES, TIME, figure_of, plain_ticks, styled
 from ptsmc_jax.paper.remark_2 import Measured
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -173,6 +173,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
     axes.plot([], [], **EXACT, label="exact, perfect estimate")
     axes.set_xlabel("time to go $t_f - t$ [s]")
     axes.set_ylim(bottom=bottom / 3)
+    plain_ticks(axes.xaxis)
     axes.invert_xaxis()
     axes.legend(loc="lower left")
     return figure

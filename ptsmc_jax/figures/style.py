@@ -52,6 +52,7 @@ class _Decades(matplotlib.ticker.LogLocator):
     """1, 2 and 5 times each power of ten; the powers alone where there are more than four, or too little room."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
+        vmin, vmax = sorted((vmin, vmax))  # of an axis that runs the other way, too
         room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
         self.set_params(subs=(1.0,) if vmax > min(MANY, room) * vmin else (1.0, 2.0, 5.0))
         return super().tick_values(vmin, vmax)

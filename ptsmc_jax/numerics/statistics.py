@@ -74,6 +74,15 @@ def _tilted(x: np.ndarray, counts: np.ndarray, tilt: float) -> tuple[float, floa
     return float(special.ndtr(w) + density * between), float(1.0 - rest)
 
 
+def percentile(values: np.ndarray, value: float) -> float:
+    """Where a value stands among all [%], among equal ones in their middle: what most rows of a plan say is no extreme.
+
+    >>> percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0), percentile(np.array([10.0, 10.0, 10.0, 10.0, 20.0]), 10.0)
+    (100.0, 50.0)
+    """
+    return 100.0 * float(np.mean(values < value) + (np.sum(values == value) + 1) / (2 * values.size))
+
+
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:
     """Two-sided interval of a quantile between two order statistics, whatever the distribution.
 

@@ -15,3 +15,12 @@ def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(delay, said
     late = ptsmc_jax.replace(from_tables(untuned(SHORT)), hardware__delay=delay)
     (axes,) = ptsmc_jax.simulate(late).plot("torque")["torque"].axes
     assert any(re.match(said, label) for label in axes.get_legend_handles_labels()[1])
+
+
+def test_the_time_to_go_has_plain_numbers():
+    """It runs from t_f down to delta: 60 to 4 s stood there as 6x10^1, 4x10^1, 3x10^1."""
+    (axes,) = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("convergence")["convergence"].axes
+    axes.figure.draw_without_rendering()
+    labels = [label.get_text() for label in axes.get_xticklabels(which="both") if label.get_text()]
+    assert labels
+    assert all(re.fullmatch(r"[\d.]+", label) for label in labels)
