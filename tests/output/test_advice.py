@@ -128,3 +128,13 @@ def test_a_command_that_actuators_cut_is_said_where_nothing_was_required_of_it(m
     lines = list(sentences.accuracy(summary))
     assert len(lines) == said
     assert all("for 0.59 % of a fresh trial on average and 6.3 % at most" in line for line in lines)
+
+
+@pytest.mark.parametrize(("without", "largest"), [(1, "57.2"), (2, "none")])
+def test_no_largest_settling_time_is_said_where_a_run_that_ended_never_settled(without, largest):
+    """Of the trials that failed there is none either, but they are counted above the table."""
+    at = {"value": 56.0, "low": 55.0, "high": 57.0}
+    settling = {"without_value": without, "max": 57.2, "0.5": at, "0.9973": at}
+    counts = {"ok": 58, "missed": 1, "diverged": 1}
+    (table,) = sentences.campaign({"plant": "spacecraft", "counts": counts, "quantiles": {"settling_time": settling}})
+    assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
