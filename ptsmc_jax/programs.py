@@ -1,8 +1,8 @@
 """`jax.jit`, with compiled programs that outlive the process: loading one takes a tenth of tracing and lowering it.
 
-Kept beside the compile cache where `configure(keep_programs=True)` asks for it, as the `ptsmc` command does. A session in
-which code may be patched should not ask: a program is told from another by the files of its code alone. Any doubt, a file
-cut short among them, falls back to compiling.
+Kept beside the compile cache where `configure(keep_programs=True)` asks for it, as the `ptsmc` command does. A session
+in which code may be patched should not ask: a program is told from another by the files of its code alone. Any doubt, a
+file cut short among them, falls back to compiling.
 """
 
 import functools
