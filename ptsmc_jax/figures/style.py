@@ -8,7 +8,7 @@ from typing import Any, Literal
 import matplotlib
 import matplotlib.ticker
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
@@ -59,7 +59,7 @@ class _Decades(matplotlib.ticker.LogLocator):
 
     def _space(self, vmin: float, vmax: float) -> float:
         """Of a power of ten with its three numbers, in what Matplotlib counts as a tick's: the longer, the more."""
-        if vmin <= 0.0 or self.axis.axis_name == "y":
+        if vmin <= 0.0 or not isinstance(self.axis, XAxis):
             return 3.0
         powers = range(math.floor(math.log10(vmin)), math.ceil(math.log10(vmax)) + 1)
         return max(3.0, 0.3 + 0.7 * max(len(f"{10.0**power:g}") for power in powers))

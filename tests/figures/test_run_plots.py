@@ -19,8 +19,9 @@ def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(delay, said
 
 def test_the_time_to_go_has_plain_numbers():
     """It runs from t_f down to delta: 60 to 4 s stood there as 6x10^1, 4x10^1, 3x10^1."""
-    (axes,) = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("convergence")["convergence"].axes
-    axes.figure.draw_without_rendering()
+    figure = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("convergence")["convergence"]
+    (axes,) = figure.axes
+    figure.draw_without_rendering()
     labels = [label.get_text() for label in axes.get_xticklabels(which="both") if label.get_text()]
     assert labels
     assert all(re.fullmatch(r"[\d.]+", label) for label in labels)

@@ -266,7 +266,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                     "input": name,
                     "drawn": float(inputs[name][at]),
                     "unit": unit_of.get(name, ""),
-                    "percentile": statistics.percentile(inputs[name], inputs[name][at]),
+                    "percentile": statistics.percentile(inputs[name], float(inputs[name][at])),
                     "median": float(np.median(inputs[name])),
                     **drivers.get(name, {"rank_correlation": None, "first_order": None}),
                 }
