@@ -138,3 +138,10 @@ def test_no_largest_settling_time_is_said_where_a_run_that_ended_never_settled(w
     counts = {"ok": 58, "missed": 1, "diverged": 1}
     (table,) = sentences.campaign({"plant": "spacecraft", "counts": counts, "quantiles": {"settling_time": settling}})
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
+
+
+def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
+    """With steps of 1 mN m on a large satellite they were off by 3 in a loop that neither chatters nor breaks off."""
+    found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}
+    (said,) = search_sentences.trust({"trust": found, "at_bound": {}})
+    assert "hardware.torque_step" in said

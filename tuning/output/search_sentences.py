@@ -136,7 +136,8 @@ def trust(summary: Summary) -> Iterator[str]:
     else:
         yield (
             f"slopes by automatic differentiation are off from differences by {shown}: the loop chatters or breaks off "
-            "there, and the descent had little to go by; trust the global check (--global-check) instead"
+            "there, or the steps of hardware.torque_step, which slopes leave out, are felt; the descent had little to "
+            "go by: trust the global check (--global-check) instead"
         )
 
 
