@@ -41,13 +41,18 @@ class Controller:
         self.about = About(
             name, source, digest(self.scenario), type(law).__name__, self.board.parameters["filter"] is not None,
             self.board.spacecraft, device is not None and device.wheels is not None,
-            0 if device is None else device.delay, float((law.t_f / (law.delta + self.period)) ** 2),
+            0 if device is None else device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
 
     @property
     def period(self) -> float:
         """The control period [s]."""
         return float(self.ready.parts.period)
+
+    @property
+    def last(self) -> float:
+        """How long before t_f the last sample before the hand-over may be [s]."""
+        return float(self.ready.parts.controller.delta) + self.period
 
 
 def flown(scenario: Scenario) -> Scenario:
@@ -80,8 +85,22 @@ def identifier(text: str) -> str:
     return plain if plain and not plain[0].isdigit() else f"c_{plain}".rstrip("_")
 
 
-def table(made: Controller, seed: int, trials: int) -> tuple[list[str], list[list[Any]]]:
-    """Header and rows of vectors.csv: of so many usable trials."""
+def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
+    """Those of so many trials that are usable, by their number."""
+    dispersion = vectors.known_alike(made.ready.dispersion)
+    numbers = np.arange(trials, dtype=np.uint32)
+    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
+    each = {int(k): vectors.one(flown, int(k)) for k in numbers}
+    usable = {k: samples for k, samples in each.items() if vectors.usable(samples)}
+    if not usable:
+        raise ScenarioError(
+            f"none of the first {trials} trials keeps away from the law's singularity: nothing to check by"
+        )
+    return usable
+
+
+def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of vectors.csv."""
     lists = templates.columns(made.code)
     header = [
         "trial",
@@ -89,31 +108,24 @@ def table(made: Controller, seed: int, trials: int) -> tuple[list[str], list[lis
         "status",
         *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in lists[kind]),
     ]
-    dispersion = vectors.known_alike(made.ready.dispersion)
     rows: list[list[Any]] = []
-    numbers = np.arange(trials, dtype=np.uint32)
-    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
-    for k in numbers:
-        samples = vectors.one(flown, int(k))
-        if not vectors.usable(samples):
-            continue
+    for k, samples in flown.items():
         given, out, state = vectors.rows(made.board, samples)
         nothing = [0.0] * (given.shape[1] + out.shape[1])
-        rows.append([int(k), -1, 0, *nothing, *vectors.first_state(made.board, samples).tolist()])
+        rows.append([k, -1, 0, *nothing, *vectors.first_state(made.board, samples).tolist()])
         together = np.column_stack([given, out, state]).tolist()
-        rows += [
-            [int(k), n, int(cut), *row] for n, (cut, row) in enumerate(zip(samples.limited, together, strict=True))
-        ]
-    if not rows:
-        raise ScenarioError(
-            f"none of the first {trials} trials keeps away from the law's singularity: nothing to check by"
-        )
+        rows += [[k, n, int(cut), *row] for n, (cut, row) in enumerate(zip(samples.limited, together, strict=True))]
     return header, rows
 
 
 def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
     """Fills a folder that is there."""
-    header, rows = table(made, seed, trials)
+    flown = fly(made, seed, trials)
+    if made.board.spacecraft:
+        t_f = float(made.ready.parts.controller.t_f)
+        least = min(vectors.steepness(samples, t_f, made.last) for samples in flown.values())
+        made.about = made.about._replace(steepness=max(made.about.steepness, least))
+    header, rows = table(made, flown)
     write_program(folder, made)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **own.digests(made.scenario)}

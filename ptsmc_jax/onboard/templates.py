@@ -36,7 +36,7 @@ class About(NamedTuple):
     spacecraft: bool
     wheels: bool
     delay: int
-    steepness: float  # (t_f / time to go of the last sample before the hand-over)^2, by which gains grow until then
+    steepness: float  # (t_f / time to go of the last sample before the hand-over)^2, by which gains grow, or more
 
 
 def filled(file: str, **values: str) -> str:

@@ -16,6 +16,8 @@ from ptsmc_jax.simulation.computer import assumed_torque, boot, decide, schedule
 from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
 from ptsmc_jax.simulation.sampled import PeriodMotion, walk_stream
 
+ROUNDED = 4.0  # times: 1.5 were seen
+
 
 class Samples(NamedTuple):
     """A run by samples, arrays (samples, ..); what there is none of is None."""
@@ -38,6 +40,7 @@ class Samples(NamedTuple):
     d_hat: Array
     command: Array
     s: Array
+    error: Array  # as the law sees it
     torque: Array  # on the body from this sample on [N m]
     wheel_torque: Array | None
     limited: Array  # bool
@@ -84,6 +87,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             gyro=getattr(computer.sensors, "rate", None),
             applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.observer,
             law=computer.law, queue=queue, d_hat=d_hat, command=u, s=s,
+            error=law.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
@@ -116,6 +120,20 @@ def usable(samples: Samples) -> bool:
     """Whether a trial is finite, and stays away from the law's singularity."""
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(samples))
     return finite and bool(np.min(samples.clearance) >= SINGULAR_CLEARANCE)
+
+
+def steepness(samples: Samples, t_f: float, last: float) -> float:
+    """How much larger the gains before the hand-over are than what the largest command of a trial is due to.
+
+    Gains grow like 1 / (t_f - t)^2 until `last` [s] before t_f, and the law's command is about the error that it sees
+    times those of its moment: a small slew asks for little, beside which rounding of its attitude is the larger. That
+    of a quaternion beside another one is up to `ROUNDED` times that of one near the identity.
+    """
+    left = t_f - samples.t
+    before = left >= last * (1.0 - 1e-9)
+    command = np.linalg.norm(samples.error[before], axis=1) * (last / left[before]) ** 2
+    largest = float(command.max(initial=0.0))
+    return ROUNDED / largest if largest else 0.0
 
 
 def one(samples: Samples, trial: int) -> Samples:

@@ -72,6 +72,23 @@ def test_every_law_of_the_registry_replays_the_simulator(plant, kind, tmp_path):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
+    """Its torque is small and its gains grow by 160 000: C was off by 4e-8 of it, and 1e-10 was allowed."""
+    tables = {
+        "spacecraft": {"inertia": [3200.0, 4500.0, 2600.0]},
+        "initial": {"rotvec_deg": [20.1, 30.3, 40.0]}, "reference": {"rotvec_deg": [20.0, 30.0, 40.0]},
+        "disturbance": {"kind": "none"}, "controller": {"error": "multiplicative", "t_f": 300.0, "delta": 0.5},
+        "loop": {"mode": "sampled", "period": 0.25, "t_end": 302.0}, "filter": {"kind": "steady_state"},
+        "hardware": {"attitude_noise": 1e-6, "rate_noise": 1e-8},
+    }  # fmt: skip
+    made = scenario.reading.complete(scenario.from_tables(tables))
+    place = folder.export(made, tmp_path / "controller", name="small", trials=1)
+    done = make(place, "check")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 def test_anything_may_come_in(exported, tmp_path):
     """A hundredth of what `make fuzz` takes, under the sanitizers where the compiler has them."""
     place = shutil.copytree(exported, tmp_path / "controller")

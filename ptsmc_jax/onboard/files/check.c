@@ -57,9 +57,9 @@ static int skip_heading(FILE *file)
 int main(int count, char **given)
 {
     const int single = sizeof(ptsmc_real) == 4;
-    /* what rounding of an attitude, times the gains just before the hand-over, is beside the torque at the start */
+    /* what rounding of an attitude, times the gains just before the hand-over, is beside the largest torque */
     const double rounding = (single ? 4.8e-7 : 8.9e-16) * @steepness@;
-    const double tolerance = count > 2 ? strtod(given[2], NULL) : fmax(single ? 1e-3 : 1e-12, rounding);
+    const double tolerance = count > 2 ? strtod(given[2], NULL) : fmax(single ? 1e-3 : 1e-12, fmin(rounding, 0.1));
     static double v[COLUMNS], largest[CHECKED], off[CHECKED], found[CHECKED];
     FILE *const file = fopen(count > 1 ? given[1] : "vectors.csv", "r");
     ptsmc_state state;
@@ -110,7 +110,7 @@ int main(int count, char **given)
     for (int k = 1; k < CHECKED; k++) {
         worst = off[k] > off[worst] || off[k] != off[k] ? k : worst;
     }
-    printf("%ld samples; other status: %ld; largest difference %.2e of %s, allowed %.0e\n", rows, statuses, off[worst],
+    printf("%ld samples; other status: %ld; largest difference %.2e of %s, allowed %.2g\n", rows, statuses, off[worst],
            checked[worst].name, tolerance);
     return rows > 0 && statuses == 0 && off[worst] <= tolerance ? 0 : 1;
 }
