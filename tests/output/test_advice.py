@@ -16,7 +16,8 @@ from tuning.studies import tune_files, tuner
 def summary(over, *, searched: float | None = 0.97):
     verdict = {"metric": "peak_torque", "limit": 0.5, "margin": over, "met": over is not None and over <= 1.0}
     found = {"largest_over_limit": {"peak_torque": searched}, "averaged": 256}
-    return {"verdicts": [verdict], "search": found}
+    unknown = {"window_error": None}
+    return {"verdicts": [verdict], "search": found, "training": unknown, "fresh": unknown}
 
 
 def test_what_to_change_is_said_with_the_numbers():
@@ -145,3 +146,12 @@ def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
     found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}
     (said,) = search_sentences.trust({"trust": found, "at_bound": {}})
     assert "hardware.torque_step" in said
+
+
+@pytest.mark.parametrize(("least", "said"), [(2.0, []), (2.36, ["tune with tune.trials = 64"])])
+def test_gains_that_fit_their_training_trials_too_closely_are_told(least, said):
+    """By intervals that share nothing: 1.73e-6 (1.49 to 2.01) in training, 2.42e-6 from 2.36 on elsewhere."""
+    at = {"training": [1.49, 2.01], "fresh": [least, 2.48]}
+    errors = {on: {"window_error": {"rms_interval": interval}} for on, interval in at.items()}
+    lines = list(search_sentences.advice({"search": {"averaged": 16}, "verdicts": [], **errors}))
+    assert [line.rpartition("; ")[2] for line in lines] == said

@@ -17,6 +17,9 @@ def test_a_line_every_ten_seconds_where_no_terminal_shows_a_bar(capsys):
         tell("searching", done, 7)
     assert capsys.readouterr().err.splitlines() == ["ptsmc: searching, 1 of 7, 10 s", "ptsmc: searching, 3 of 7, 21 s"]
     at = iter([0.0, 99.0])
+    Lines(silent=False, clock=lambda: next(at))("searching", 7, 100)
+    assert capsys.readouterr().err.splitlines() == ["ptsmc: searching, 7 %, 99 s"]
+    at = iter([0.0, 99.0])
     Lines(silent=True, clock=lambda: next(at))("searching", 1, 7)
     assert not capsys.readouterr().err
 

@@ -17,6 +17,7 @@ def test_steps_that_end_early_and_further_rounds_move_one_scale():
 
     assert told("compiling", 0) == 0
     assert told("a", 0) == 0
+    assert seen[-1] == ("compiling", 0)  # whatever has begun: nothing has flown yet
     assert told("a", 25) == 25
     assert told("b", 30) == round(100 * 30 / 80)  # a ended early: 30 done, 50 left
     assert told("b", 30, 4) == round(100 * 50 / 80)  # a rollout with slopes is worth five

@@ -91,14 +91,14 @@ def _how_far(summary: Summary, metric: str, ratio: float | None) -> str:
 
 
 def advice(summary: Summary) -> Iterator[str]:
-    """What to change where fresh trials break a requirement that the search kept."""
+    """What to change where fresh trials break a requirement that the search kept, or are less accurate than its own."""
     record = summary["search"]
+    larger = f"tune.trials = {4 * record.get('averaged', 256)}"
     for verdict in summary["verdicts"]:
         searched, over = record["largest_over_limit"].get(verdict["metric"]), verdict["margin"]
         kept_in_search = searched is not None and searched <= 1.0
         if verdict["met"] or not kept_in_search or verdict.get("at_least") or not verdict["limit"]:
             continue
-        larger = f"tune.trials = {4 * record.get('averaged', 256)}"
         if over is None or not math.isfinite(over):
             yield f"{verdict['metric']}: kept in the search, but fresh trials fail or lack it: tune with {larger}"
         else:
@@ -107,6 +107,12 @@ def advice(summary: Summary) -> Iterator[str]:
                 f"{verdict['metric']}: kept in the search, but fresh trials reach {over:.3g} times the limit: tune "
                 f"with {larger}, or with requirements.{verdict['metric']} = {limit}, by which these gains would keep it"
             )
+    trained, fresh = ((summary[on]["window_error"] or {}).get("rms_interval") for on in ("training", "fresh"))
+    if trained and fresh and trained[1] < fresh[0]:
+        yield (
+            "fresh trials are less accurate than training ones by more than chance explains: the gains fit those too "
+            f"closely; tune with {larger}"
+        )
 
 
 def trust(summary: Summary) -> Iterator[str]:

@@ -36,7 +36,10 @@ class Work:
         left = sum(cost for _, cost in self._left)
         if self._left and self._left[0][0] == what.partition(",")[0]:
             left -= min(self._left[0][1], flown - self._base)
-        self._report(what, round(PERCENT * flown / (flown + left)) if flown else 0, PERCENT, value, over)
+        if flown:
+            self._report(what, round(PERCENT * flown / (flown + left)), PERCENT, value, over)
+        else:  # which takes minutes where margins with slopes are among it
+            self._report("compiling", 0, 0, value, over)
 
     def _turn(self, name: str) -> None:
         """What is left from this step on."""
