@@ -50,11 +50,11 @@ The pointing error indices are there with `[pointing]` only, whose observation b
 windows one after the other; a last part that fills none counts for APE and AKE only. An error about an axis is a
 component of the rotation vector from the reference to the body, in body axes; a half-cone is the angle between where
 the boresight points and where it should, and what is a mean or a difference of such is one of arcs on the sphere, laid
-flat. They are taken at the ends of control periods, at the observation's begin and at the ends of windows, means over
-all of the time; half-cones of RPE, PDE and RKE are known to 0.5 %, and said so much too large. PDE is the largest
-difference between the means of any two windows. What the law is given (AKE, MKE, RKE: with noise or a filter only)
-holds from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of the
-time."""
+flat. They are taken at the ends of control periods and at the observation's begin, RPE at the ends of windows too, and
+means over all of the time; half-cones of RPE, PDE and RKE are known to 0.5 %, and said so much too large. PDE is the
+largest difference between the means of any two windows. What the law is given (AKE, MKE, RKE: with noise or a filter
+only) holds from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of
+the time."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing
