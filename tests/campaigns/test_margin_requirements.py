@@ -193,6 +193,19 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_jud
     np.testing.assert_allclose(near, np.max(shares), rtol=1e-12)
 
 
+def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for(drawn, monkeypatch):
+    """Another one, by a shape or a type, would be compiled for nothing."""
+    posed, prepared = drawn, []
+    monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *given: prepared.append(given))
+    monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
+    bounds = posed.evaluate.bounds
+    margin_rows.ask(posed.ready, bounds, 3)
+    known = [(jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)])
+             for given in ((some, share) for some, bound, share in prepared if bound is bounds)]  # fmt: skip
+    asked = (posed.problem.margins, bounds.share(posed.own))
+    assert known == [(jax.tree.structure(asked), [programs._shape(leaf) for leaf in jax.tree.leaves(asked)])]
+
+
 FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains
 
 

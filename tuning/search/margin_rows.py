@@ -47,8 +47,11 @@ class Asked:
         return replace(self, limits=self.limits * factor)
 
 
-def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
-    """The margins that a scenario asks for, or None; where loops differ, of the trials hardest by its gains."""
+def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
+    """The margins that a scenario asks for, or None; where loops differ, of the trials hardest by its gains.
+
+    The program of a search's rows is compiled beside the one that finds these trials: each takes as long as a search.
+    """
     if not ready.margins:
         return None
     asked = Asked(
@@ -59,9 +62,17 @@ def ask(ready: Study, names: tuple[str, ...], seed: int) -> Asked | None:
         wanted=jnp.asarray([one.limit for one in ready.margins]),
         limits=jnp.ones(len(ready.margins)),
         metrics=tuple(one.metric for one in ready.margins),
-        names=names,
+        names=bounds.names,
     )
-    return hardest(asked, np.asarray(gain_names.own(ready.parts, names)))[0]
+    some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
+    sloped.prepare(some, bounds, np.zeros(len(bounds.names)))
+    return hardest(asked, np.asarray(gain_names.own(ready.parts, bounds.names)))[0]
+
+
+def _of_trials(asked: Asked, trials: np.ndarray) -> Asked:
+    """With the loops of these trials."""
+    drawn = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
+    return replace(asked, coordinates=drawn)
 
 
 def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
@@ -76,9 +87,7 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
     shares = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
     near = np.max(np.nan_to_num(shares, nan=WITHOUT, neginf=-1e9), axis=0)
-    trials = jnp.asarray(np.argsort(-near, kind="stable")[:CASES], dtype=jnp.uint32)
-    coordinates = montecarlo.coordinates(asked.dispersion, asked.seed, trials)
-    return replace(asked, coordinates=coordinates), max(float(near.max()), 0.0)
+    return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:

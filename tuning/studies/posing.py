@@ -80,7 +80,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         goal=T_F if table.objective == T_F else "window_error",
         tail=_tail(table, trained),
         torque_weight=table.torque_weight,
-        margins=margin_rows.ask(ready, bounds.names, seed),
+        margins=margin_rows.ask(ready, bounds, seed),
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
