@@ -310,7 +310,8 @@ def delayed_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Comple
 def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
     """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1.
 
-    In NumPy: with every delay the matrix has another size, and would be another program.
+    NaN of a loop about a run that is not finite. In NumPy: with every delay the matrix has another size, and would be
+    another program.
     """
     closed = at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
-    return float(np.abs(np.linalg.eigvals(closed)).max())
+    return float(np.abs(np.linalg.eigvals(closed)).max()) if np.all(np.isfinite(closed)) else float("nan")

@@ -1,9 +1,12 @@
 """`ptsmc margins`: what it leaves, what it says, what it refuses."""
 
 import csv
+import dataclasses
 import json
 import tomllib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -109,12 +112,25 @@ def test_few_margins_are_warned_of():
     assert "the frozen loop is NOT stable in hold" in next(margin_sentences.tuned({"hold": lost}))
 
 
-@pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
-def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
-    """t_f - delta is half a period: no sample before the hand-over lasts a whole one."""
+def at_hand_over(period):
+    """Parts of a chain whose t_f - delta is half a period."""
     tables = {**tomllib.loads(SHORT_CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
     tables["loop"]["period"] = period
-    parts = scenario.study(scenario.from_tables(tables)).parts
+    return scenario.study(scenario.from_tables(tables)).parts
+
+
+def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error():
+    """As of a pair of `map` whose nominal run flies away, by which the whole map ended."""
+    parts = at_hand_over(0.1)
+    lost = dataclasses.replace(parts, initial=jax.tree.map(lambda v: jnp.nan * v, parts.initial))
+    for left, radius in run_margins.at_ends(lost).values():
+        assert np.isnan([radius, *left.gain_up, *left.delay]).all()
+
+
+@pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
+def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
+    """No sample before the hand-over lasts a whole one."""
+    parts = at_hand_over(period)
     ends = run_margins.at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
         np.testing.assert_array_equal(one, other)
