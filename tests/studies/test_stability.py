@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short
 from tuning.output import margin_sentences, page
@@ -113,24 +114,28 @@ def test_few_margins_are_warned_of():
 
 
 def at_hand_over(period):
-    """Parts of a chain whose t_f - delta is half a period."""
+    """A chain whose t_f - delta is half a period."""
     tables = {**tomllib.loads(SHORT_CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
     tables["loop"]["period"] = period
-    return scenario.study(scenario.from_tables(tables)).parts
+    return scenario.study(scenario.from_tables(tables))
 
 
-def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error():
-    """As of a pair of `map` whose nominal run flies away, by which the whole map ended."""
-    parts = at_hand_over(0.1)
-    lost = dataclasses.replace(parts, initial=jax.tree.map(lambda v: jnp.nan * v, parts.initial))
-    for left, radius in run_margins.at_ends(lost).values():
+def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error(monkeypatch):
+    """As of a pair of `map` whose nominal run flies away, by which the whole map ended; `margins` blamed the law."""
+    ready = at_hand_over(0.1)
+    initial = jax.tree.map(lambda v: jnp.nan * v, ready.parts.initial)
+    lost = dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, initial=initial))
+    for left, radius in run_margins.at_ends(lost.parts).values():
         assert np.isnan([radius, *left.gain_up, *left.delay]).all()
+    monkeypatch.setattr(stability, "study", lambda _: lost)
+    with pytest.raises(ScenarioError, match="nominal run, which ends diverged: the state is not finite"):
+        stability.find(lost.scenario)
 
 
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
 def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
     """No sample before the hand-over lasts a whole one."""
-    parts = at_hand_over(period)
+    parts = at_hand_over(period).parts
     ends = run_margins.at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
         np.testing.assert_array_equal(one, other)

@@ -12,6 +12,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 from ptsmc_jax.theory import margins, rest, run_margins
 from ptsmc_jax.theory.margins import FIELDS
@@ -22,12 +23,19 @@ _NO_SIGN = "the exact sign has no slope: these margins are those of the loop wit
 
 
 def find(scenario: Scenario) -> tuple[Study, Course]:
-    """Margins of a scenario, along its nominal run. Raises ScenarioError without the sampled loop, or slopes of it."""
+    """Margins of a scenario, along its nominal run.
+
+    Raises ScenarioError without the sampled loop or slopes of it, or where that run is lost before its end.
+    """
     if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     course = run_margins.along(ready.parts)
     if np.isnan(course.hold[1].modulus).any():
+        code = int(rollout.simulate_jit(ready.parts, np.uint32(0), np.uint32(0)).status)
+        if code not in rollout.FINISHED:
+            status, why = rollout.STATUS[code]
+            raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
         raise ScenarioError(
             f"margins need slopes of the loop by all that it carries, but with controller.kind = "
             f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
