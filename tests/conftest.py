@@ -23,8 +23,6 @@ jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# tests stand deep in calls, and looking through them for the line behind every operation took a sixth of their time
-jax.config.update("jax_traceback_in_locations_limit", 0)
 # modules that name shapes: a function inside another is decorated anew whenever that one is called. Not folders, whose
 # names would stand for all modules in them
 SHAPES = re.compile(r"\b(Float|Int|Bool|Complex)\[")
