@@ -16,6 +16,8 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2")  # of points that break a limit, by the limit
+# of a pair of which a trial failed: seen on any colour
+LOST: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
 WIDEST = 1e4  # times, that colours of a map span: what is farther off is no use to tell apart
 
 
@@ -271,6 +273,7 @@ def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequen
         logarithmic(axes, "x")
     if y.logarithmic:
         logarithmic(axes, "y")
+    axes.set_facecolor("0.9")  # of pairs without a number: no colour of the map
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
     bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")
     plain_ticks(bar.ax.yaxis)
@@ -310,7 +313,7 @@ def accuracy_map(
     for axes, name in zip(many, drawn, strict=False):
         kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
         _coloured(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
-        axes.plot(column[lost], row[lost], "x", color="white", ms=5, mew=1.2)
+        axes.plot(column[lost], row[lost], ls="", **LOST)
         limits = axes.get_xlim(), axes.get_ylim()
         for (label, line), style in zip(borders.items(), ("-", "--", ":"), strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
@@ -325,7 +328,7 @@ def accuracy_map(
     figure.supylabel(y.label)
     handles, labels = many[0].get_legend_handles_labels()
     if np.any(lost):
-        handles.append(matplotlib.lines.Line2D([], [], color="0.4", marker="x", ls=""))
+        handles.append(matplotlib.lines.Line2D([], [], ls="", **LOST))
         labels.append("a trial failed or missed t_f")
     if handles:
         figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
