@@ -80,7 +80,7 @@ def percentile(values: np.ndarray, value: float) -> float:
     >>> percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0), percentile(np.array([10.0, 10.0, 10.0, 10.0, 20.0]), 10.0)
     (100.0, 50.0)
     """
-    return 100.0 * float(np.mean(values < value) + (np.sum(values == value) + 1) / (2 * values.size))
+    return float(stats.percentileofscore(values, value, kind="rank"))
 
 
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:

@@ -120,21 +120,18 @@ def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str
 
 def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
     """Fills a folder that is there."""
-    flown = fly(made, seed, trials)
-    if made.board.spacecraft:
-        t_f = float(made.ready.parts.controller.t_f)
-        least = min(vectors.steepness(samples, t_f, made.last) for samples in flown.values())
-        made.about = made.about._replace(steepness=max(made.about.steepness, least))
+    flown, t_f = fly(made, seed, trials), float(made.ready.parts.controller.t_f)
     header, rows = table(made, flown)
-    write_program(folder, made)
+    steepness = min(vectors.steepness(one, t_f, made.last) for one in flown.values()) if made.board.spacecraft else 0.0
+    write_program(folder, made, steepness)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **own.digests(made.scenario)}
     store.record(folder, parsing.dump(made.scenario), made_by)
 
 
-def write_program(folder: Path, made: Controller) -> None:
-    """The files that do not depend on a trial."""
-    code, about = made.code, made.about
+def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> None:
+    """The files without any trial's numbers; steepness: check.c is to allow for at least this one, see `About`."""
+    code, about = made.code, made.about._replace(steepness=max(made.about.steepness, steepness))
     texts = {
         f"ptsmc_{about.name}.h": templates.header(code, about),
         f"ptsmc_{about.name}.c": templates.source(code, about),

@@ -37,11 +37,11 @@ def _check_requirements(scenario: Scenario) -> None:
             _check_limit(key, value)
         if key in catalogues.MARGINS:
             scenario.need_samples(f"requirements.{key}")
-        if key in catalogues.MARGINS and scenario.exact_sign:
-            raise ScenarioError(
-                f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
-                "allowed is a width greater than 0"
-            )
+            if scenario.exact_sign:
+                raise ScenarioError(
+                    f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
+                    "allowed is a width greater than 0"
+                )
 
 
 def _check_limit(metric: str, limit: tables.Limit) -> None:

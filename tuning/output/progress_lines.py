@@ -45,6 +45,7 @@ class Lines:
                 return
             self._last = now
             what, done, total = self._doing
+            # so many of a hundred are a percentage, as searches report
             share = "" if not total else f", {done} %" if total == 100 else f", {done} of {total}"
             print(f"ptsmc: {what}{share}, {now - self._begun:.0f} s", file=sys.stderr, flush=True)
 

@@ -310,6 +310,7 @@ def campaign(summary: Summary) -> list[Table]:
 def _ends(summary: Summary, quantile: str, extreme: str) -> list[tuple[str, ...]]:
     """Rows of the metrics that have this quantile at their bad end."""
     rows: list[tuple[str, ...]] = []
+    units = catalogues.units(summary["plant"])
     failed = sum(count for status, count in summary["counts"].items() if status not in ("ok", "missed"))
     for name, statistics in summary["quantiles"].items():
         if pointing_sentences.is_index(name) or quantile not in statistics:
@@ -317,9 +318,9 @@ def _ends(summary: Summary, quantile: str, extreme: str) -> list[tuple[str, ...]
         far = statistics[quantile]
         between = f"{_number(far['low'])}..{_number(far['high'])}"
         values = (_number(v) for v in (statistics["0.5"]["value"], far["value"]))
-        unit = CATALOGUES[summary["plant"]].get(name, ("",))[0]
         never = statistics["without_value"] > failed  # as of a run that ends but never settles
-        rows.append((name, *values, between, "none" if never else _number(statistics.get(extreme)), unit))
+        largest = "none" if never else _number(statistics.get(extreme))
+        rows.append((name, *values, between, largest, units.get(name, "")))
     return rows
 
 
