@@ -26,6 +26,7 @@ class CommandFilter(Table, frozen=True):
     """
 
     corner: Positive = 1.0
+    prefix: ClassVar[str] = "command_"
     gains: ClassVar[Mapping[str, GainBounds]] = {"command_corner": GainBounds(_usual_corner, _allowed_corner)}
 
     def physics(self) -> Any:

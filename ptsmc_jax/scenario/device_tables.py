@@ -49,11 +49,6 @@ class Actuators(Table, frozen=True):
         return any(getattr(self, key) is not None for key in self.noises)
 
     @property
-    def gains(self) -> Mapping[str, GainBounds]:
-        """The gains that tuning may move."""
-        return {} if self.command_filter is None else self.command_filter.gains
-
-    @property
     def delay_periods(self) -> int:
         """Control periods from measuring to acting."""
         return self.delay or 0
@@ -224,7 +219,8 @@ class FilterTable(Kind, frozen=True):
     """An attitude filter, or none."""
 
     on: ClassVar[bool] = True
-    gains: ClassVar[Mapping[str, GainBounds]] = {}  # that tuning may move
+    prefix: ClassVar[str] = "filter_"
+    gains: ClassVar[Mapping[str, GainBounds]] = {}
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""

@@ -9,8 +9,6 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice
 from ptsmc_jax.scenario.tables import Scenario
 
-_OTHERS = ("filter_bandwidth", "command_corner")  # gains that are none of a law or an observer
-
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     """The table with its defaults: gains, bounds, level; of a scenario that is checked but for it.
@@ -45,25 +43,8 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
         raise wrong("tune.free", free, tables.FREE_ALLOWED)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in ("observer_gain", *_OTHERS, *own):
-            known = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, "observer_gain"))
-            raise ScenarioError(
-                f"{said} the law of controller.kind = {errors.show(scenario.controller.kind)} has no {name}; "
-                f"allowed is some of {', '.join((*known, *_OTHERS))}"
-            )
-    if "observer_gain" in free and "observer_gain" not in scenario.observer.gains:
-        raise ScenarioError(
-            f"{said} observer.kind = {errors.show(scenario.observer.kind)} has no gain of that name; "
-            "allowed is observer_gain with an observer of another kind"
-        )
-    if "filter_bandwidth" in free and "filter_bandwidth" not in scenario.estimator.gains:
-        raise ScenarioError(
-            f'{said} there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
-        )
-    if "command_corner" in free and "command_corner" not in scenario.devices.gains:
-        raise ScenarioError(
-            f"{said} the command is not filtered; allowed is command_corner with hardware.command_filter"
-        )
+        if name not in own:
+            raise ScenarioError(f"{said} {_absent(scenario, name)}")
     if "t_f" in free and getattr(scenario.observer, "t_o", 0.0) is None:
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
@@ -79,6 +60,22 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
             raise wrong("tune.torque_weight", tune.torque_weight, 'absent where tune.objective is "t_f"')
     for name in tune.bounds:
         _check_bounds(Choice(scenario, free, tune.bounds), name)
+
+
+def _absent(scenario: Scenario, name: str) -> str:
+    """Why a scenario has no such gain, and what would give it one."""
+    law, observer = (errors.show(table.kind) for table in (scenario.controller, scenario.observer))
+    match name:
+        case "observer_gain":
+            lacks = f"observer.kind = {observer} has no gain of that name"
+            return f"{lacks}; allowed is observer_gain with an observer of another kind"
+        case "filter_bandwidth":
+            return 'there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
+        case "command_corner":
+            return "the command is not filtered; allowed is command_corner with hardware.command_filter"
+    known = (*scenario.controller.gains, *scenario.observer.gains, *tables.OF_NO_LAW)
+    lacks = f"the law of controller.kind = {law} has no {name}"
+    return f"{lacks}; allowed is some of {', '.join(dict.fromkeys(known))}"
 
 
 def _check_bounds(choice: Choice, name: str) -> None:
@@ -114,18 +111,11 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
 
 def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
     """The scenario's gain of this name, on each axis where it has several; none if it has none."""
-    if name == "observer_gain":
-        return getattr(scenario.observer, "gain", None) or ()
-    if name == "command_corner":
-        filtering = scenario.devices.command_filter
-        return () if filtering is None else (filtering.corner,)
-    if scenario.sensors is not None and name in scenario.sensors.gains:
-        return (float(getattr(scenario.sensors, name.removeprefix("sensors_"))),)
-    if name in scenario.controller.gains:
-        value = getattr(scenario.controller, name, None)
-    else:
-        value = getattr(scenario.observer, name.removeprefix("observer_"), None)
-    return () if value is None or (name == "sign_width" and value == 0.0) else (float(value),)
+    table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
+    value = getattr(table, name.removeprefix(table.prefix))
+    if value is None or (name == "sign_width" and value == 0.0):
+        return ()
+    return value if isinstance(value, tuple) else (float(value),)
 
 
 def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:

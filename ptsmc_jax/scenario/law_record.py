@@ -14,6 +14,7 @@ from ptsmc_jax.scenario.values import Kind
 class LawTable(Kind, frozen=True):
     """A law, whatever it is for; each has t_f, and bounds of Assumption 1 on the disturbance."""
 
+    prefix: ClassVar[str] = ""  # with the key it makes the name of a gain
     gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
     # those that are free where a scenario does not say; the second ones in the sampled loop only, since without samples
     # a larger K1 and a narrower sign cost nothing but steps

@@ -21,7 +21,8 @@ from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Po
 class ObserverTable(Kind, frozen=True):
     """An observer, whatever it is for."""
 
-    gains: ClassVar[Mapping[str, GainBounds]] = {}  # "observer_gain", where it has one
+    prefix: ClassVar[str] = "observer_"
+    gains: ClassVar[Mapping[str, GainBounds]] = {}
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""
@@ -211,7 +212,7 @@ class OwnObserver(Own, ObserverTable, kw_only=True, frozen=True):
     code: Code
     needs: ClassVar[tuple[str, ...]] = ("step",)
     tuned: ClassVar[bool] = True
-    prefix: ClassVar[str] = "observer_"
+    prefix: ClassVar[str] = ObserverTable.prefix
 
     @classmethod
     def base(cls) -> type:

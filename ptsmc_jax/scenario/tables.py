@@ -61,8 +61,9 @@ class Limit(Table, frozen=True):
         return self.quantile if self.probability is None else self.probability
 
 
-FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains),
-        "observer_gain", "filter_bandwidth", "command_corner")  # besides those of a law of one's own  # fmt: skip
+# gains that tuning may move, besides those of parts of one's own
+OF_NO_LAW = ("observer_gain", "filter_bandwidth", "command_corner")
+FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains), *OF_NO_LAW)
 FREE_ALLOWED = f"a list of some of {', '.join(FREE)}"
 FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOWED)]
 
@@ -193,10 +194,24 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return None, None
 
     @property
+    def tuned_tables(self) -> dict[str, Any]:
+        """The tables that may have gains for tuning to move, by where a file has them.
+
+        A table knows its gains by name, which is its `prefix` and the key: "filter_bandwidth" of the table [filter].
+        """
+        tables = {
+            "controller": self.controller,
+            "observer": self.observer,
+            "sensors": self.sensors,
+            "filter": self.estimator,
+            "hardware.command_filter": self.devices.command_filter,
+        }
+        return {where: table for where, table in tables.items() if table is not None}
+
+    @property
     def gains(self) -> dict[str, GainBounds]:
         """The gains that it has for tuning to move, with their bounds."""
-        parts = self.controller, self.observer, self.sensors, self.estimator, self.devices
-        return {name: gain for part in parts if part is not None for name, gain in part.gains.items()}
+        return {name: bounds for table in self.tuned_tables.values() for name, bounds in table.gains.items()}
 
     @property
     def measured(self) -> bool:

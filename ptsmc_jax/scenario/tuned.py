@@ -7,7 +7,7 @@ from ptsmc_jax.scenario import reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.parsing import plain
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.simulation.gains import of_law, of_observer, of_sensors, on_every_axis
+from ptsmc_jax.simulation.gains import AXIS, base, on_every_axis
 
 
 def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
@@ -15,23 +15,21 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
 
     All else stays, defaults too. Raises ScenarioError where the scenario must not have them.
     """
-    if "filter_bandwidth" in gains and "filter_bandwidth" not in scenario.estimator.gains:
-        raise ScenarioError(
-            'filter_bandwidth is no gain of this scenario, which has no [filter] of kind "steady_state"'
-        )
-    if "command_corner" in gains and scenario.devices.command_filter is None:
-        raise ScenarioError("command_corner is no gain of this scenario, which has no hardware.command_filter")
-    changes: dict[str, Any] = {f"controller__{name}": value for name, value in of_law(gains).items()}
-    changes |= {f"observer__{name}": value for name, value in of_observer(gains).items()}
-    changes |= {f"sensors__{name}": value for name, value in of_sensors(gains).items()}
-    each = on_every_axis(gains, list(getattr(scenario.observer, "gain", ())))
-    if each is not None:
-        changes["observer__gain"] = each
-    if "filter_bandwidth" in gains:
-        changes["filter__bandwidth"] = gains["filter_bandwidth"]
-    if "command_corner" in gains:
-        table = plain(scenario.devices.command_filter)
-        changes["hardware__command_filter"] = {**table, "corner": gains["command_corner"]}
+    axes = list(getattr(scenario.observer, "gain", ()))
+    known = [*scenario.gains, *(f"{AXIS}{k + 1}" for k in range(len(axes)))]
+    for name in gains:
+        if name not in known:
+            raise ScenarioError(f"{name} is no gain of this scenario; allowed is some of {', '.join(known)}")
+    each = on_every_axis(gains, axes)
+    gains = {base(name): value for name, value in gains.items()} | ({} if each is None else {"observer_gain": each})
+    changes: dict[str, Any] = {}
+    for where, table in scenario.tuned_tables.items():
+        values = {name.removeprefix(table.prefix): value for name, value in gains.items() if name in table.gains}
+        outer, _, inner = where.partition(".")
+        if inner and values:
+            changes[f"{outer}__{inner}"] = {**plain(table), **values}
+        else:
+            changes |= {f"{outer}__{key}": value for key, value in values.items()}
     if "t_f" in gains:
         changes["loop__t_end"] = gains["t_f"] + (scenario.end - scenario.controller.t_f)
     return reading.replace(reading.settled(scenario), **changes)

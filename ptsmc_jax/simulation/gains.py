@@ -3,9 +3,9 @@
 A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,28 @@ from ptsmc_jax.simulation.assembly import Parts
 
 AXIS = "observer_gain_"
 SENSORS = "sensors_"  # prefix of the gains that sensors of one's own have
-_OF_FILTERS = ("filter_bandwidth", "command_corner")
+
+
+class _Device(NamedTuple):
+    """The gain of a device between the law and the plant."""
+
+    there: Callable[[Parts], bool]
+    read: Callable[[Parts], Any]
+    write: Callable[[Parts, Any], Parts]
+
+
+_DEVICES = {
+    "filter_bandwidth": _Device(
+        lambda parts: getattr(parts.sensors, "filter", None) is not None,
+        lambda parts: parts.sensors.bandwidth(parts.period),
+        lambda parts, value: replace(parts, sensors=parts.sensors.with_bandwidth(value, parts.period)),
+    ),
+    "command_corner": _Device(
+        lambda parts: parts.command_filter is not None,
+        lambda parts: parts.command_filter.corner,
+        lambda parts, value: replace(parts, command_filter=replace(parts.command_filter, corner=value)),
+    ),
+}
 
 
 def base(name: str) -> str:
@@ -40,7 +61,7 @@ def of_sensors(gains: Mapping[str, Any]) -> dict[str, Any]:
 
 def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
     """Gains of the law."""
-    return {k: v for k, v in gains.items() if not k.startswith(("observer_", SENSORS)) and k not in _OF_FILTERS}
+    return {k: v for k, v in gains.items() if not k.startswith(("observer_", SENSORS)) and k not in _DEVICES}
 
 
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
@@ -66,12 +87,9 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     if of_sensors(gains):
         own_sensors = replace(parts.sensors.own, **of_sensors(gains))
         parts = replace(parts, sensors=replace(parts.sensors, own=own_sensors))
-    if "filter_bandwidth" in gains:
-        sensors = parts.sensors.with_bandwidth(gains["filter_bandwidth"], parts.period)
-        parts = replace(parts, sensors=sensors)
-    if "command_corner" in gains:
-        assert parts.command_filter is not None  # `_check_names`
-        parts = replace(parts, command_filter=replace(parts.command_filter, corner=gains["command_corner"]))
+    for name, device in _DEVICES.items():
+        if name in gains:
+            parts = device.write(parts, gains[name])
     _check_clock(parts)
     return parts
 
@@ -83,10 +101,7 @@ def _check_names(parts: Parts, names: Iterable[str]) -> None:
     if axes:
         allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(axes))}
     allowed |= {SENSORS + name for name in _tunable_of_sensors(parts)}
-    if getattr(parts.sensors, "filter", None) is not None:
-        allowed.add("filter_bandwidth")
-    if parts.command_filter is not None:
-        allowed.add("command_corner")
+    allowed |= {name for name, device in _DEVICES.items() if device.there(parts)}
     for name in names:
         if name not in allowed:
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(allowed))}")
@@ -129,10 +144,7 @@ def gains_of(parts: Parts) -> dict[str, float]:
     gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
     for name in _tunable_of_sensors(parts):
         gains[SENSORS + name] = float(getattr(parts.sensors.own, name))
-    if getattr(parts.sensors, "filter", None) is not None:
-        gains["filter_bandwidth"] = float(parts.sensors.bandwidth(parts.period))
-    if parts.command_filter is not None:
-        gains["command_corner"] = float(parts.command_filter.corner)
+    gains |= {name: float(device.read(parts)) for name, device in _DEVICES.items() if device.there(parts)}
     return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(axes) if len(set(axes)) > 1}}
 
 

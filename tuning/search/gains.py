@@ -3,6 +3,7 @@
 A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 from ptsmc_jax import scenario as scenarios
@@ -13,8 +14,7 @@ from ptsmc_jax.scenario.law_record import common_keys
 from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
-from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.gains import AXIS, SENSORS
+from ptsmc_jax.simulation.gains import AXIS
 from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
 from ptsmc_jax.simulation.gains import own as own
@@ -24,28 +24,18 @@ from ptsmc_jax.simulation.gains import with_gains as with_gains
 def units(plant: str) -> dict[str, str]:
     """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
     tables: Any = SCENARIOS[plant].TABLES
-    gains_of_tables: list[tuple[type[Table], dict[str, str]]] = [
-        *((law, {name: name for name in law.gains}) for law in tables["controller"].values()),
-        *((observer, {"gain": "observer_gain"}) for observer in tables["observer"].values()),
-        *((one, {"bandwidth": "filter_bandwidth"}) for one in FILTERS.values()),
-        (CommandFilter, {"corner": "command_corner"}),
-    ]
-    unit_of: dict[str, str] = {}
-    for table, gains in gains_of_tables:
-        for key in keys.of(table):
-            if key.name in gains:
-                unit_of.setdefault(gains[key.name], key.unit or "-")
-    return unit_of
+    return _units((*tables["controller"].values(), *tables["observer"].values(), *FILTERS.values(), CommandFilter))
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
     """The unit of each gain of a scenario, those of a law or an observer of one's own among them."""
-    unit_of = units(scenario.plant.kind)
-    for table, prefix in ((scenario.controller, ""), (scenario.observer, "observer_"), (scenario.sensors, SENSORS)):
-        if table is not None:
-            own = {prefix + key.name: key.unit or "-" for key in keys.of(type(table))}
-            unit_of |= {name: unit for name, unit in own.items() if name in table.gains}
-    return unit_of
+    return units(scenario.plant.kind) | _units(type(table) for table in scenario.tuned_tables.values())
+
+
+def _units(tables: Iterable[Any]) -> dict[str, str]:
+    """The unit of each gain of these tables, as the first that has it says."""
+    named = [(table, key, table.prefix + key.name) for table in tables for key in keys.of(table)]
+    return {name: key.unit or "-" for table, key, name in reversed(named) if name in table.gains}
 
 
 def named(scenario: Scenario) -> tuple[str, ...]:
