@@ -7,7 +7,7 @@ computer knows its filter: observers use the filtered command. Vectors (m,) in N
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -16,10 +16,10 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 class FilterState(NamedTuple):
-    """A filter's integrators between samples, advanced by half of the next period."""
+    """Integrators of a second-order filter between samples, advanced by half of the next period."""
 
     first: Array  # (m,) [N m]
-    second: Array  # (m,) [N m]; of a first-order filter not used
+    second: Array  # (m,) [N m]
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class CommandFilter:
 
     corner: Leaf  # W [rad/s]
 
-    def begin(self, inputs: int) -> FilterState:
+    def begin(self, inputs: int) -> Any:
         """At rest."""
-        return FilterState(jnp.zeros(inputs), jnp.zeros(inputs))
+        raise NotImplementedError
 
     def prewarped(self, dt: Scalar) -> Scalar:
         """The g = tan(W dt / 2) [-] for a period dt [s]; W dt below pi."""
         return jnp.tan(0.5 * self.corner * dt)
 
-    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+    def step(self, state: Any, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Any]:
         """Filtered command (m,) [N m] of a sample, and the state for the next one.
 
         before, dt: lengths of the periods that end and begin at the sample [s].
@@ -49,11 +49,15 @@ class CommandFilter:
 class FirstOrder(CommandFilter):
     """Roll-off W / (s + W): 3 dB and 45 degrees at the corner, then 20 dB a decade."""
 
-    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+    def begin(self, inputs: int) -> Vector:
+        """At rest: its one integrator (m,) [N m], between samples too advanced by half of the next period."""
+        return jnp.zeros(inputs)
+
+    def step(self, state: Vector, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Vector]:
         """The low pass y, y' = W (u - y)."""
         g = self.prewarped(before)
-        y = (state.first + g * u) / (1.0 + g)
-        return y, FilterState(y + self.prewarped(dt) * (u - y), state.second)
+        y = (state + g * u) / (1.0 + g)
+        return y, y + self.prewarped(dt) * (u - y)
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,10 @@ class _Second(CommandFilter):
     """Two integrators: b' = W h, l' = W b, h = u - 2 z b - l, as one of all second-order filters has them."""
 
     damping: Leaf  # z [-]
+
+    def begin(self, inputs: int) -> FilterState:
+        """At rest."""
+        return FilterState(jnp.zeros(inputs), jnp.zeros(inputs))
 
     def _integrated(
         self, state: FilterState, u: Vector, before: Scalar, dt: Scalar

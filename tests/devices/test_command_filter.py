@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy import signal
 
 from ptsmc_jax import scenario
@@ -40,6 +41,16 @@ def test_it_is_the_bilinear_transform(kind):
     u = np.append(0.0, np.random.default_rng(0).normal(size=40))  # rest has gone on for a period
     b, a = digital(kind)
     np.testing.assert_allclose(filtered(device, u, [H] * 40), signal.lfilter(b, a, u), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_it_remembers_has_the_poles_of_the_filter_and_no_others(kind):
+    """A state that nothing uses stayed as it was: a pole at 1, which margins took for the loop's radius."""
+    device, _, _ = KINDS[kind]
+    start, tree = ravel_pytree(device.begin(1))
+    moved = jax.jacfwd(lambda kept: ravel_pytree(device.step(tree(kept), vector([0.0]), H, H)[1])[0])(start)
+    _, a = digital(kind)
+    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(moved)), np.sort_complex(np.roots(a)), atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", KINDS)
