@@ -229,12 +229,14 @@ def update(
     share = jnp.clip((begins - t) / length, 0.0, 1.0)  # of the interval that lies before the observation
     window_end = begins + (tally.windows + 1.0) * window
     until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
-    observed = t_next > begins
-    closes = observed & (window_end <= t_next + guards.rounding(window, t_next))
+    by_rounding = guards.rounding(window, t_next)
+    observed = t_next > begins + by_rounding
+    closes = observed & (window_end <= t_next + by_rounding)
     first, last = error.at(share), error.at(until)
     # the observation's first moment counts; later intervals begin where the ones before have ended
-    opened = guards.select(t <= begins, tally.window.including(first), tally.window)
-    largest = jnp.where(t <= begins, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
+    opens = t <= begins + guards.rounding(window, t)
+    opened = guards.select(opens, tally.window.including(first), tally.window)
+    largest = jnp.where(opens, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
     integral = opened.integral + error.integral(until) - error.integral(share)
     segments = opened.segments
     if segments is not None:
@@ -258,6 +260,10 @@ def update(
             segments = segments.emptied().added(last, error.end, length * (1.0 - until))
         projections = _projections(last)
         new = Window(rest, projections, projections, segments).including(error.end)
+        if isinstance(error, ConstantPath):  # which leaps from here: what ends with a window is none of the next one's
+            lasts = t_next > window_end + by_rounding
+            high, low = jnp.where(lasts, new.high, -jnp.inf), jnp.where(lasts, new.low, jnp.inf)
+            new = new._replace(high=high, low=low)
         return still_open._replace(
             mean=jnp.maximum(still_open.mean, _sizes(mean)),
             relative=jnp.maximum(still_open.relative, _sizes_of(deviations)),

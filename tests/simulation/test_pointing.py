@@ -148,6 +148,33 @@ def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
     np.testing.assert_allclose(tally.mean[:3], 9.5, rtol=1e-12)
 
 
+@jax.jit
+def held(nodes, error, begins, window):
+    """A tally over errors (n, 5) that are each held from a node to the next one."""
+
+    def step(tally, row):
+        t, t_next, value = row
+        path, never = pointing.ConstantPath(value, t_next - t), jnp.full((3, 4), jnp.inf)
+        return pointing.update(tally, path, t, t_next, begins, window, never), None
+
+    return jax.lax.scan(step, pointing.begin(jnp.zeros(())), (nodes[:-1], nodes[1:], error))[0]
+
+
+@pytest.mark.parametrize(("begins", "window"), [*OBSERVED, (3.0 * 0.1, 0.2), (4.0, 0.1)])
+def test_a_held_error_counts_where_it_is_held(begins, window):
+    """What ends as a window begins, or the observation, is none of it: with one sample a window none deviates."""
+    error = np.random.default_rng(3).normal(size=(NODES.size - 1, 5))
+    tally, relative = held(*map(jnp.asarray, (NODES, error, begins, window))), []
+    for k in range(int((NODES[-1] - begins) / window + 1e-9)):
+        low, high = begins + k * window, begins + (k + 1) * window
+        lasts = np.clip(np.minimum(NODES[1:], high) - np.maximum(NODES[:-1], low), 0.0, None)
+        off = np.abs(error - lasts @ error / window)[lasts > 1e-9]
+        relative.append(off[:, :3].max(axis=0))
+    np.testing.assert_allclose(tally.relative[:3], np.max(relative, axis=0), rtol=1e-9, atol=1e-12)
+    seen = np.abs(error[NODES[1:] > begins + 1e-9])
+    np.testing.assert_allclose(tally.largest[:3], seen[:, :3].max(axis=0), rtol=1e-14)
+
+
 def check_the_cone(seed):
     """Against the angle between the boresight and where it points, and SciPy's rotation vector."""
     rng = np.random.default_rng(seed)
