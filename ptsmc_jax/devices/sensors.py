@@ -225,7 +225,8 @@ class Sensors(Sensor):
         if self.own_times is None:
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
-            age = self.star_age(now.sample, dt)
+            # where there is none, all of the period lies behind it, as the C has it
+            age = jnp.where(weight > 0.0, self.star_age(now.sample, dt), dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
 

@@ -187,7 +187,7 @@ def _finite(field: Field, owner: str) -> str:
     if not field.shape:
         return f"isfinite({owner}{field.name})"
     first = owner + field.name + "[0]" * len(field.shape)
-    return f"finite(&{first}, {field.size})"
+    return f"all_finite(&{first}, {field.size})"
 
 
 def _all(terms: Sequence[str], indent: str) -> list[str]:
@@ -197,7 +197,7 @@ def _all(terms: Sequence[str], indent: str) -> list[str]:
 
 def _checks(code: Code, about: About) -> list[str]:
     reals = [field for field in code.inputs if field.kind == REAL]
-    lines = ["static int finite(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
+    lines = ["static int all_finite(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
              "        if (!isfinite(v[k])) {", "            return 0;", "        }", "    }", "    return 1;", "}", "",
              f"/* Finite and no larger than {'1e6' if about.spacecraft else '1e12'}: what is larger would stay in the "
              "observer for long. */",

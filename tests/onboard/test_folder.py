@@ -49,6 +49,15 @@ def test_it_compiles_without_a_warning_and_replays_the_simulator(exported, tmp_p
     assert make(place, "check", f"REAL={real}").returncode != 0
 
 
+@needs_compiler
+def test_it_compiles_in_the_compiler_s_own_language_too(exported):
+    """With the names of a C library beside those of C99: `finite` is one, and stopped gcc without -std=c99."""
+    sources = [str(place) for place in sorted(exported.glob("*.c"))]
+    called = [CC, "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *sources]
+    done = subprocess.run(called, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "own"]
 
 

@@ -87,7 +87,7 @@ static long read_rows(const char *name)
     return count;
 }
 
-static int finite(const double *v, int count)
+static int all_finite(const double *v, int count)
 {
     for (int k = 0; k < count; k++) {
         if (!isfinite(v[k])) {
@@ -144,7 +144,8 @@ int main(int count, char **given)
         last = ptsmc_step(&ptsmc_parameters, &state, &in, &found);
         out_to(&found, out);
         state_to(&state, after);
-        if (last < PTSMC_OK || last > PTSMC_OVERFLOW || !finite(out, PTSMC_OUT_SIZE) || !finite(after, PTSMC_STATE_SIZE)) {
+        if (last < PTSMC_OK || last > PTSMC_OVERFLOW || !all_finite(out, PTSMC_OUT_SIZE) ||
+            !all_finite(after, PTSMC_STATE_SIZE)) {
             printf("sample %ld: status %d, and not finite\n", k, last);
             return 1;
         }
