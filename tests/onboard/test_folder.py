@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from tests.helpers import SHORT, fly, short
 from tests.onboard.compiled import CC, needs_compiler
-from tests.onboard.flights import FLIGHTS
+from tests.onboard.flights import FILTER, FLIGHTS, flight
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +94,19 @@ def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
     place = folder.export(made, tmp_path / "controller", name="small", trials=1)
     done = make(place, "check")
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_what_rounding_leaves_does_not_add_up(tmp_path):
+    """Over 1 250 samples of a loop that is open: C went off by 3e-12 of the command, and 1e-12 was allowed."""
+    law = {"t_f": 20.0, "delta": 3.0, "sampling": "implicit", "k1": 7.0}
+    tables = flight(**FILTER, controller=law, loop={"period": 0.02, "t_end": 25.0}, dispersion={})
+    made = scenario.reading.complete(scenario.from_tables(tables))
+    place = folder.export(made, tmp_path / "controller", name="long", trials=1)
+    for real in ("double", "float"):
+        done = make(place, "check", f"REAL={real}")
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 @needs_compiler

@@ -1,6 +1,7 @@
 /* check.c: replays vectors.csv through ptsmc_step and compares every output, state and status.
  *
  * A row is trial, sample, status, inputs, outputs, state after the sample; sample -1 is the state before the first one.
+ * Each sample begins with the state of the row before it.
  * A number is compared relative to the largest of its group in the file: those of an array, and torques with torques,
  * rates with rates, since an estimated disturbance or bias is a difference of these. Exit status 0: all agree.
  */
@@ -104,6 +105,8 @@ int main(int count, char **given)
                 off[k] = error;
             }
         }
+        /* from where the simulator was: the loop is open here, and would add up what rounding leaves of each sample */
+        state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
         rows++;
     }
     fclose(file);
