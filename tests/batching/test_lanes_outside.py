@@ -287,3 +287,16 @@ def test_large_arrays_are_not_taken_apart():
     few, many = (len(jax.make_jaxpr(lanes.vmap(lambda t: 2 * t + 1))(draw(n)).eqns) for n in (65, 64))
     assert few < 5
     assert many >= 2 * 64
+
+
+def test_whole_numbers_and_truths_have_no_slopes():
+    """As JAX says by its type float0; an array of it ended in NumPy, which compares it with nothing."""
+
+    def function(x):
+        return jnp.argsort(x), x > 0.5, x**2
+
+    values, slopes = lanes.jvp(function)((X,), (jnp.ones((2, *X.shape)),))
+    expected, along = jax.jvp(jax.vmap(function), (X,), (jnp.ones_like(X),))
+    agree(values, expected)
+    agree(slopes[2][0], along[2])
+    assert [(s.shape, s.dtype) for s in slopes[:2]] == [((2, *X.shape), jax.dtypes.float0)] * 2
