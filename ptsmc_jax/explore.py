@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
-from ptsmc_jax.scenario import Study, parsing
+from ptsmc_jax.scenario import Study, parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -183,9 +183,7 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 
 
 def _read(what: Scenario | Study | str | Path) -> Scenario:
-    if isinstance(what, Study):
-        return what.scenario
-    return what if isinstance(what, Scenario) else scenario.read(what)
+    return reading.of(what.scenario if isinstance(what, Study) else what)
 
 
 def _ready(what: Scenario | Study | str | Path) -> Study:

@@ -2,6 +2,7 @@
 
 import typing
 from dataclasses import dataclass
+from pathlib import Path
 
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
@@ -76,15 +77,17 @@ def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     )
 
 
-def study(scenario: Scenario, saves: object = (), reach: timing.Reach | None = None, *, drawn: bool = True) -> Study:
-    """The parts of a checked scenario; `saves`: times [s] at which a continuous run must have nodes.
+def study(
+    scenario: Scenario | str | Path, saves: object = (), reach: timing.Reach | None = None, *, drawn: bool = True
+) -> Study:
+    """The parts of a checked scenario, or of its file; `saves`: times [s] at which a continuous run must have nodes.
 
     drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
     Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
     where the law meets its singularity on the way from the initial state to the reference.
     """
     configure.warn_if_forgotten()
-    scenario = reading.complete(scenario)
+    scenario = reading.complete(reading.of(scenario))
     setup = build.setup(scenario)
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
     dispersion = build.dispersion(scenario, parts)

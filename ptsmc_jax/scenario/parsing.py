@@ -354,7 +354,10 @@ def _key(key: str, value: Any, kind: Any) -> Any:
 
 
 def _value(key: str, value: Any, kind: Any) -> Any:
-    value = _plain(value)
+    try:
+        value = _plain(value)
+    except TypeError:  # of JAX, which is not imported here
+        raise ScenarioError(f"{key} is traced by JAX, but must be known here; with_gains takes traced gains") from None
     bad = _not_finite(value)
     if bad is not None:
         raise wrong(key, value, f"{keys.allowed(kind)}, and {show(bad)} is no finite number")

@@ -17,6 +17,16 @@ def read(path: str | Path) -> Scenario:
     return from_tables(parsing.load(path))
 
 
+def of(what: object) -> Scenario:
+    """What is a scenario, or the file of one; raises TypeError, with one sentence, where it is neither."""
+    if isinstance(what, str | Path):
+        return read(what)
+    if not isinstance(what, Scenario):
+        found = type(what).__name__
+        raise TypeError(f"a scenario is needed, as read or from_tables return it, or its file, but this is a {found}")
+    return what
+
+
 def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence.
 
@@ -56,8 +66,8 @@ def settled(scenario: Scenario) -> Scenario:
     return msgspec.structs.replace(scenario, defaulted={})
 
 
-def replace(scenario: Scenario, **changes: Any) -> Scenario:
-    """The scenario with other values, keys written table__key, checked again: replace(s, controller__eta=4.0).
+def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
+    """The scenario, or a file's, with other values, keys written table__key, checked: replace(s, controller__eta=4.0).
 
     None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one. What
     the scenario does not say stays the default, which may follow what is changed.
@@ -69,6 +79,7 @@ def replace(scenario: Scenario, **changes: Any) -> Scenario:
     Traceback (most recent call last):
     ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
+    scenario = of(scenario)
     tables = parsing.stated(scenario)
     for name, value in changes.items():
         table, _, key = name.partition("__")

@@ -15,6 +15,7 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
 
     All else stays, defaults too. Raises ScenarioError where the scenario must not have them.
     """
+    scenario = reading.of(scenario)
     axes = list(getattr(scenario.observer, "gain", ()))
     known = [*scenario.gains, *(f"{AXIS}{k + 1}" for k in range(len(axes)))]
     for name in gains:

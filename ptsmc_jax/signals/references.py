@@ -73,6 +73,7 @@ class TurningFunction(Function):
         value = self.function(t)
         if isinstance(value, Target):
             return value
+        value = jnp.asarray(value) if isinstance(value, list | tuple) else value
         if jnp.shape(value) != (4,):
             raise TypeError(
                 f"the reference function returns {value!r}, but must return a quaternion (4,), scalar last, or a Target"

@@ -80,6 +80,12 @@ class Setup:
         return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
 
 
+def check_parts(what: object) -> None:
+    """Raise TypeError, with one sentence, where something else is in the place of parts."""
+    if not isinstance(what, Setup):
+        raise TypeError(f"parts are needed, such as study(scenario).parts, but this is a {type(what).__name__}")
+
+
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Parts(Setup):

@@ -12,7 +12,7 @@ import numpy as np
 from jax import core
 from jaxtyping import Array
 
-from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.assembly import Parts, check_parts
 
 AXIS = "observer_gain_"
 SENSORS = "sensors_"  # prefix of the gains that sensors of one's own have
@@ -67,12 +67,18 @@ def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
 
-    Raises ValueError where there is no such gain, where one of the observer's is no single number, and where the parts'
-    anchored clock has too few samples for them, as far as they are known: under a transformation such a run comes back
-    as `unfinished`.
+    Raises ValueError where there is no such gain, where one is no single number, and where the parts' anchored clock
+    has too few samples for them, as far as they are known: under a transformation such a run comes back as
+    `unfinished`; TypeError where there are no parts.
     """
+    check_parts(parts)
     _check_names(parts, gains)
     gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    for name, value in gains.items():
+        if value.ndim and name == "observer_gain":
+            raise ValueError(f"the observer's gain must be a number; {AXIS}1 and so on name those of its axes")
+        if value.ndim:
+            raise ValueError(f"{name} must be a number, but has shape {value.shape}; jax.vmap takes one at a time")
     if "t_f" in gains:
         parts = parts.with_t_f(gains["t_f"])
     law = {name: value for name, value in of_law(gains).items() if name != "t_f"}
@@ -81,8 +87,6 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
     axes = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
     if axes is not None:
-        if any(np.ndim(value) > 0 for value in axes):
-            raise ValueError(f"the observer's gain must be a number; {AXIS}1 and so on name those of its axes")
         parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(axes)))
     if of_sensors(gains):
         own_sensors = replace(parts.sensors.own, **of_sensors(gains))
@@ -134,6 +138,7 @@ def _check_clock(parts: Parts) -> None:
 
 def gains_of(parts: Parts) -> dict[str, float]:
     """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
+    check_parts(parts)
     controller = parts.controller
     law = [name for name in controller.tunable if name not in ("k1", "sign_width", "surface_rate", "t_f")]
     gains = {name: float(getattr(controller, name)) for name in law}

@@ -4,6 +4,8 @@
 inertia or noise is the same compiled program.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -13,7 +15,7 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import continuous, sampled
-from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.interval import Criteria
 from ptsmc_jax.simulation.run_state import (
@@ -52,7 +54,10 @@ def simulate(
 
     Returns:
         Metrics, as they came out whatever the status, status, first bad time and history.
+
+    Raises TypeError, with one sentence, where parts changed by hand do not fit each other.
     """
+    _check(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     pointing = None if parts.pointing is None else parts.pointing.of_run(ticks.t.size)
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
@@ -65,6 +70,24 @@ def simulate(
     return sampled.fly(run, seed, trial, software) if parts.clock.sampled else continuous.fly(run)
 
 
+def _check(parts: Parts) -> None:
+    """Raise TypeError where start or disturbance have another shape than the plant's: JAX would from deep inside."""
+    check_parts(parts)
+    for name, size in (("q", 4), ("w", 3)) if parts.plant.attitude else ():
+        _check_shape(f"initial.{name}", getattr(parts.initial, name, None), [(size,)])
+    if not callable(parts.disturbance):
+        raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
+    value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))
+    _check_shape("what the disturbance returns", value, [(parts.plant.inputs,), ()])
+
+
+def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
+    shape = getattr(value, "shape", None)
+    if shape not in allowed:
+        found = f"of type {type(value).__name__}" if shape is None else f"one of shape {shape}"
+        raise TypeError(f"{name} must be an array {allowed[0]}, but is {found}")
+
+
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     """First time without samples [s], where the clock was made for shorter t_f or delta than it got; NaN: none."""
     first, last = ticks.t[0], ticks.t_next[-1]
@@ -72,5 +95,14 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
+class _Flights(programs.Program):
+    """`simulate` compiled: what is no parts is refused before JAX says that it is no array."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Result:
+        """Call it as `simulate` is called."""
+        check_parts(args[0] if args else kwargs.get("parts"))
+        return super().__call__(*args, **kwargs)
+
+
 # One compiled program for all parts of the same structure.
-simulate_jit = programs.jit(simulate, static_argnames=("record", "software"))
+simulate_jit = _Flights(simulate, ("record", "software"))

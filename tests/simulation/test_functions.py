@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.signals.disturbances import Sinusoid
 from ptsmc_jax.signals.references import Fixed, Spin
@@ -52,6 +54,60 @@ def test_what_is_no_attitude_and_what_has_no_inertia_is_refused_in_a_sentence():
         wrong.reference(jnp.asarray(0.0))
     with pytest.raises(ValueError, match="the plant is a Chain, but with_inertia goes with a spacecraft"):
         chain_parts([1.0, 0.0]).with_inertia([1.0, 1.0, 1.0])
+
+
+def test_a_reference_may_return_a_list():
+    plain = parts(8.0, 3.0, 0.5, reference=lambda t: [0.0, 0.0, jnp.sin(t), jnp.cos(t)])
+    np.testing.assert_allclose(jax.jit(plain.reference)(jnp.asarray(1.0)).w, [0.0, 0.0, 2.0], atol=1e-15)
+
+
+RUN = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
+FLIGHT = scenario.from_tables({})
+REFUSED = {
+    "a start of another shape": (
+        lambda: ptsmc.simulate_jit(replace(RUN, initial=RUN.initial._replace(w=jnp.zeros(4)))),
+        r"initial.w must be an array \(3,\), but is one of shape \(4,\)",
+    ),
+    "a list among the parts": (
+        lambda: ptsmc.simulate_jit(replace(RUN, initial=RUN.initial._replace(q=[0.0, 0.0, 0.0, 1.0]))),
+        r"initial.q must be an array \(4,\), but is of type list",
+    ),
+    "a disturbance of another shape": (
+        lambda: ptsmc.simulate_jit(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
+        r"what the disturbance returns must be an array \(3,\), but is one of shape \(4,\)",
+    ),
+    "no disturbance": (
+        lambda: ptsmc.simulate_jit(replace(RUN, disturbance=None)),
+        r"the disturbance must be a function of \(t, x\), but is None",
+    ),
+    "a scenario for parts": (lambda: ptsmc.simulate_jit(FLIGHT), "parts are needed, such as study"),
+    "a scenario's gains": (lambda: ptsmc.gains_of(FLIGHT), "parts are needed, such as study"),
+    "gains in a scenario": (lambda: ptsmc.with_gains(FLIGHT, {"eta": 3.0}), "parts are needed, such as study"),
+    "parts for a scenario": (lambda: ptsmc.simulate(RUN), "a scenario is needed, as read or from_tables return it"),
+    "tables for a scenario": (lambda: ptsmc.study({}), "a scenario is needed, as read or from_tables return it"),
+    "many gains at once": (
+        lambda: ptsmc.with_gains(RUN, {"eta": [3.0, 3.5, 4.0]}),
+        r"eta must be a number, but has shape \(3,\)",
+    ),
+    "a traced value": (
+        lambda: jax.eval_shape(lambda eta: ptsmc.replace(FLIGHT, controller__eta=eta).loop.t_end, 3.0),
+        "controller.eta is traced by JAX, but must be known here; with_gains takes traced gains",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_does_not_fit_is_refused_in_a_sentence(what):
+    """JAX said it, from deep inside, or flew three different eta on the three axes."""
+    call, said = REFUSED[what]
+    with pytest.raises((TypeError, ValueError), match=said):
+        call()
+
+
+def test_a_study_and_other_values_are_made_of_a_file_too(tmp_path):
+    (tmp_path / "s.toml").write_text("controller = { eta = 3.5 }")
+    assert float(ptsmc.study(tmp_path / "s.toml").parts.controller.eta) == 3.5
+    assert ptsmc.replace(str(tmp_path / "s.toml"), controller__eta=4.0).controller.eta == 4.0
 
 
 def test_metrics_show_what_a_run_has():
