@@ -136,4 +136,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_EXPORTS]
+    return sorted({*globals(), *_EXPORTS})

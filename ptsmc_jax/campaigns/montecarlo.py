@@ -16,6 +16,7 @@ from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
@@ -37,6 +38,8 @@ class Trials:
     bad_time: np.ndarray  # first bad time [s], NaN if none
     drawn: dict[str, np.ndarray]  # what each flew with, by name, see `values`
     own: dict[str, np.ndarray] = field(default_factory=dict)  # metrics of one's own
+
+    __repr__ = listing
 
     @property
     def ok(self) -> np.ndarray:
@@ -73,6 +76,8 @@ class Flown(NamedTuple):
     bad_time: jax.Array
     drawn: dict[str, jax.Array]
     own: dict[str, jax.Array]
+
+    __repr__ = listing
 
 
 def one(

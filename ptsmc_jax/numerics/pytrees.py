@@ -1,13 +1,15 @@
 """Parts as pytrees: the decorator of a part's class, the types of its numbers, and gains among them."""
 
 import math
+import textwrap
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import core
 from jaxtyping import Array, Float
 
 # Type of a part's numbers: an array, alone or with batch axes; at run time anything, since JAX rebuilds pytrees
@@ -23,12 +25,39 @@ Vector = Float[Array, " m"]  # a number for each input of the plant
 _Class = TypeVar("_Class", bound=type)
 
 
+FEW = 9  # numbers of an array that are shown
+
+
+def listing(self: Any, indent: str = "") -> str:
+    """A part in lines, its fields by name, absent ones left out; of arrays with many numbers their type and shape."""
+    if is_dataclass(self):
+        items = {f.name: getattr(self, f.name) for f in fields(self)}
+    elif type(self).__base__ is tuple and hasattr(self, "_asdict"):  # a named one, shown in no way of its own
+        items = self._asdict()
+    elif isinstance(self, dict):
+        items = self
+    else:
+        return _shown(self, indent)
+    inside = f"{indent}  "
+    lines = [f"\n{inside}{name}: {listing(item, inside)}" for name, item in items.items() if item is not None]
+    return type(self).__name__ + "".join(lines).replace(": \n", ":\n")
+
+
+def _shown(value: Any, indent: str) -> str:
+    if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, core.Tracer):
+        if value.size > FEW or not np.issubdtype(value.dtype, np.number):
+            return f"{value.dtype} {value.shape}"
+        return " ".join(np.array2string(np.asarray(value), separator=", ").split())
+    text = repr(value)
+    return "\n" + textwrap.indent(text, f"{indent}  ") if "\n" in text else text
+
+
 def pytree(cls: _Class) -> _Class:
     """Registers a dataclass with JAX: its fields are children, those with the metadata `static` part of the structure.
 
     As `jax.tree_util.register_dataclass` does, which must not be used: up to jaxlib 0.10.2 two such classes whose
     fields have the same structure compare equal, so that where their hashes fall together, about once in thirty
-    processes, `jit` runs the program compiled for the one on the numbers of the other.
+    processes, `jit` runs the program compiled for the one on the numbers of the other. It is shown as a `listing`.
     """
     static = tuple(f.name for f in fields(cls) if f.metadata.get("static"))
     names = tuple(f.name for f in fields(cls) if f.name not in static)
@@ -45,6 +74,7 @@ def pytree(cls: _Class) -> _Class:
         return cls(**dict(zip(names, children, strict=True)), **dict(zip(static, fixed, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
+    setattr(cls, "__repr__", listing)  # noqa: B010, by its name pyright asks for a bound one
     return cls
 
 

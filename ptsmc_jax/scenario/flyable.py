@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
+from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.scenario import build, own_checks, reading, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
@@ -23,6 +24,8 @@ class Study:
     dispersion: variation.Dispersion
     requirements: tuple[Requirement, ...]  # of its runs
     margins: tuple[Requirement, ...]  # of its loop
+
+    __repr__ = listing
 
     @property
     def drawn(self) -> bool:

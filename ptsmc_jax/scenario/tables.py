@@ -127,6 +127,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     motion: ClassVar[str] = ""  # what the laws drive to zero: "spacecraft", "chain" or "system"
     reaching: ClassVar[float] = 1.0  # K1 over the rate at which s decays after the hand-over: 2 where (60) halves it
 
+    def __repr__(self) -> str:
+        """The tables that it has, a line each."""
+        tables = {name: getattr(self, name) for name in self.__struct_fields__ if name != "defaulted"}
+        return type(self).__name__ + "".join(f"\n  {name}: {table!r}" for name, table in tables.items() if table)
+
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Defaults that depend on other keys, by table; given: keys of [plant] that are there, law: its kind."""

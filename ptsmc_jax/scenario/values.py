@@ -37,6 +37,10 @@ MOST_STEPS = 200_000  # of a run
 class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     """A table of a scenario file."""
 
+    def __repr__(self) -> str:
+        keys = {key: getattr(self, key) for key in self.__struct_fields__}
+        return f"{type(self).__name__}({', '.join(f'{key}={v!r}' for key, v in keys.items() if v is not None)})"
+
 
 class Kind(Table, frozen=True):
     """A kind of a table, which may have lists of one number for each input of the plant."""

@@ -27,10 +27,17 @@ class Metrics(namedtuple("Metrics", METRICS)):
 
 def _lacks(name: str, value: Any) -> bool:
     """Whether no run has the metric; one that never settles has that one."""
-    return name != "settling_time" and not isinstance(value, core.Tracer) and bool(np.all(np.isnan(value)))
+    return name != "settling_time" and _are_numbers(value) and bool(np.all(np.isnan(value)))
+
+
+def _are_numbers(value: Any) -> bool:
+    """Whether they are known: under transformations tracers, shapes, axes stand in their places."""
+    return isinstance(value, jax.Array | np.ndarray | np.number | float) and not isinstance(value, core.Tracer)
 
 
 def _shown(value: Any) -> str:
+    if not (_are_numbers(value) or isinstance(value, core.Tracer)):
+        return repr(value)
     several = isinstance(value, core.Tracer) or np.ndim(value) > 0
     return f"{type(value).__name__} {np.shape(value)}" if several else f"{float(value):.6g}"
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
@@ -49,6 +49,8 @@ class Log(NamedTuple):
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
     has_length: Array  # bool: the row starts an interval of positive length, or is the last
 
+    __repr__ = listing
+
 
 class Result(NamedTuple):
     """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history."""
@@ -57,6 +59,8 @@ class Result(NamedTuple):
     status: Array
     bad_time: Array
     log: Log | None
+
+    __repr__ = listing
 
 
 class Run(NamedTuple):

@@ -125,9 +125,33 @@ def test_metrics_show_what_a_run_has():
     jax.jit(lambda metrics: repr(metrics) and metrics)(found)
 
 
+def test_parts_and_results_are_shown_in_lines_that_can_be_read():
+    """A history in its shapes, for its numbers are hundreds of lines; shapes in the place of metrics, which raised."""
+    shown = repr(RUN).splitlines()
+    assert {"  disturbance: Sinusoid", "    amplitude: [0.01, 0.01, 0.01]", "    delta: 0.5"} <= set(shown)
+    assert not any(": None" in line for line in shown)
+    many = repr(jax.tree.map(lambda v: jnp.stack([v] * 4), RUN)).splitlines()
+    assert {"    inertia: float64 (4, 3, 3)", "    delta: [0.5, 0.5, 0.5, 0.5]"} <= set(many)
+    shapes = jax.eval_shape(lambda run: ptsmc.simulate_jit(run, record=True), RUN)
+    assert re.search(r"    window_error +ShapeDtypeStruct\(shape=\(\), dtype=float64\)\n", repr(shapes))
+    assert "  metrics:\n    terminal_error " in repr(shapes)
+    log = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes.log)
+    assert {"  u: float64 (181, 3)", "    q: float64 (181, 4)"} <= set(repr(log).splitlines())
+    jax.jit(lambda run: repr(run) and run.t_end)(RUN)
+
+
+def test_scenarios_and_studies_are_shown_by_their_tables():
+    shown = repr(FLIGHT).splitlines()
+    assert shown[0] == "SpacecraftScenario"
+    assert any(line.startswith("  controller: SpacecraftController(kind='prescribed_time', error=") for line in shown)
+    assert not any("defaulted" in line or "=None" in line or line.startswith("  hardware") for line in shown)
+    assert f"    {shown[1]}" in repr(scenario.study(FLIGHT))
+
+
 def test_the_names_that_everybody_needs_are_at_the_top():
     for name in ("one", "run", "study", "Reach", "reach_of"):
         assert callable(getattr(ptsmc, name))
+    assert len(dir(ptsmc)) == len(set(dir(ptsmc)))
 
 
 def said(code):
