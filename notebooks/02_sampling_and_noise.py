@@ -61,8 +61,8 @@ for eta in (3.0, 5.0):
 # %% [markdown]
 # Handing over earlier wins most of it back: with noise the error falls from 4e-4 to 3e-5 at δ = 0.45 s, 2.5 times the
 # best quiet one. The curve has a minimum: too late, and noise rules; too early, and what is left is for the slow constant
-# gains, which is why the quiet curve rises too. (Less than a period and a half is one and the same sample, so the first
-# two points are equal.)
+# gains, which is why the quiet curve rises too. (From one period to two it is one and the same sample, so the first two
+# points are equal.)
 
 # %%
 deltas = np.geomspace(0.05, 4.0, 9)
