@@ -75,6 +75,8 @@ def configure(
         raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
     if device not in (None, "cpu", "gpu"):
         raise ValueError(f'device is {device!r}, but must be "cpu", "gpu", or None for the first that JAX finds')
+    if devices is not None and not (isinstance(devices, int) and devices >= 1):
+        raise ValueError(f"devices is {devices!r}, but must be a whole number from 1 on, or None for all cores")
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when jaxlib is loaded; what is fatal is still said
     _set_compiler_options(fast, folder)

@@ -28,9 +28,20 @@ def tried(monkeypatch):
     return seen
 
 
-@pytest.mark.parametrize("asked", [{"bits": "64"}, {"bits": 16}, {"device": "cuda"}, {"device": "GPU"}])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"bits": "64"},
+        {"bits": 16},
+        {"device": "cuda"},
+        {"device": "GPU"},
+        {"devices": 0},
+        {"devices": -1},
+        {"devices": "2"},
+    ],
+)
 def test_other_bits_and_devices_are_refused(asked):
-    """Whatever was not the number 64 was taken for 32 bits."""
+    """Whatever was not the number 64 was taken for 32 bits, no devices for all and fewer than none for one."""
     (name,) = asked
     with pytest.raises(ValueError, match=f"^{name} is .*, but must be"):
         setup.configure(**asked)
