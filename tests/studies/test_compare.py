@@ -69,6 +69,24 @@ def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
             wrong.check()
 
 
+def test_a_law_of_ones_own_that_is_flown_is_compared_as_the_scenario_says(tmp_path):
+    (tmp_path / "own.py").write_bytes((ROOT / "scenarios" / "own_parts.py").read_bytes())
+    law = {"kind": "own", "code": f"{tmp_path}/own.py:Scaling", "t_f": 5.0, "delta": 0.7}
+    own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller=law)
+    own = scenario.replace(own, tune={"free": ["delta"], "trials": 8})
+    assert compare.contenders(own, compare.Rivals(("pd",)))["Scaling"] is own  # without being named
+    (tmp_path / "linked.py").symlink_to(tmp_path / "own.py")
+    named = compare.contenders(own, compare.Rivals(("pd",), (f"{tmp_path}/linked.py:Scaling",)))
+    assert list(named) == ["prescribed_time", "pd", "Scaling"]
+    assert named["Scaling"] is own
+
+
+def test_laws_of_ones_own_with_one_name_are_all_compared():
+    named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:paper")).named
+    assert list(named) == ["prescribed_time", "Mine", "own Mine", "own own Mine", "own paper"]
+    assert len({law.get("code") for law in named.values()}) == 5
+
+
 def test_a_baselines_own_scenario_keeps_its_own_bounds():
     own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller={"kind": "pd", "t_f": 5.0, "k_p": 2.0})
     own = scenario.replace(own, tune={"free": ["k_d"], "bounds": {"k_d": [0.5, 3.0]}, "trials": 8})

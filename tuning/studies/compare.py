@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from tuning.search.objective import T_F
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
-OURS = "prescribed_time"
+OURS, PAPER = "prescribed_time", "paper"  # the paper's law as tuned, and with the paper's gains
 OFF = 0.1  # share by which the inertia differs from what laws are told
 UNTOLD = ("heavier", "lighter", "later")
 KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
@@ -113,10 +113,10 @@ class Rivals:
         """The law of the table [controller] of each, the paper's first, by what it is called."""
         kinds = laws() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
-        for where in self.own:
+        for where in dict.fromkeys(self.own):
             place, _, name = where.rpartition(":")
             code = f"{os.path.realpath(place)}:{name}" if place.endswith(".py") else where
-            tables[name if name not in tables else f"own {name}"] = {"kind": "own", "code": code}
+            tables[_free_name(name, tables)] = {"kind": "own", "code": code}
         return tables
 
     def identity(self) -> dict[str, Any]:
@@ -125,13 +125,23 @@ class Rivals:
         return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
 
 
+def _free_name(name: str, taken: Iterable[str]) -> str:
+    """What a law of one's own is called: as its class, where no other law is."""
+    while name in (PAPER, *taken):
+        name = f"own {name}"
+    return name
+
+
 def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
-    """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default."""
+    """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default.
+
+    Its own is among them where it is one of those asked for, or of the user's own.
+    """
     table, tune = scenario.controller, scenario.search
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     posed = {}
     for name, law in rivals.named.items():
-        if law["kind"] != "own" and table.kind == name:
+        if _is(table, law):
             posed[name] = scenario
         elif name == OURS:
             posed[name] = _posed(gains.papers(scenario), tune, same)
@@ -141,7 +151,19 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
             width = {"sign_width": table.sign_width} if both else {}
             law = {**law, **common_keys(table), **width}
             posed[name] = _posed(replace(scenario, tune=None, controller=law), tune, same)
+    if table.kind == "own" and all(one is not scenario for one in posed.values()):
+        posed[_free_name(type(table).__name__, posed)] = scenario
     return posed
+
+
+def _is(table: Any, law: Mapping[str, str]) -> bool:
+    """Whether the scenario's law is the one that is named; one of one's own by where it stands, links followed."""
+    if table.kind != law["kind"] or table.kind != "own":
+        return table.kind == law["kind"]
+    code = table.code
+    return isinstance(code, str) and all(
+        of(code) == of(law["code"]) for of in (systems.location, lambda where: where.rpartition(":")[2])
+    )
 
 
 def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
@@ -206,9 +228,9 @@ def compare(
     rivals = that_fly(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
     contenders, interrupted = {}, False
-    if "paper" in others:
+    if PAPER in others:
         tell("the paper's gains: judging on fresh trials", 0, 0, np.nan, 0.0)
-        contenders["paper"] = _with_more(_papers(judging.as_flown(others["paper"]), fresh_seed), fresh_seed)
+        contenders[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)  # all on the same fresh trials
