@@ -12,7 +12,9 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import study_plots
+from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
@@ -20,7 +22,7 @@ from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
 from tests.output.pages import checked
 from tuning.errors import UsageError
 from tuning.output import law_sentences, page
-from tuning.search import gains
+from tuning.search import gains, own_parts
 from tuning.studies import compare, judging, tuner
 
 TABLES = tomllib.loads(SHORT)
@@ -79,6 +81,19 @@ def test_a_law_of_ones_own_that_is_flown_is_compared_as_the_scenario_says(tmp_pa
     named = compare.contenders(own, compare.Rivals(("pd",), (f"{tmp_path}/linked.py:Scaling",)))
     assert list(named) == ["prescribed_time", "pd", "Scaling"]
     assert named["Scaling"] is own
+
+
+def test_scenarios_of_a_comparison_run_the_laws_that_it_was_made_with_and_no_others(tmp_path):
+    for name in ("flown", "beside", "other"):
+        (tmp_path / f"{name}.py").write_text(f"# {name}\n")
+    where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("flown", "beside", "other")}
+    of_scenario = {"controller_sha256": systems.digest(where["flown"])}
+    of_rivals = {"own_laws": {where["beside"]: systems.digest(where["beside"])}}
+    for made, names in ((of_scenario | of_rivals, ("flown", "beside")), (of_rivals, ("beside",))):
+        for name in names:
+            own_parts.check_unchanged({"controller.code": where[name]}, tmp_path, made)
+        with pytest.raises(RefusedError, match="was made with another"):
+            own_parts.check_unchanged({"controller.code": where["other"]}, tmp_path, made)
 
 
 def test_laws_of_ones_own_with_one_name_are_all_compared():
