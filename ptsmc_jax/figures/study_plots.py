@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax.figures.style import FLOOR, LIMIT, STYLES, figure_of, logarithmic, plain_ticks, styled
+from ptsmc_jax.scenario.gain_record import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
@@ -88,7 +89,7 @@ def tuning_history(
     for ax, (name, (unit, courses)) in zip(axes[1:], gains.items(), strict=True):
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
         ax.set_ylabel(f"{name}\n[{unit}]")
-        if np.nanmax(courses) > 10 * np.nanmin(courses):
+        if wide(np.nanmin(courses), np.nanmax(courses)):
             ax.set_yscale("log")
     axes[-1].set_xlabel("step")
     axes[-1].xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
@@ -131,7 +132,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
             label = f"beyond the limit of {of}"
             ax.semilogy(one.gain[beyond], one.goal[beyond], mark, color=STYLES[1][0], label=label)
         ax.axvline(one.tuned, color="0.3", lw=0.9, ls=":", label="tuned")
-        if one.gain[-1] > 10 * one.gain[0]:
+        if wide(one.gain[0], one.gain[-1]):
             logarithmic(ax, "x")
         ax.set(xlabel=f"{name} [{one.unit}]", ylabel=goal)
     axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)

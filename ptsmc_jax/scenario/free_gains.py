@@ -6,7 +6,7 @@ import msgspec
 
 from ptsmc_jax.scenario import errors, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_record import Choice
+from ptsmc_jax.scenario.gain_record import Choice, wide
 from ptsmc_jax.scenario.tables import Scenario
 
 
@@ -102,6 +102,8 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
     (low, high), own = gain.usual(choice), _own(choice.scenario, name)
     if own:
         least, most, closed = gain.allowed(choice)
+        if math.isinf(least):  # of one's own, that may be negative: as far out as the usual ones are apart
+            least = min(low, *own) - (high - low)
         if min(own) < low and (least <= min(own) if closed else least < min(own)):
             low = (least + min(own)) / 2
         if high < max(own) < most:
@@ -145,7 +147,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     if border(scenario, name, side, low if side == "lower" else high) is not None:
         return None
     least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
-    if high > 10.0 * low:
+    if wide(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
     else:

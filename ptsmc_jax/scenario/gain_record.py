@@ -7,6 +7,15 @@ from typing import Any, NamedTuple
 Interval = tuple[float, float]
 
 
+def wide(low: Any, high: Any) -> Any:
+    """Whether an interval, or each of many, is searched on a log scale: above zero, its ends more than tenfold apart.
+
+    >>> wide(0.1, 2.0), wide(0.5, 2.0), wide(-1.0, 2.0)
+    (True, False, False)
+    """
+    return (low > 0.0) & (high > 10.0 * low)
+
+
 class Choice(NamedTuple):
     """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
 

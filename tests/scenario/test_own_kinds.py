@@ -117,6 +117,26 @@ def test_gains_of_ones_own_are_set_in_parts_and_in_the_scenario():
     assert gains.units_of(whole)["observer_rate"] == "1/s"
 
 
+SIGNED = """
+class Signed(ptsmc.AccelerationLaw):
+    '''A constant beside PD.'''
+
+    lead: float = ptsmc.gain(0.0, (-1.0, 1.0), above=-float("inf"))
+
+    def acceleration(self, now, error, error_rate, bound):
+        return self.lead - error - error_rate, error
+"""
+
+
+@pytest.mark.parametrize(("own", "bounds"), [(0.5, (-1.0, 1.0)), (-3.0, (-4.0, 1.0)), (2.0, (-1.0, 7.0))])
+def test_bounds_of_a_gain_of_any_sign_hold_the_scenarios_own(here, own, bounds):
+    (here / "signed.py").write_text(HEAD + SIGNED)
+    law = {"kind": "own", "code": "signed.py:Signed", "t_f": 5.0, "lead": own}
+    whole = reading.complete(scenario.from_tables({**CHAIN, "controller": law, "tune": {}}))
+    assert whole.tune is not None
+    assert whole.tune.bounds == {"lead": bounds}
+
+
 def test_a_class_from_python_needs_no_file():
     law = made("mine.py", "Mine")
     base = scenario.from_tables({**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}})

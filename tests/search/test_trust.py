@@ -1,6 +1,7 @@
 """Slopes, influence, sensitivities, intervals and the global check, against what is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -59,6 +60,21 @@ def test_sensitivities_at_a_bound_are_taken_inside_it(quiet):
         gains = np.array([3.3, (BOUNDS.lower, BOUNDS.upper)[at][1], (BOUNDS.upper, BOUNDS.lower)[at][2]])
         powers = trust.sensitivities(quiet, BOUNDS, gains, ("peak_torque",))["peak_torque"]
         np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
+
+
+def test_a_gain_that_is_zero_has_no_sensitivity_and_hides_no_others(monkeypatch):
+    """The error is the first gain's square, whatever the second, which is zero."""
+
+    def fly(_, gains):
+        errors = np.tile(gains[:, :1] ** 2, (1, 4))
+        return SimpleNamespace(status=np.zeros((len(gains), 4), int), metrics=SimpleNamespace(window_error=errors))
+
+    monkeypatch.setattr(trust.flights, "fly", fly)
+    problem = SimpleNamespace(others=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
+    bounds = Bounds(problem.names, (1.0, -1.0), (3.0, 1.0))
+    found = trust.sensitivities(problem, bounds, np.array([2.0, 0.0]), ("window_error",))
+    assert list(found["window_error"]) == ["k"]
+    np.testing.assert_allclose(found["window_error"]["k"], 2.0, rtol=1e-4)  # see above
 
 
 @pytest.mark.parametrize(("ratio", "flat"), [(1.0, True), (1.005, True), (1.02, False), (3.0, False)])

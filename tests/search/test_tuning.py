@@ -105,6 +105,14 @@ def test_bounds_map_shares_into_the_interval_and_back():
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
 
 
+def test_a_gain_that_may_be_negative_is_searched_between_its_bounds_as_they_are():
+    some = shares.Bounds(("k", "lead"), (0.1, -1.0), (10.0, 3.0))
+    assert list(some.logarithmic) == [True, False]
+    np.testing.assert_allclose(some.gains(jnp.asarray([0.5, 0.5])), [1.0, 1.0], rtol=1e-14)
+    np.testing.assert_allclose(some.share(np.array([1.0, 0.0])), [0.5, 0.25], rtol=1e-14)
+    assert some.at_bound(np.array([1.0, -1.0])) == {"lead": "lower"}
+
+
 def test_the_narrowest_sign_follows_the_observer():
     """K2 is inverse to the observer's gain, and at half of what K2 moves s by in a period the sampled sign hops."""
     table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": {}}

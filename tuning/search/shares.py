@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.scenario import free_gains
+from ptsmc_jax.scenario.gain_record import wide
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes
@@ -34,12 +35,14 @@ class Bounds:
     @property
     def logarithmic(self) -> np.ndarray:
         """(gains,) bool: searched on a log scale."""
-        return np.asarray(self.upper) > 10.0 * np.asarray(self.lower)
+        return wide(np.asarray(self.lower), np.asarray(self.upper))
 
     def _scaled(self) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = np.asarray(self.lower), np.asarray(self.upper)
         log = self.logarithmic
-        return np.where(log, np.log(lower), lower), np.where(log, np.log(upper), upper)
+        logarithms = (np.log(np.where(log, bound, 1.0)) for bound in (lower, upper))
+        low, high = (np.where(log, inner, bound) for inner, bound in zip(logarithms, (lower, upper), strict=True))
+        return low, high
 
     def gains(self, share: Float[Array, " gains"]) -> Float[Array, " gains"]:
         """Gains of shares of the intervals: 0 is the lower bound, 1 the upper one."""

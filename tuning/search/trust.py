@@ -77,7 +77,7 @@ def sensitivities(
 
     Central differences inside the bounds, of the program that judges, which has every metric: one that slopes are
     compiled for takes longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is
-    left out.
+    left out, and so is a gain that is zero, of which there is no percent.
     """
     less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
     trials = problem.others(np.asarray(problem.trials)[: problem.averaged])
@@ -85,13 +85,17 @@ def sensitivities(
     finished = np.isin(flown.status, rollout.FINISHED)
     metrics = (getattr(flown.metrics, name) for name in names)
     with np.errstate(divide="ignore", invalid="ignore"):
-        metric_rms = [[rms(one[ended]) for one, ended in zip(metric, finished, strict=True)] for metric in metrics]
+        metric_rms = [
+            [rms(one[ended]) if ended.any() else np.nan for one, ended in zip(metric, finished, strict=True)]
+            for metric in metrics
+        ]
         below, above = np.split(np.transpose(metric_rms), 2)
         rows = np.log(above / below) / np.log(np.diag(more) / np.diag(less))[:, None]
+    some = np.flatnonzero(gains)
     return {
-        metric: dict(zip(problem.names, row.tolist(), strict=True))
+        metric: {problem.names[k]: float(row[k]) for k in some}
         for metric, row in zip(names, np.transpose(rows), strict=True)
-        if np.all(np.isfinite(row))
+        if some.size and np.all(np.isfinite(row[some]))
     }
 
 
