@@ -8,6 +8,7 @@ from tests.helpers import parts
 from tests.search.test_trust import SPREAD
 from tuning.search import cma_es, objective
 from tuning.search.descent import Best
+from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.shares import Bounds
 
@@ -69,6 +70,19 @@ def test_a_limit_is_followed_to_the_optimum_on_it(seed):
     assert best.over == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # SLACK beyond the limit is allowed
     assert best.f <= optimum + 5.0 * cma_es.GAINED
+
+
+def test_what_evolution_sets_out_from_is_the_first_of_the_history():
+    """All that there is to tell where it is interrupted then."""
+    valley = Valley(np.eye(2))
+    names = valley.bounds.names
+    valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
+    some = objective.problem(parts(20.0, 3.0, 1.0), SPREAD, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
+    search = Descents(valley, 0.0, 4, np.random.default_rng(0))
+    search.sweep(some, np.full(2, 1.9))
+    (first,) = search.history
+    assert first.value == search.best.value
+    assert search.best.f < 0.01  # of 512 points spread over the square
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

@@ -11,7 +11,9 @@ from ptsmc_jax import scenario
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ROOT, SHORT_CHAIN, small_search
 from tuning.output import search_sentences
-from tuning.search import worst
+from tuning.search import trust, worst
+from tuning.search.descents import Step
+from tuning.search.objective import FAILED
 from tuning.studies import judging, tune_files, tuner
 
 LIMIT = 0.6  # of the peak torque
@@ -73,6 +75,21 @@ def test_every_column_of_a_history_has_a_name_of_its_own():
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
     columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])
     assert columns == ["step", "start", "goal_t_f", "eta", "t_f", "peak_torque_over_limit"]
+
+
+def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():
+    some = scenario.from_tables(tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta"]}})
+    lost = np.full(2, np.nan)
+    trials = SimpleNamespace(finished=np.zeros(2, bool), metrics=SimpleNamespace(window_error=lost, peak_torque=lost))
+    profile = trust.Profile(np.array([3.0, 4.0]), np.full(2, FAILED), np.full(2, 0.0), np.zeros(2), ["", ""])
+    steps = [Step(0, np.array([eta]), FAILED, np.array([FAILED])) for eta in (3.0, 3.5)]
+    tuning = SimpleNamespace(
+        search=SimpleNamespace(history=steps, value=FAILED, gains=np.array([3.0])),
+        fresh={"tuned": trials},
+        floors={"tuned": None},
+        trust=SimpleNamespace(sensitivities={}, profiles={"eta": profile}),
+    )
+    assert set(tune_files.figures_of(some, cast("Any", tuning))) == {"history", "profiles"}
 
 
 @pytest.mark.parametrize(

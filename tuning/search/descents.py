@@ -253,18 +253,20 @@ class Descents:
         tightened = self.tightened(problem)
         share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
         share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
-        self._take(self._best_of(tightened, share), tightened, 0, afresh=True)
+        best, flown = self._best_of(tightened, share)
+        self._keep(0, flown)  # interrupted before evolution has a generation, it is all that there is to tell
+        self._take(best, tightened, 0, afresh=True)
 
-    def _best_of(self, tightened: Problem, share: np.ndarray) -> Best:
-        """The best of these points, (points, gains), flown without slopes."""
-        best = Best(share[0], len(tightened.rows), self._margin)
-        best.offer(share, self._evaluate.fly(tightened, share))
-        return best
+    def _best_of(self, tightened: Problem, share: np.ndarray) -> tuple[Best, Measured]:
+        """The best of these points, (points, gains), flown without slopes, and what was measured at each of them."""
+        best, flown = Best(share[0], len(tightened.rows), self._margin), self._evaluate.fly(tightened, share)
+        best.offer(share, flown)
+        return best, flown
 
     def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
         """Look for better points around these shares, without slopes."""
         tightened = self.tightened(problem)
-        best = self._best_of(tightened, share[None])
+        best, _ = self._best_of(tightened, share[None])
         try:
             evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
                    lambda done, steps: self._report(EVOLVING, done, steps, *best.so_far),
@@ -273,7 +275,7 @@ class Descents:
             self._take(best, tightened, 0, afresh=True)
         on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
         if on_samples.size:
-            best = self._best_of(tightened, on_samples)
+            best, _ = self._best_of(tightened, on_samples)
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
 
     def _finish(self, problem: Problem) -> None:

@@ -203,7 +203,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"].unit
     goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
-    figures = {
+    figures: dict[str, Any] = {
         "history": study_plots.tuning_history(
             {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
             over_steps(lambda step: step.value),
@@ -211,18 +211,18 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
             goal,
             (tuning.search.value, dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
-        "tradeoff": study_plots.tradeoff(
-            {
-                name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
-                for name, trials in tuning.fresh.items()
-            },
-            judging.limit_of("peak_torque", scenario),
-            kind,
-            tuning.floors["tuned"],
-        ),
     }
-    if tuning.trust is not None:
+    ended = {
+        name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
+        for name, trials in tuning.fresh.items()
+        if trials.finished.any()
+    }
+    if ended:
+        limit, floor = judging.limit_of("peak_torque", scenario), tuning.floors["tuned"]
+        figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, floor)
+    if tuning.trust is not None and tuning.trust.sensitivities:  # none where no trial ends
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
+    if tuning.trust is not None:
         figures["profiles"] = study_plots.profiles(
             {
                 name: study_plots.Profile(units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
