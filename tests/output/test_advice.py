@@ -141,6 +141,15 @@ def test_no_largest_settling_time_is_said_where_a_run_that_ended_never_settled(w
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
 
 
+@pytest.mark.parametrize("slopes", [None, {"start": 1e-9, "end": 1e-9}])
+def test_margins_of_the_exact_sign_are_told_to_be_without_it(slopes):
+    hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 3.0}
+    found = {"influence": {}, "margins": {"hold": hold}, "slopes_off_central_differences": slopes}
+    said = " ".join(search_sentences.trust({"trust": found, "at_bound": {}}))
+    assert "gain 9 dB" in said
+    assert ("the loop without its switching term" in said) == (slopes is None)
+
+
 def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
     """With steps of 1 mN m on a large satellite they were off by 3 in a loop that neither chatters nor breaks off."""
     found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}

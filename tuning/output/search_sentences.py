@@ -130,6 +130,8 @@ def trust(summary: Summary) -> Iterator[str]:
         return
     yield from margin_sentences.tuned(record.get("margins"))
     if record["slopes_off_central_differences"] is None:
+        if record.get("margins"):
+            yield "the exact sign has no slope: margins are those of the loop without its switching term"
         yield (
             "the gains were found by evolution, since the exact sign has no slopes to go by; with sign_width free, its "
             "width is a gain too"
