@@ -507,6 +507,18 @@ def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
     np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + descents.LATER), atol=1e-9)
 
 
+def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not():
+    """What is trained with it between two samples, a flight computer hands over later."""
+    some = replace(problem(2), names=("t_f",))
+    evaluate = Evaluator(shares.Bounds(("t_f",), (10.0,), (20.0,)))
+    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
+    run._take(descent.Best(evaluate.bounds.share(np.array([15.13])), 0, 0.0), some, 0, afresh=True)
+    moved = [float(evaluate.bounds.gains(jnp.asarray(one))[0]) for one in run._with_the_hand_over_on_a_sample(some)]
+    delta = float(some.parts.controller.delta)
+    before = np.floor((15.13 - delta) / 0.2)
+    np.testing.assert_allclose(moved, delta + 0.2 * (before + np.arange(descents.LATER)), atol=1e-9)
+
+
 def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
     some = replace(problem(), names=THREE.names)
     own = np.array([3.0, 5.0, 2e-3])

@@ -315,17 +315,18 @@ class Descents:
         A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
         """
         clock: Any = problem.parts.clock
-        bounds = self._evaluate.bounds
-        if "delta" not in problem.names or not clock.anchored:
+        bounds, law, moves = self._evaluate.bounds, problem.parts.controller, list[tuple[int, float]]()
+        at = {name: k for k, name in enumerate(problem.names) if name in TIMES}
+        if not at or not clock.anchored or "delta" not in law.tunable:  # a law without it does not hand over
             return []
-        named, at = dict(zip(problem.names, self.gains, strict=True)), problem.names.index("delta")
-        t_f, period = float(named.get("t_f", problem.parts.controller.t_f)), float(clock.period)
-        samples = (t_f - named["delta"]) / period
+        t_f, delta = (float(self.gains[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
+        period = float(clock.period)
+        samples = (t_f - delta) / period
         before, behind = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
-        moves = [(at, t_f - sample * period) for sample in sorted({before, behind})]
-        if "t_f" in named:  # it moves instead: where it is as short as limits allow, another delta may break one
-            of_t_f = problem.names.index("t_f")
-            moves += [(of_t_f, sample * period + named["delta"]) for sample in range(before, before + LATER)]
+        if "delta" in at:
+            moves += [(at["delta"], t_f - sample * period) for sample in sorted({before, behind})]
+        if "t_f" in at:  # where it is as short as limits allow, another delta may break one
+            moves += [(at["t_f"], sample * period + delta) for sample in range(before, before + LATER)]
         shares = []
         for k, time in moves:
             if bounds.lower[k] * (1 - 1e-9) <= time <= bounds.upper[k]:
