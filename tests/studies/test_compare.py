@@ -134,6 +134,7 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     found = json.loads((folder / "summary.json").read_text())
     laws = ["paper", "prescribed_time", *others]
     assert list(found["laws"]) == laws
+    assert found["judged_on"] == "flight clock"  # not with the sign of one of them
     assert code == (0 if found["laws"]["prescribed_time"]["met"] else 1)
     assert {path.name for path in (folder / "figures").iterdir()} == {"settling.png", "tradeoff.png"}
     rows = list(csv.DictReader((folder / "compare.csv").read_text().splitlines()))
