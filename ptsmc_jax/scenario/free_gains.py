@@ -34,6 +34,16 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     return tune
 
 
+def need_some(scenario: Scenario) -> None:
+    """Raise ScenarioError where a scenario with [tune] has no gain to find: a law of one's own need not have any."""
+    if not scenario.search.gains:
+        raise ScenarioError(
+            f"tune.free is absent, and controller.kind = {errors.show(scenario.controller.kind)} with observer.kind = "
+            f"{errors.show(scenario.observer.kind)} has no gain that is free then; allowed is some of "
+            f"{', '.join(scenario.gains)}, or a law with a ptsmc_jax.gain"
+        )
+
+
 def _check(scenario: Scenario, tune: tables.Tune) -> None:
     """Raise ScenarioError where the table asks for what cannot be tuned, before defaults are computed from it."""
     free, own = tune.gains, scenario.gains

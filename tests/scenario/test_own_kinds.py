@@ -366,6 +366,21 @@ def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
     )
 
 
+def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here):
+    (here / "mine.py").write_text(HEAD + LAW.split("    eta:")[0] + "    def acceleration(self, now, error, *_):\n"
+                                  "        return -error, error\n")  # fmt: skip
+    (here / "s.toml").write_text(
+        '[plant]\nkind = "chain"\n[controller]\nkind = "own"\ncode = "mine.py:Mine"\n[observer]\nkind = "none"\n'
+        '[loop]\nmode = "sampled"\n'
+    )
+    for search in ("tune", "pareto"):
+        status, _, error = command(search, "s.toml")
+        assert (status, error.count("\n")) == (2, 1)
+        assert "tune.free is absent" in error
+        assert "allowed is some of delta, t_f, or a law with" in error
+    assert not (here / "out").exists()
+
+
 @pytest.mark.long
 def test_the_command_tunes_it(command, here, monkeypatch):
     small_search(monkeypatch)

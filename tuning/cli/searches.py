@@ -30,10 +30,12 @@ class LongSearch:
 
 
 def with_tune(scenario: "Scenario") -> "Scenario":
-    """The scenario with a `tune` table, the default one where it has none."""
-    from ptsmc_jax.scenario import replace
+    """The scenario with a `tune` table, the default one where it has none. Raises ScenarioError without any gain."""
+    from ptsmc_jax.scenario import free_gains, replace
 
-    return scenario if scenario.tune is not None else replace(scenario, tune={})
+    scenario = scenario if scenario.tune is not None else replace(scenario, tune={})
+    free_gains.need_some(scenario)
+    return scenario
 
 
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:

@@ -15,7 +15,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at
-from ptsmc_jax.scenario import cautions, errors, own, parsing, replace, study, systems, tables
+from ptsmc_jax.scenario import cautions, errors, free_gains, own, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_record import common_keys
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -172,6 +172,7 @@ def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenari
     for law, posed in each.items():
         try:
             study(posed)
+            free_gains.need_some(posed)
         except ScenarioError as error:
             raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
     return each
