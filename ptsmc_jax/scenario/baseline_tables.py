@@ -25,6 +25,7 @@ class PDController(BaselineTable, frozen=True):
     """
 
     kind: Literal["pd"] = "pd"
+    switches: ClassVar[bool] = False
     k_p: Positive = 0.2
     k_d: Positive = 0.6
     gains: ClassVar[Mapping[str, GainBounds]] = {
@@ -171,6 +172,7 @@ class TimeBasePDController(BaselineTable, frozen=True):
     """
 
     kind: Literal["time_base_pd"] = "time_base_pd"
+    switches: ClassVar[bool] = False
     k_p: Positive = 1.0
     k_d: Positive = 2.0
     gains: ClassVar[Mapping[str, GainBounds]] = {
@@ -239,6 +241,7 @@ class ScalingController(BaselineTable, frozen=True):
     """
 
     kind: Literal["scaling"] = "scaling"
+    switches: ClassVar[bool] = False
     delta: Positive = 2.0
     m: Annotated[float, Meta(ge=1, description="a number, at least 1")] = 1.0
     k1: Positive = 1.0
@@ -309,6 +312,7 @@ class SuperTwistingController(BaselineTable, frozen=True):
     """
 
     kind: Literal["super_twisting"] = "super_twisting"
+    switches: ClassVar[bool] = False
     surface_rate: Positive = 0.4
     lipschitz: Positive = 0.01
     sign_width: NotNegative = 1e-3

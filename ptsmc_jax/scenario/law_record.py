@@ -20,6 +20,7 @@ class LawTable(Kind, frozen=True):
     # a larger K1 and a narrower sign cost nothing but steps
     free_by_default: ClassVar[tuple[str, ...]] = ()
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
+    switches: ClassVar[bool] = True  # against the bound on what is not estimated, which some laws have no use for
     prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
 
     def physics(self, motion: str) -> Any:

@@ -195,6 +195,10 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
         ({"controller": {"disturbance_bound": 1.0}}, []),  # which an observer has no use for
         ({"controller": {"disturbance_bound": 1.0}, "observer": {"kind": "none"}}, ["bound is 1", "chatters"]),
         ({"controller": {"disturbance_rate_bound": 1e-3}, "disturbance": QUIET}, ["reaches 0: the law switches"]),
+        *(
+            ({"controller": {"kind": law, "disturbance_rate_bound": 1e-3}, "disturbance": QUIET, "loop": SAMPLED}, said)
+            for law, said in (("pd", []), ("super_twisting", []), ("terminal", ["the law switches"]))
+        ),
         ({**NOISY, "disturbance": QUIET}, ["observer.gain is 0.07", "more than the disturbance", "at most 1e-06"]),
         ({**NOISY, "disturbance": QUIET, "observer": {"gain": [1e-4] * 3}}, []),
         ({**NOISY, "disturbance": {"kind": "none"}}, []),
