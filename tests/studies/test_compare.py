@@ -369,6 +369,9 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 trials" in lines
         assert not [line for line in lines if "delay_margin" in line]
     assert "no law meets every requirement" in page.build(tmp_path / "out")
+    assert not [line for line in law_sentences.lines(compare.summary(found)) if "interrupted" in line]
+    cut_short = compare.summary(replace(found, interrupted=True))
+    assert next(law_sentences.lines(cut_short)).startswith("interrupted while prescribed time was tuned")
 
 
 def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):

@@ -190,6 +190,11 @@ def _cell(value: Value, law: Summary) -> str:
 
 def lines(summary: Summary) -> Iterator[str]:
     """The gains of each law, trials that went wrong, and limits that it breaks."""
+    if summary["status"] == "interrupted":
+        yield (
+            f"interrupted while {_name(list(summary['laws'])[-1])} was tuned: its gains are the best so far, and laws "
+            "after it are missing; the same command goes on from here"
+        )
     yield from sentences.paper_refused(summary)
     for name, law in summary["laws"].items():
         gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law["gains"].items())
