@@ -148,7 +148,7 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
 
 
 def beyond(scenario: Scenario, name: str, side: str) -> float | None:
-    """A gain a tenth of its interval beyond a bound, or half as far as it may go; None: what lies there is known.
+    """A gain a tenth of its interval beyond a bound, or half as far as it may go; None: known, or none is allowed.
 
     Of an interval that is searched on a log scale a tenth of its logarithm.
     """
@@ -163,7 +163,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     else:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
     value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
-    return float(f"{value:.4g}")
+    return None if value in (low, high) else float(f"{value:.4g}")  # on it: the least that there is
 
 
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:

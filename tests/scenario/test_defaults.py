@@ -237,6 +237,12 @@ def test_how_far_beyond_a_bound_is_looked_at():
     assert free_gains.beyond(said, "delta", "upper") == pytest.approx(10.0 * 100.0**0.1, rel=1e-3)
     assert free_gains.beyond(said, "delta", "lower") is None  # a period: there is none shorter
     assert free_gains.beyond(said, "observer_gain", "upper") is None  # dead-beat
+    law, observer = {"kind": "scaling", "disturbance_rate_bound": 0.123456}, {"kind": "finite_time"}
+    other = scenario.from_tables({"controller": law, "observer": observer, "loop": SAMPLED, "tune": {}})
+    assert other.search.bounds["m"][0] == 1.0
+    assert other.search.bounds["observer_gain"][0] == 0.123456
+    for gain in ("m", "observer_gain"):  # the least that is allowed, itself
+        assert free_gains.beyond(other, gain, "lower") is None
 
 
 def test_the_disturbance_that_is_built_keeps_within_its_bounds():
