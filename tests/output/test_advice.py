@@ -141,6 +141,16 @@ def test_no_largest_settling_time_is_said_where_a_run_that_ended_never_settled(w
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
 
 
+@pytest.mark.parametrize(
+    ("times", "said"), [(1.001, "+0.10 % off that"), (0.98, "-2.00 % off that"), (3835.0, "3.84e+03 times that")]
+)
+def test_how_far_the_global_check_is_off_is_told_by_the_goals_themselves(times, said):
+    check = {"rollouts": 7, "value": 2.0, "distance": float(np.log(times)), "kept": True}
+    record = {"largest_over_limit": {}, "differential_evolution": check}
+    (sentence,) = search_sentences.search({"search": record, "verdicts": [], "differential_evolution": check})
+    assert sentence.endswith(f"the goal of the tuned gains is {said}")
+
+
 @pytest.mark.parametrize("slopes", [None, {"start": 1e-9, "end": 1e-9}])
 def test_margins_of_the_exact_sign_are_told_to_be_without_it(slopes):
     hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 3.0}

@@ -66,8 +66,10 @@ def _worst_case(hardest: Summary, *, tuned_for: bool) -> str:
 def _beside_evolution(check: Summary, record: Summary) -> str:
     """What differential evolution found, beside the search."""
     search_keeps = all(ratio is not None and ratio <= 1.0 for ratio in record["largest_over_limit"].values())
+    far = check["distance"]  # of logarithms: a share only where it is small
+    off = f"{math.exp(far):.3g} times that" if far > math.log(2.0) else f"{100 * math.expm1(far):+.2f} % off that"
     beside = {
-        (True, True): f"and the goal of the tuned gains is {100 * check['distance']:+.2f} % off that",
+        (True, True): f"and the goal of the tuned gains is {off}",
         (True, False): "with gains that break a limit, which the tuned gains keep",
         (False, True): "with gains that keep every limit, unlike the tuned ones",
         (False, False): "with gains that do not keep every limit, as the tuned ones do not",

@@ -24,7 +24,7 @@ class Check:
 
     gains: dict[str, float]
     value: float  # its goal
-    distance: float  # the search's F less this one's: about the share by which the search is worse
+    distance: float  # the search's F less this one's: ln of how many times its goal the search's is
     kept: bool  # whether it keeps every limit
     rollouts: int  # trials flown for it
 
