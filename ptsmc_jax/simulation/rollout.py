@@ -98,7 +98,7 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
 class _Flights(programs.Program):
     """`simulate` compiled: what is no parts is refused before JAX says that it is no array."""
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Result:
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as `simulate` is called."""
         check_parts(args[0] if args else kwargs.get("parts"))
         return super().__call__(*args, **kwargs)

@@ -50,7 +50,9 @@ def test_what_it_remembers_has_the_poles_of_the_filter_and_no_others(kind):
     start, tree = ravel_pytree(device.begin(1))
     moved = jax.jacfwd(lambda kept: ravel_pytree(device.step(tree(kept), vector([0.0]), H, H)[1])[0])(start)
     _, a = digital(kind)
-    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(moved)), np.sort_complex(np.roots(a)), atol=1e-14)
+    np.testing.assert_allclose(
+        np.sort_complex(np.linalg.eigvals(moved)), np.sort_complex(np.roots(np.asarray(a))), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

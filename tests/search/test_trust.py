@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,7 +71,7 @@ def test_a_gain_that_is_zero_has_no_sensitivity_and_hides_no_others(monkeypatch)
         return SimpleNamespace(status=np.zeros((len(gains), 4), int), metrics=SimpleNamespace(window_error=errors))
 
     monkeypatch.setattr(trust.flights, "fly", fly)
-    problem = SimpleNamespace(others=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
+    problem: Any = SimpleNamespace(others=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
     bounds = Bounds(problem.names, (1.0, -1.0), (3.0, 1.0))
     found = trust.sensitivities(problem, bounds, np.array([2.0, 0.0]), ("window_error",))
     assert list(found["window_error"]) == ["k"]
