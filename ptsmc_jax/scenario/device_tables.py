@@ -122,7 +122,8 @@ class Hardware(Actuators, frozen=True):
     def periods_apart(self, period: float) -> int | None:
         """Control periods [s] between two of its samples; None where that is no whole number."""
         ratio = self.interval(period) / period
-        return round(ratio) if abs(ratio - round(ratio)) < SAME * ratio else None
+        whole = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses what is beyond the run
+        return int(whole) if abs(ratio - whole) < SAME * ratio else None
 
     def check(self, scenario: Any) -> None:
         """One noise of the gyro; a star tracker that pauses needs a filter."""

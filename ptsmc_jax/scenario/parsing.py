@@ -306,7 +306,7 @@ def _in_unit(key: str, text: str, unit: str, allowed: str) -> float:
 def _in_words(name: str, value: Any, struct: type[Table], kind: Any) -> Any:
     """The value of a key, or the numbers of one, where it is in words and the key has a unit that has others."""
     said = isinstance(value, str) or (isinstance(value, list) and any(isinstance(one, str) for one in value))
-    if not said or _fits(value, kind):
+    if not said or name in layouts.KINDS or _fits(value, kind):
         return value
     unit = next((one.unit for one in keys.of(struct) if one.name == name.rpartition(".")[2]), "")
     if unit not in catalogues.UNITS:

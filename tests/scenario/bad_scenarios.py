@@ -235,6 +235,11 @@ BAD = [
         "hardware.star_tracker_period is 1000000000.0",
         "at most loop.t_end, 40.0",
     ),
+    (
+        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware.star_tracker_period = 1e308",
+        "hardware.star_tracker_period is 1e+308",
+        "at most loop.t_end, 40.0",
+    ),
     (SAMPLED + "hardware.star_tracker_period = 0", "hardware.star_tracker_period is 0", "greater than 0"),
     (
         SAMPLED + "hardware = { rate_noise = 1e-6, rate_noise_density = 1e-7 }",
@@ -262,6 +267,7 @@ BAD = [
     ("flexible.coupling = [[4, 0, 0]]", "flexible.coupling is [[4.0, 0.0, 0.0]]", "must be positive definite"),
     (SAMPLED + "flexible.frequency = [1e4]", "flexible.frequency is [10000.0]", "lower: loop.period"),
     ("hardware.command_filter = 3", "hardware.command_filter is 3", 'an inline table such as { kind = "first_order" }'),
+    ("hardware.command_filter = 'notch'", 'hardware.command_filter is "notch"', "an inline table such as"),
     ("hardware.command_filter = { kind = 'pid' }", 'hardware.command_filter.kind is "pid"', '"notch"'),
     ("hardware.command_filter = { corner = 0 }", "hardware.command_filter.corner is 0", "greater than 0"),
     ("hardware.command_filter = { width = 1 }", "hardware.command_filter.width is not", "command_filter.corner"),
