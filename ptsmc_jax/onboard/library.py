@@ -23,7 +23,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
 
-# many steps with the same parameters, a row each: states, inputs -> states, outputs, statuses
+# many steps, a row each: parameters, states, inputs -> states, outputs, statuses
 GLUE = """
 #include "ptsmc_@name@_flat.h"
 
@@ -35,14 +35,13 @@ void ptsmc_set(double *params);
 void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
                 int *status)
 {
-    ptsmc_params p;
-    ptsmc_state first;
-    params_from(params, &p);
-    ptsmc_init(&p, &first);
     for (long k = 0; k < count; k++) {
-        ptsmc_state x = first; /* with what is derived, which is not among the columns */
+        ptsmc_params p;
+        ptsmc_state x;
         ptsmc_in given;
         ptsmc_out found;
+        params_from(params + k * PTSMC_PARAMS_SIZE, &p);
+        ptsmc_init(&p, &x); /* with what is derived, which is not among the columns */
         state_from(state + k * PTSMC_STATE_SIZE, &x);
         in_from(in + k * PTSMC_IN_SIZE, &given);
         status[k] = ptsmc_step(&p, &x, &given, &found);
@@ -118,14 +117,16 @@ class Library:
         self._made.ptsmc_first(_at(self.parameters), _at(state))
         return state
 
-    def many(self, state: Any, given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A step of each row (.., columns): states after it, outputs, statuses."""
+    def many(self, state: Any, given: Any, parameters: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A step of each row (.., columns): states after it, outputs, statuses; parameters: by default all the same."""
         state, given = (np.ascontiguousarray(v, dtype=float) for v in (state, given))
         shape = state.shape[:-1]
+        each = self.parameters if parameters is None else np.asarray(parameters, dtype=float)
+        each = np.ascontiguousarray(np.broadcast_to(each, (*shape, self.parameters.size)))
         after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
         status = np.empty(shape, dtype=np.int32)
         count = ctypes.c_long(int(np.prod(shape, dtype=int)))
-        self._made.ptsmc_many(count, *map(_at, (self.parameters, state, given, after, out, status)))
+        self._made.ptsmc_many(count, *map(_at, (each, state, given, after, out, status)))
         names = list(STATUS)
         self.statuses.update({names[k].lower(): int(n) for k, n in enumerate(np.bincount(status.ravel())) if n})
         return after, out, status
@@ -144,7 +145,7 @@ class InTheLoop:
 
     def __init__(self, library: Library, parts: Parts):
         """Raises ScenarioError where the controller is one of other parts."""
-        self.library, self.board = library, board(parts)
+        self.library, self.board, self.nominal = library, board(parts), parts
         mine = names_of(self.board)
         for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
             if library.columns[kind] != mine[kind]:
@@ -190,7 +191,7 @@ class InTheLoop:
             inputs["attitude_age"] = sensors.star_age(now.sample, dt_before)
             inputs["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
-        after, out = self._stepped(state, row)
+        after, out = self._stepped(state, row, self._told(parts))
         after = jnp.where(period.length > 0.0, after, state)
         outputs = self._trees(self.board.outputs, out, 0)
         memory = self._trees(self.board.state, after, 3)
@@ -200,17 +201,33 @@ class InTheLoop:
                             parts.plant.velocity(seen), channels)  # fmt: skip
         return decision, Computer((sensing, after), seen, memory["observer"], memory["law"], computer.applied)
 
-    def _stepped(self, state: Any, given: Any) -> tuple[Any, Any]:
+    def _told(self, parts: Parts) -> Any:
+        """The parameters (columns,) that a trial draws and tells its flight computer; NaN of those of the folder."""
+        columns = self.library.columns["params"]
+        told = jnp.full(len(columns), jnp.nan)
+        for part, key, first in (
+            ("reference", "q", "reference_q[0]"),
+            ("actuators", "torque_limit", "actuators_torque_limit"),
+        ):
+            drawn, nominal = (getattr(getattr(of, part), key, None) for of in (parts, self.nominal))
+            if drawn is not None and first in columns:
+                at = columns.index(first)
+                value = jnp.where(jnp.any(drawn != nominal), jnp.ravel(drawn), jnp.nan)
+                told = told.at[at : at + drawn.size].set(value)
+        return told
+
+    def _stepped(self, state: Any, given: Any, told: Any) -> tuple[Any, Any]:
         shapes = (
             jax.ShapeDtypeStruct(state.shape, state.dtype),
             jax.ShapeDtypeStruct((len(self.library.columns["out"]),), state.dtype),
         )
 
-        def step(state: Any, given: Any) -> tuple[np.ndarray, np.ndarray]:
-            after, out, _ = self.library.many(np.asarray(state), np.asarray(given))
+        def step(state: Any, given: Any, told: Any) -> tuple[np.ndarray, np.ndarray]:
+            parameters = np.where(np.isnan(told), self.library.parameters, told)
+            after, out, _ = self.library.many(np.asarray(state), np.asarray(given), parameters)
             return after, out
 
-        return jax.pure_callback(step, shapes, state, given, vmap_method="broadcast_all")
+        return jax.pure_callback(step, shapes, state, given, told, vmap_method="broadcast_all")
 
     def _with(self, state: Any, name: str, value: Any) -> Any:
         at = self.library.columns["state"].index(f"{name}[0]")

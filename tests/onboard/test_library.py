@@ -216,6 +216,20 @@ def test_limits_are_told(exported):
 
 
 @needs_compiler
+def test_what_a_trial_draws_and_its_computer_knows_is_told(exported):
+    """Its reference and its torque limit: C flew to the nominal ones, and was judged by those drawn."""
+    _, library = exported("delay, limit, quantised")
+    drawn = {"reference": {"kind": "normal", "std_deg": 20.0}, "torque_limit": {"kind": "relative_normal", "std": 0.2}}
+    tables = {**FLIGHTS["delay, limit, quantised"], "dispersion": drawn}
+    ready = scenario.study(folder.flown(scenario.from_tables(tables)))
+    ours = runs.fly(ready, 3, 2)
+    theirs = runs.fly(ready, 3, 2, InTheLoop(library, ready.parts).software)
+    assert library.statuses["saturated"] > 0
+    for name in ("window_error", "peak_torque", "peak_torque_delivered"):
+        np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-9, err_msg=name)
+
+
+@needs_compiler
 @pytest.mark.parametrize("name", ["wheels", "implicit chain"])
 def test_single_precision_flies_as_well(exported, name):
     """Statistics to three digits: see `benchmarks/exported_c.py`; one run's peak, and its error at t_f."""
