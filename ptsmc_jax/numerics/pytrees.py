@@ -112,7 +112,8 @@ def gain(
     """A field of a part of one's own that tuning may move: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s")`.
 
     usual: the bounds of a search where a scenario gives none, two numbers or a function of t_f and the period [s];
-    where they are more than a factor of 10 apart it is searched on a log scale. above, below: what it must lie between.
+    where they are positive and more than a factor of 10 apart it is searched on a log scale. above, below: what it must
+    lie between.
     """
     return field(default=default, metadata={"gain": Gain(usual, above, below, unit, meaning)})
 
