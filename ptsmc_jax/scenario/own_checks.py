@@ -62,7 +62,9 @@ class _Asked:
         return ScenarioError(f"{self._said} {method} returns {returns} at t = 0, but must return {must}")
 
     def check(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> None:
-        """Raise ScenarioError where this is not finite, or of another shape."""
+        """Raise ScenarioError where this is no array, not finite, or of another shape."""
+        if not isinstance(value, jax.Array):
+            raise self.refused(method, f"{what} that is a {type(value).__name__}", f"an array of shape {shape}")
         got = np.asarray(value)
         if got.shape != shape:
             raise self.refused(method, f"{what} of shape {got.shape}", f"one of shape {shape}")

@@ -247,6 +247,10 @@ def changed(old, new):
 BAD = [
     (changed("return 0.5 * wanted, s", "return jnp.zeros(2), s"), {}, "acceleration", "shape"),
     (
+        changed("return 0.5 * wanted, s", "return [0.5 * wanted[0]], s"), {},
+        "acceleration returns an acceleration that is a list", "an array of shape (1,)",
+    ),
+    (
         changed("return 0.5 * wanted, s", "return 0.5 * wanted"), {},
         "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
     ),
