@@ -45,7 +45,8 @@ def listing(self: Any, indent: str = "") -> str:
 
 def _shown(value: Any, indent: str) -> str:
     if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, core.Tracer):
-        if value.size > FEW or not np.issubdtype(value.dtype, np.number):
+        gone = isinstance(value, jax.Array) and value.is_deleted()  # as one that was donated
+        if gone or value.size > FEW or not jnp.issubdtype(value.dtype, np.number):
             return f"{value.dtype} {value.shape}"
         return " ".join(np.array2string(np.asarray(value), separator=", ").split())
     text = repr(value)

@@ -140,6 +140,9 @@ def test_parts_and_results_are_shown_in_lines_that_can_be_read():
     log = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes.log)
     assert {"  u: float64 (181, 3)", "    q: float64 (181, 4)"} <= set(repr(log).splitlines())
     jax.jit(lambda run: repr(run) and run.t_end)(RUN)
+    given = replace(RUN, t_end=RUN.t_end + 0.0, window=jax.random.key(0))
+    given.t_end.delete()  # as donated arguments are
+    assert {"  t_end: float64 ()", "  window: key<fry> ()"} <= set(repr(given).splitlines())
 
 
 def test_scenarios_and_studies_are_shown_by_their_tables():
