@@ -58,7 +58,7 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
     >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
     """
     store.check_file(Path(file), force, "force=True")
-    store.write_toml(Path(file), parsing.dump(scenario))
+    store.write_toml(Path(file), parsing.dump(reading.of(scenario)))
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,8 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callab
     def mapped(args: tuple, directions: tuple) -> tuple[Any, Any]:
         trials, one, values = _mapped(args, in_axes)
         moves = [k for k, along in enumerate(directions) if along is not None]
+        if not moves or len(directions) > len(args):
+            raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(moves)}")
 
         def both(one: tuple, slopes: tuple) -> tuple[Any, Any]:
             def of(*some: Any) -> Any:
@@ -75,8 +77,9 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callab
         closed, out = jax.make_jaxpr(both, return_shape=True)(one, tuple(one[k] for k in moves))
         # an argument that stays has a place among the values, but none here
         inner = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
-        slopes = [_slope(leaf, shape) for leaf, shape in zip(along, inner, strict=True)]
-        lanes = _Lanes(trials, strict, directions=along[0].shape[0])
+        count = along[0].shape[0] if along[0].ndim else 0
+        slopes = [_slope(leaf, shape, count, trials) for leaf, shape in zip(along, inner, strict=True)]
+        lanes = _Lanes(trials, strict, directions=count)
         results = lanes.evaluate(used(closed), [*values, *slopes])
         half = len(results) // 2
         leads = [(trials,)] * half + [(lanes.directions, trials)] * half
@@ -106,9 +109,11 @@ def _mapped(args: tuple, in_axes: Any) -> tuple[int, tuple, list]:
     return sizes.pop(), jax.tree.unflatten(tree, one), values
 
 
-def _slope(along: Array, shape: tuple[int, ...]) -> Lane:
+def _slope(along: Array, shape: tuple[int, ...], count: int, trials: int) -> Lane:
     """Directions of a value of this shape, (directions, [trials,] *shape)."""
-    equal = along.ndim == len(shape) + 1  # in all trials
+    equal = along.shape == (count, *shape)  # in all trials
+    if not equal and along.shape != (count, trials, *shape):
+        raise ValueError(f"{count} directions of {shape} in {trials} trials cannot be of shape {along.shape}")
     dense, differs = (along[:, None], DIRECTION) if equal else (along, TRIAL | DIRECTION)
     return Lane(shape, dense=dense, differs=differs).apart()
 

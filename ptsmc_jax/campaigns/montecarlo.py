@@ -18,8 +18,8 @@ from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.metrics import Metrics
-from ptsmc_jax.simulation.rollout import Parts
 
 FEW = 64  # fewer trials are flown at once, by a program for this many: a step of one costs nearly as much
 CAPACITY = 4096  # trials in one call
@@ -154,8 +154,9 @@ def run(
         own: see `one`.
         kernel: whole runs in one kernel, see `kernel`; on a processor it is interpreted, slowly.
 
-    Raises ValueError where the trials are no such numbers.
+    Raises ValueError where the trials are no such numbers, TypeError where there are no parts.
     """
+    check_parts(parts)
     trials = trials if isinstance(trials, Row) else _numbers(trials)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(jax.local_devices())

@@ -180,6 +180,22 @@ def test_the_error_names_what_was_found():
         lanes.vmap(jnp.multiply, (0, 1))(X, Y)
 
 
+@pytest.mark.parametrize(
+    ("directions", "said"),
+    [
+        ((None,), "directions must be of some of the 1 arguments, found 0"),
+        ((X[None], X[None]), "directions must be of some of the 1 arguments, found 2"),
+        ((X[0],), r"3 directions of \(3,\) in 5 trials cannot be of shape \(3,\)"),
+        ((X[None, :4],), r"1 directions of \(3,\) in 5 trials cannot be of shape \(1, 4, 3\)"),
+    ],
+    ids=["none", "of more", "without their axis", "in fewer trials"],
+)
+def test_directions_that_do_not_fit_raise(directions, said):
+    """A vector was taken for as many directions of a number, and slopes came out of it."""
+    with pytest.raises(ValueError, match=said):
+        lanes.jvp(lambda x: x**2)((X,), directions)
+
+
 # what it is for
 
 

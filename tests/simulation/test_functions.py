@@ -85,6 +85,8 @@ REFUSED = {
     "a scenario for parts": (lambda: ptsmc.simulate_jit(FLIGHT), "parts are needed, such as study"),
     "a scenario's gains": (lambda: API.gains_of(FLIGHT), "parts are needed, such as study"),
     "gains in a scenario": (lambda: API.with_gains(FLIGHT, {"eta": 3.0}), "parts are needed, such as study"),
+    "trials of a scenario": (lambda: API.run(FLIGHT, None, 0, [1]), "parts are needed, such as study"),
+    "parts in a file": (lambda: API.write(RUN, "never.toml"), "a scenario is needed, as read or from_tables"),
     "parts for a scenario": (lambda: API.simulate(RUN), "a scenario is needed, as read or from_tables return it"),
     "tables for a scenario": (lambda: API.study({}), "a scenario is needed, as read or from_tables return it"),
     "many gains at once": (
