@@ -63,7 +63,7 @@ class _Asked:
 
     def check(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> None:
         """Raise ScenarioError where this is no array, not finite, or of another shape."""
-        if not isinstance(value, jax.Array):
+        if not isinstance(value, jax.Array | np.ndarray):
             raise self.refused(method, f"{what} that is a {type(value).__name__}", f"an array of shape {shape}")
         got = np.asarray(value)
         if got.shape != shape:
