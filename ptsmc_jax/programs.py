@@ -31,7 +31,13 @@ from jax.experimental import serialize_executable
 from ptsmc_jax import configure
 
 KEPT = 400  # programs; those not used for longest make room
-QUICKLY = {"xla_backend_optimization_level": 0}  # for what runs for a moment: optimising would take longer
+# for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
+# compile in half the time besides, and run faster, at this level
+QUICKLY = {
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
 OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files
 PLAIN = (int, float, str, bool, bytes, type(None))
 
