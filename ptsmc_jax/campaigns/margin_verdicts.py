@@ -50,13 +50,28 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
     rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one, which
     is none of those that the trials' loops are linearised about.
     """
-    planned_loops = isinstance(rows, Row) and not rows.given.keys().isdisjoint({*OF_LOOPS, *OF_MISFITS})
-    loops_differ = planned_loops or differ(ready.dispersion)
-    if not (ready.margins and loops_differ) or rest.swing(ready.parts) is not None:
+    trials = _whose_loops_differ(ready, rows)
+    if trials is None or rest.swing(ready.parts) is not None:
         return of_loop(ready.parts, ready.margins)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
-    trials = np.arange(TRIALS) if rows is None else rows
     return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, trials, limits))
+
+
+def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
+    """Begin to compile what `over_trials` needs, beside what is being done."""
+    trials = _whose_loops_differ(ready, rows)
+    if trials is not None:
+        _look.prepare(ready.parts, ready.dispersion, jnp.uint32(0), _in_calls(trials))
+    elif ready.margins:
+        run_margins.judged_jit.prepare(ready.parts)
+
+
+def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
+    """The trials that margins are asked of; None: of the nominal loop, which is that of all, or none is asked for."""
+    planned_loops = isinstance(rows, Row) and not rows.given.keys().isdisjoint({*OF_LOOPS, *OF_MISFITS})
+    if not ready.margins or not (planned_loops or differ(ready.dispersion)):
+        return None
+    return np.arange(TRIALS, dtype=np.uint32) if rows is None else rows
 
 
 def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, Any]) -> list[Verdict]:
@@ -104,9 +119,7 @@ def worst(
     """
     trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
-    whole = -(-count // CALL) * CALL
-    padded = jax.tree.map(lambda v: jnp.asarray(np.resize(v, (whole, *v.shape[1:]))), trials)
-    looks = _look(parts, dispersion, jnp.uint32(seed), padded)
+    looks = _look(parts, dispersion, jnp.uint32(seed), _in_calls(trials))
     loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
     values = np.stack([rough[name] for name in names])  # (names, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
@@ -130,6 +143,15 @@ def worst(
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
         off = np.where(apart > off / 2.0, 2.0 * apart, off)
         values[:, chosen], unsure[:, chosen] = exact, False
+
+
+def _in_calls(trials: np.ndarray | Row) -> Any:
+    """The trials, and some of them again, as many as whole calls take."""
+
+    def padded(v: Any) -> Array:
+        return jnp.asarray(np.resize(v, (-(-v.shape[0] // CALL) * CALL, *v.shape[1:])))
+
+    return jax.tree.map(padded, trials)
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:

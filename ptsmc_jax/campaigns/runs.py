@@ -102,6 +102,12 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
 
 
+def prepare(ready: Study) -> None:
+    """Begin to compile what flies one run of such a study, beside what is being done."""
+    number = np.uint32(0)
+    rollout.simulate_jit.prepare(ready.parts, number, number, record=True, software=OURS)
+
+
 @programs.jit
 def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
     return planned.about(parts, dispersion, seed, trial).drawn

@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import explore, programs, scenario
-from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.campaigns import margin_verdicts, runs, store
+from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins, run_margins
 from tests.helpers import short
@@ -204,6 +204,38 @@ def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for
              for given in ((some, share) for some, bound, share in prepared if bound is bounds)]  # fmt: skip
     asked = (posed.problem.margins, bounds.share(posed.own))
     assert known == [(jax.tree.structure(asked), [programs._shape(leaf) for leaf in jax.tree.leaves(asked)])]
+
+
+class _AskedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("owner", "program", "prepare", "ask"),
+    [
+        (margin_verdicts, "_look", margin_verdicts.prepare, lambda ready: margin_verdicts.over_trials(ready, 3)),
+        (rollout, "simulate_jit", runs.prepare, lambda ready: runs.floor(ready, 3)),
+    ],
+    ids=["margins", "floor"],
+)
+def test_what_a_campaign_prepares_is_what_its_theory_asks_for(drawn, monkeypatch, owner, program, prepare, ask):
+    """As above."""
+    known = []
+
+    def heard(*given, **fixed):
+        known.append((jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)], fixed))
+
+    def called(*given, **fixed):
+        heard(*given, **fixed)
+        raise _AskedError
+
+    called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
+    monkeypatch.setattr(owner, program, called)
+    prepare(drawn.ready)
+    with pytest.raises(_AskedError):
+        ask(drawn.ready)
+    assert len(known) == 2
+    assert known[0] == known[1]
 
 
 FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains

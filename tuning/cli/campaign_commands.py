@@ -169,6 +169,7 @@ def _flown(
     """The campaign flown, its share of it; width: until every requirement's share is known to within it."""
     from tuning.studies import campaign_folder
 
+    campaign_folder.prepare_floor(folder)
     if width is None:
         campaign_folder.fly(folder, share, report, elsewhere)
     else:

@@ -21,6 +21,7 @@ from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.scenario import Study, own, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -310,16 +311,30 @@ def find_floor(folder: Folder) -> None:
 
     The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
     """
-    if "window_error" not in _theory(folder) or unjudged(folder):
+    if _lacks_theory(folder):
         ready, plan = folder.campaign.ready, folder.campaign.plan
-        first, looked_at = [], None
-        if plan is not None:
-            first = [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
-            looked_at = plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
-        verdicts = margin_verdicts.over_trials(ready, folder.seed, looked_at)
+        first = [] if plan is None else [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
+        verdicts = margin_verdicts.over_trials(ready, folder.seed, _looked_at(folder))
         floor = runs.floor(ready, folder.seed, first)
         theory = {"window_error": floor, "margins": [verdict.in_summary() for verdict in verdicts]}
         store.write_json(folder.path / FLOOR, theory)
+
+
+def prepare_floor(folder: Folder) -> None:
+    """Begin to compile what `find_floor` needs, beside flying."""
+    if _lacks_theory(folder):
+        margin_verdicts.prepare(folder.campaign.ready, _looked_at(folder))
+        runs.prepare(folder.campaign.ready)
+
+
+def _lacks_theory(folder: Folder) -> bool:
+    return "window_error" not in _theory(folder) or unjudged(folder)
+
+
+def _looked_at(folder: Folder) -> Row | None:
+    """The rows of a plan whose loops are looked at; None: there is none."""
+    plan = folder.campaign.plan
+    return None if plan is None else plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
 
 
 def floor_of(folder: Folder) -> float | None:
