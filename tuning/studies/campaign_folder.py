@@ -331,7 +331,7 @@ def _lacks_theory(folder: Folder) -> bool:
     return "window_error" not in _theory(folder) or unjudged(folder)
 
 
-def _looked_at(folder: Folder) -> Row | None:
+def _looked_at(folder: Folder) -> np.ndarray | Row | None:
     """The rows of a plan whose loops are looked at; None: there is none."""
     plan = folder.campaign.plan
     return None if plan is None else plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
