@@ -328,7 +328,7 @@ def prepare_floor(folder: Folder) -> None:
 
 
 def _lacks_theory(folder: Folder) -> bool:
-    return "window_error" not in _theory(folder) or unjudged(folder)
+    return "window_error" not in _theory(folder) or bool(unjudged(folder))
 
 
 def _looked_at(folder: Folder) -> np.ndarray | Row | None:
