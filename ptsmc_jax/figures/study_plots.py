@@ -84,8 +84,9 @@ def tuning_history(
     judged_goal, judged_gains = judged
     for ax, value in zip(axes, (judged_goal, *(judged_gains[name] for name in gains)), strict=True):
         ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="found, and judged on fresh trials")
-    axes[0].set(ylabel=goal, title="Tuning, all starts")
-    axes[0].legend(ncols=3, fontsize=9)
+    axes[0].set_ylabel(goal)
+    figure.suptitle("Tuning, all starts")
+    axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
     for ax, (name, (unit, courses)) in zip(axes[1:], gains.items(), strict=True):
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
         ax.set_ylabel(f"{name}\n[{unit}]")
