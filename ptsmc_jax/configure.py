@@ -1,6 +1,7 @@
 """JAX set up before its backend starts: the command and the notebooks call it, the library never does."""
 
 import hashlib
+import importlib.util
 import json
 import os
 import platform
@@ -13,18 +14,21 @@ from typing import Any, Literal
 
 # Compiler options for loops on a CPU, no stable interface. The first lets all outputs of a loop's body share their
 # common work, the second compiles the whole loop into one kernel, the third lets that kernel's loops over the trials
-# become vectors however many arrays they touch, the fourth lets the vectors be as wide as the processor's. The others
-# leave out what takes a quarter of compiling such a kernel, and does not make it faster.
-_OPTIONS = (
+# become vectors however many arrays they touch, the fourth lets the vectors be as wide as the processor's.
+_FASTER = (
     "xla_cpu_use_multi_output_fusion=true",
     "xla_cpu_small_while_loop_byte_threshold=100000000",
     "-vectorize-memory-check-threshold=100000",
     "--xla_cpu_prefer_vector_width=512",
+)
+# What takes a quarter of compiling such a kernel, and does not make it faster. A GPU's compiler would read these, too.
+_SOONER = (
     "-unroll-runtime=false",
     "-unroll-allow-partial=false",
     "-post-RA-scheduler=false",
     *(["-x86-machine-combiner=false"] if platform.machine() in ("x86_64", "AMD64") else []),
 )
+_OPTIONS = (*_FASTER, *_SOONER)
 
 
 def _flags(options: tuple[str, ...]) -> str:
@@ -79,7 +83,7 @@ def configure(
         raise ValueError(f"devices is {devices!r}, but must be a whole number from 1 on, or None for all cores")
     folder = None if cache is None else _cache_folder() if cache == "default" else Path(cache)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when jaxlib is loaded; what is fatal is still said
-    _set_compiler_options(fast, folder)
+    _set_compiler_options(fast, folder, device)
     global programs, _called
     _called = True
     programs = folder / "programs" if keep_programs and folder is not None else None
@@ -107,12 +111,12 @@ def configure(
             raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
 
 
-def _set_compiler_options(fast: bool, folder: Path | None) -> None:
+def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -> None:
     """XLA_FLAGS with our options or without; raises RuntimeError where JAX has already started with others."""
     global _added
     before = os.environ.get("XLA_FLAGS", "")
     flags = before.replace(_added, "").strip()
-    ours = _flags(_accepted(folder)) if fast and "xla_backend_extra_options" not in flags else ""
+    ours = _flags(_options(folder, device)) if fast and "xla_backend_extra_options" not in flags else ""
     wanted = f"{flags} {ours}".strip()
     if sorted(wanted.split()) == sorted(before.split()):
         return
@@ -180,6 +184,12 @@ def warn_if_forgotten() -> None:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _options(folder: Path | None, device: str | None) -> tuple[str, ...]:
+    """The options for what runs are flown on; None: what JAX finds, a GPU where a plug-in for one is installed."""
+    processor = device == "cpu" or (device is None and importlib.util.find_spec("jax_plugins") is None)
+    return tuple(option for option in _accepted(folder) if processor or option not in _SOONER)
 
 
 def _accepted(folder: Path | None) -> tuple[str, ...]:

@@ -83,6 +83,16 @@ def test_options_that_only_fail_together_are_all_left_out(monkeypatch):
         assert setup._accepted(None) == ()
 
 
+@pytest.mark.parametrize("found", [None, "a plug-in"])
+def test_what_makes_a_processors_programs_sooner_is_left_out_where_a_gpu_may_fly(tried, tmp_path, monkeypatch, found):
+    """Its compiler would unroll no loops either, of which nobody knows what they take there."""
+    monkeypatch.setattr(setup.importlib.util, "find_spec", lambda name: found)
+    assert setup._options(tmp_path, "cpu") == GOOD
+    assert setup._options(tmp_path, "gpu") == GOOD[:4]
+    assert setup._options(tmp_path, None) == (GOOD if found is None else GOOD[:4])
+    assert len(tried) == 1
+
+
 def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
     (tmp_path / "file").write_text("")
     assert setup._accepted(tmp_path / "file") == GOOD
