@@ -128,9 +128,9 @@ def known(eqn: Any) -> list | None:
     if eqn.primitive.name != "broadcast_in_dim" or not isinstance(eqn.invars[0], core.Literal):
         return None
     out = eqn.outvars[0].aval
-    if out.dtype == jax.dtypes.float0:  # of whole numbers and truths, which NumPy compares with nothing
-        return [np.zeros(out.shape, out.dtype)]
-    return [np.zeros(out.shape, out.dtype)] if eqn.invars[0].val == 0 and small(out.shape) else None
+    slopeless = out.dtype == jax.dtypes.float0  # of whole numbers and truths, which NumPy compares with nothing
+    zeros = slopeless or (eqn.invars[0].val == 0 and small(out.shape))
+    return [np.zeros(out.shape, out.dtype)] if zeros else None
 
 
 def apply(eqn: Any, values: Sequence, alike: "Alike", largest: int = LARGEST) -> list[Lane] | None:

@@ -71,7 +71,7 @@ def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarr
     planned_loops = isinstance(rows, Row) and not rows.given.keys().isdisjoint({*OF_LOOPS, *OF_MISFITS})
     if not ready.margins or not (planned_loops or differ(ready.dispersion)):
         return None
-    return np.arange(TRIALS, dtype=np.uint32) if rows is None else rows
+    return np.arange(TRIALS) if rows is None else rows
 
 
 def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, Any]) -> list[Verdict]:
@@ -117,7 +117,6 @@ def worst(
     also shows how large the error of the lines was: where it is more than half of `OFF`, twice as much is reckoned with
     from then on.
     """
-    trials = trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32)
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     looks = _look(parts, dispersion, jnp.uint32(seed), _in_calls(trials))
     loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
@@ -151,7 +150,7 @@ def _in_calls(trials: np.ndarray | Row) -> Any:
     def padded(v: Any) -> Array:
         return jnp.asarray(np.resize(v, (-(-v.shape[0] // CALL) * CALL, *v.shape[1:])))
 
-    return jax.tree.map(padded, trials)
+    return jax.tree.map(padded, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:

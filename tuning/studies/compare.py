@@ -160,10 +160,11 @@ def _is(table: Any, law: Mapping[str, str]) -> bool:
     """Whether the scenario's law is the one that is named; one of one's own by where it stands, links followed."""
     if table.kind != law["kind"] or table.kind != "own":
         return table.kind == law["kind"]
-    code = table.code
-    return isinstance(code, str) and all(
-        of(code) == of(law["code"]) for of in (systems.location, lambda where: where.rpartition(":")[2])
-    )
+
+    def place(code: str) -> tuple[Any, str]:
+        return systems.location(code), code.rpartition(":")[2]
+
+    return isinstance(table.code, str) and place(table.code) == place(law["code"])
 
 
 def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
