@@ -24,7 +24,7 @@ class Loop(Table, frozen=True):
     Attributes:
         mode: the law inside the integrator, or computed and held once a period
         period: control period, sampled loop only [s]
-        clock: a sample at t_f - delta, for tuning, or at whole periods, as a flight computer has them
+        clock: a sample at t_f - delta, as `tune` has where it moves either, or at whole periods, as a computer has
         t_end: end of the run; default: t_f + 10, or + window if that is longer [s]
         window: time after t_f over which window_error is taken; default: 1, or a control period if that is longer [s]
         settling_angle: angle to the reference that counts as settled; of other plants |x_1| [rad]

@@ -14,7 +14,7 @@ from tuning.output import search_sentences
 from tuning.search import trust, worst
 from tuning.search.descents import Step
 from tuning.search.objective import FAILED
-from tuning.studies import judging, tune_files, tuner
+from tuning.studies import judging, posing, tune_files, tuner
 
 LIMIT = 0.6  # of the peak torque
 
@@ -69,6 +69,17 @@ def test_progress_after_a_search_says_whether_it_kept_the_limits(monkeypatch):
         tuner.tune(loaded, 0, lambda *said, told=told: told.append(said), trusted=False, tries=1)
         (over,) = (said[4] for said in told if said[0] == "judging on fresh trials")
         assert (over == 0.0) is kept
+
+
+@pytest.mark.parametrize(("free", "anchored"), [(["eta", "delta"], True), (["eta", "t_f"], True), (["eta"], False)])
+def test_a_hand_over_that_moves_has_its_sample_whatever_clock_flies(free, anchored):
+    """On the flight clock, which `tuned.toml` has too, delta moved nothing, and its slopes were zero."""
+    bounds = {"eta": [2.6, 3.1], "delta": [0.1, 2.0], "t_f": [4.0, 6.0]}
+    tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": free, "bounds": {name: bounds[name] for name in free}}}
+    flown = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
+    posed = posing.pose(flown, 0)
+    assert posed.problem.parts.clock.anchored is anchored
+    assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else flown)
 
 
 def test_every_column_of_a_history_has_a_name_of_its_own():

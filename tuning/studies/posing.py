@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.scenario import Study, study, tables
+from ptsmc_jax.scenario import Study, replace, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
@@ -62,7 +62,7 @@ class Posed:
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
     """The tuning problem of a scenario; farther: see `reach`."""
-    table = scenario.search
+    scenario, table = as_trained(scenario), scenario.search
     ready = study(scenario, reach=reach(scenario, table, **farther))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
     asked = [r.implied_by for r in ready.requirements]
@@ -85,6 +85,15 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
     return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed)
+
+
+def as_trained(scenario: Scenario) -> Scenario:
+    """The scenario with a sample at the hand-over, where a gain moves it.
+
+    A flight computer hands over at its first sample not before t_f - delta: up to there delta moves nothing.
+    """
+    moved = scenario.sampled and any(name in gain_bounds.TIMES for name in gains.named(scenario))
+    return replace(scenario, loop__clock="anchored") if moved else scenario
 
 
 def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
