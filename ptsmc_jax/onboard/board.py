@@ -88,20 +88,10 @@ def shapes(tree: Any) -> Any:
 def board(parts: Parts) -> Board:
     """The flight computer of parts whose loop is sampled."""
     observer, law, device = parts.observer, parts.controller, parts.actuators
-    period = parts.period
-    parameters = {
-        "law": law,
-        "reference": parts.reference,
-        "observer": observer,
-        "observer_matrix": observer.update_matrix(period),
-        "bound": observer.error_bound(),
-        "filter": getattr(parts.sensors, "filter", None),
-        "actuators": device,
-        "period": period,
-    }
+    parameters = known(parts)
     computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
     if parameters["filter"] is not None:
-        _filter_parameters(computer, parts.sensors, period)
+        _filter_parameters(computer, parts.sensors, parts.period)
     computer.about["period"] = "of the control loop [s]"
     computer.about["observer_matrix"] = _said(type(observer).update_matrix)
     if not computer.spacecraft:
@@ -118,12 +108,31 @@ def board(parts: Parts) -> Board:
     return computer
 
 
+def known(parts: Parts) -> dict[str, Any]:
+    """All that the flight computer of these parts computes with [SI units], by name: of a trial what it is told."""
+    observer, sensors, period = parts.observer, parts.sensors, parts.period
+    parameters = {
+        "law": parts.controller,
+        "reference": parts.reference,
+        "observer": observer,
+        "observer_matrix": observer.update_matrix(period),
+        "bound": observer.error_bound(),
+        "filter": getattr(sensors, "filter", None),
+        "actuators": parts.actuators,
+        "period": period,
+    }
+    if parameters["filter"] is not None:  # what its gains follow from
+        parameters["filter_bandwidth"] = sensors.bandwidth(period)
+        if sensors.own_times is not None:
+            parameters["star_tracker_interval"] = sensors.own_times.interval
+    return parameters
+
+
 def _filter_parameters(computer: Board, sensors: Any, period: Any) -> None:
-    """What the filter's gains follow from."""
+    """The filter's bandwidth as a short number, and what is said of what its gains follow from."""
     computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
     computer.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
     if sensors.own_times is not None:
-        computer.parameters["star_tracker_interval"] = sensors.own_times.interval
         computer.about["star_tracker_interval"] = "between its samples [s]"
 
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.devices.actuators import ActuatorState
-from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
+from ptsmc_jax.onboard.parameters import named
 from ptsmc_jax.onboard.templates import STATUS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
@@ -159,6 +160,10 @@ class InTheLoop:
                 f"loop.period is {period:g} s, but must be {library.period:g} s, that of the controller in "
                 f"{library.folder}"
             )
+        columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
+        firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
+        # of the parameters that C has, by their paths: the first column
+        self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
 
     @property
     def software(self) -> Software:
@@ -202,18 +207,12 @@ class InTheLoop:
         return decision, Computer((sensing, after), seen, memory["observer"], memory["law"], computer.applied)
 
     def _told(self, parts: Parts) -> Any:
-        """The parameters (columns,) that a trial draws and tells its flight computer; NaN of those of the folder."""
-        columns = self.library.columns["params"]
-        told = jnp.full(len(columns), jnp.nan)
-        for part, key, first in (
-            ("reference", "q", "reference_q[0]"),
-            ("actuators", "torque_limit", "actuators_torque_limit"),
-        ):
-            drawn, nominal = (getattr(getattr(of, part), key, None) for of in (parts, self.nominal))
-            if drawn is not None and first in columns:
-                at = columns.index(first)
-                value = jnp.where(jnp.any(drawn != nominal), jnp.ravel(drawn), jnp.nan)
-                told = told.at[at : at + drawn.size].set(value)
+        """The parameters (columns,) that a trial gives its flight computer otherwise; NaN of those of the folder."""
+        told = jnp.full(len(self.library.columns["params"]), jnp.nan)
+        drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(known(of))) for of in (parts, self.nominal))
+        for path, at in self._columns.items():
+            value = jnp.where(jnp.any(drawn[path] != nominal[path]), jnp.ravel(drawn[path]), jnp.nan)
+            told = told.at[at : at + value.size].set(value)
         return told
 
     def _stepped(self, state: Any, given: Any, told: Any) -> tuple[Any, Any]:

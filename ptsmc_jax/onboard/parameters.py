@@ -76,7 +76,7 @@ def nodes_of(pool: Pool, text: str, made: Field, places: dict[str, str], pointer
 
 def parameters(board: Board) -> Parameters:
     """The parameters of a flight computer, and which of them C derives."""
-    made = _fields(board)
+    made = named(board)
     for rule in board.rules:
         _follow(made, rule)
     return made
@@ -85,7 +85,8 @@ def parameters(board: Board) -> Parameters:
 COMPUTED = ("bound", "observer_matrix")  # what is shared with these has the other's name
 
 
-def _fields(board: Board) -> Parameters:
+def named(board: Board) -> Parameters:
+    """The parameters of a flight computer by their names, of which none is derived yet."""
     found: dict[int, Field] = {}
     listed = jax.tree_util.tree_flatten_with_path(board.parameters)[0]
     leaves = [leaf for _, leaf in listed]

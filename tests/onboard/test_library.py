@@ -1,13 +1,18 @@
 """The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
 
 import shutil
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs, store
+from ptsmc_jax.devices.attitude_filter import filter_gains
+from ptsmc_jax.dispersions.base import plant_of
+from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.library import InTheLoop, Library
@@ -215,18 +220,40 @@ def test_limits_are_told(exported):
     assert np.max(np.abs(run.log.u)) <= 3.0
 
 
+@pytree
+@dataclass(frozen=True)
+class Measured(ptsmc.Draw):
+    """A body that is weighed before each flight, whose computer is given the inertia and gains to match."""
+
+    def at(self, c, parts):
+        """The parts with what was measured."""
+        factor = 1.0 + 0.05 * c[0]
+        parts = parts.with_inertia(factor * plant_of(parts).inertia)
+        law = replace(parts.controller, eta=factor * parts.controller.eta)
+        observer = replace(parts.observer, gain=parts.observer.gain / factor)
+        sensors = parts.sensors
+        if sensors.filter is not None:
+            gains = filter_gains(0.5 * factor, parts.period)
+            known = replace(sensors.filter, attitude_gain=gains[0], bias_gain=gains[1])
+            sensors = replace(sensors, filter=known)
+        return replace(parts, controller=law, observer=observer, sensors=sensors)
+
+
 @needs_compiler
-def test_what_a_trial_draws_and_its_computer_knows_is_told(exported):
-    """Its reference and its torque limit: C flew to the nominal ones, and was judged by those drawn."""
-    _, library = exported("delay, limit, quantised")
-    drawn = {"reference": {"kind": "normal", "std_deg": 20.0}, "torque_limit": {"kind": "relative_normal", "std": 0.2}}
-    tables = {**FLIGHTS["delay, limit, quantised"], "dispersion": drawn}
-    ready = scenario.study(folder.flown(scenario.from_tables(tables)))
+@pytest.mark.parametrize("name", short(["delay, limit, quantised", "filter"], ["delay, limit, quantised"]))
+def test_what_a_trial_draws_and_its_computer_knows_is_told(name, exported):
+    """Its reference, its limit, what an own draw gives law, observer and filter: C flew with the nominal ones."""
+    _, library = exported(name)
+    drawn = {"reference": {"kind": "normal", "std_deg": 20.0}}
+    if name != "filter":
+        drawn["torque_limit"] = {"kind": "relative_normal", "std": 0.2}
+    ready = scenario.study(folder.flown(scenario.from_tables({**FLIGHTS[name], "dispersion": drawn})))
+    ready = replace(ready, dispersion=replace(ready.dispersion, own=Measured()))
     ours = runs.fly(ready, 3, 2)
     theirs = runs.fly(ready, 3, 2, InTheLoop(library, ready.parts).software)
-    assert library.statuses["saturated"] > 0
-    for name in ("window_error", "peak_torque", "peak_torque_delivered"):
-        np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-9, err_msg=name)
+    assert library.statuses["saturated"] > 0 or name == "filter"
+    for metric in ("window_error", "peak_torque", "peak_torque_delivered"):
+        np.testing.assert_allclose(theirs.metrics[metric], ours.metrics[metric], rtol=1e-9, err_msg=metric)
 
 
 @needs_compiler
