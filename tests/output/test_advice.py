@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.cli import campaign_commands
 from tuning.output import search_sentences, sentences
@@ -28,6 +29,39 @@ def test_what_to_change_is_said_with_the_numbers():
     assert "fail or lack it" in lost
     assert not list(search_sentences.advice(summary(0.9)))
     assert not list(search_sentences.advice(summary(1.1, searched=1.2)))  # the search says that it found none
+
+
+@pytest.mark.parametrize(
+    ("metric", "limit", "worst", "said"),
+    [
+        ("gain_margin", 6.0, 5.2, "break it, the worst with 5.2 dB: tune with requirements.gain_margin = 6.94"),
+        ("modulus_margin", 6.0, 7.5, "break it, the worst with 7.5 dB: tune with requirements.modulus_margin = 4.71"),
+        ("phase_margin", 30.0, 0.0, "break it, some with none left: tune with a stricter requirements.phase_margin, "
+         "or draw less in [dispersion]"),
+    ],
+)  # fmt: skip
+def test_margins_that_fresh_loops_break_are_told_with_what_to_do(metric, limit, worst, said):
+    """Of 256 loops 38 broke what was asked, and nothing was advised: the search looks at the hardest two."""
+    asked = Requirement(metric, limit, at_least=metric != "modulus_margin", unit=MARGINS[metric].unit)
+    values = np.full(256, worst)
+    values[38:] = limit
+    verdict = asked.verdict(values, np.ones(256, bool)).in_summary()
+    unknown = {"window_error": None}
+    found = {"verdicts": [verdict], "training": unknown, "fresh": unknown}
+    (line,) = search_sentences.advice({**found, "search": {"largest_over_limit": {metric: 0.99}}})
+    assert line == f"{metric}: kept by the loops that the search looked at, but 38 of 256 fresh ones {said}"
+    verdict["trials"] = 1  # the nominal loop alone: the trust in it says why
+    assert not list(search_sentences.advice({**found, "search": {"largest_over_limit": {metric: 0.99}}}))
+
+
+def test_margins_are_shares_of_their_limits_in_words_too():
+    """How near a limit is come to was told as how many times it is reached: 4.8 dB of 6 as 1.2 times."""
+    reached = summary(1.0)
+    reached["search"] |= {"largest_over_limit": {"gain_margin": 1.2}, "earlier": [
+        {"margin": 0.03, "over": {"gain_margin": 1.1}, "fresh_seed": 7}]}  # fmt: skip
+    none, on = search_sentences.search(reached)
+    assert none.endswith("gain_margin reaches 0.8 times its limit on the training trials")
+    assert on.startswith("gains that kept every limit in the search reached 0.9 times the limit of gain_margin on")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 
+from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import margin_sentences
 from tuning.output.cells import Summary, lost, valued
 
@@ -41,7 +42,9 @@ def _went_on(record: Summary) -> Iterator[str]:
     earlier = record.get("earlier", [])
     next_margins = [*(search["margin"] for search in earlier[1:]), record.get("margin", 0.0)]
     for search, margin in zip(earlier, next_margins, strict=False):
-        over = " and ".join(f"{ratio:.4g} times the limit of {metric}" for metric, ratio in search["over"].items())
+        over = " and ".join(
+            f"{_of_limit(metric, ratio):.4g} times the limit of {metric}" for metric, ratio in search["over"].items()
+        )
         yield (
             f"gains that kept every limit in the search reached {over} on fresh trials (seed {search['fresh_seed']}): "
             f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
@@ -84,12 +87,17 @@ def _how_far(summary: Summary, metric: str, ratio: float | None) -> str:
     """How far the training trials are beyond a limit, or how many of them do not arrive, in words."""
     if ratio is not None and math.isfinite(ratio):
         limit = next((f", {v['limit']:g} {v['unit']}," for v in summary["verdicts"] if v["metric"] == metric), "")
-        return f"{metric} reaches {ratio:.3g} times its limit{limit} on the training trials"
+        return f"{metric} reaches {_of_limit(metric, ratio):.3g} times its limit{limit} on the training trials"
     training = summary.get("training", {})
     bad, ended = lost(training.get("counts", {}))
     if not bad:
         return f"a training trial has no {metric}"
     return f"{bad} of {training['trials']} training trials do not arrive ({ended}), and so keep no limit"
+
+
+def _of_limit(metric: str, over: float) -> float:
+    """A metric's value as a share of its limit, from how near it comes, see `requirements.over`."""
+    return 2.0 - over if metric in MARGINS and MARGINS[metric].at_least else over
 
 
 def advice(summary: Summary) -> Iterator[str]:
@@ -99,9 +107,11 @@ def advice(summary: Summary) -> Iterator[str]:
     for verdict in summary["verdicts"]:
         searched, over = record["largest_over_limit"].get(verdict["metric"]), verdict["margin"]
         kept_in_search = searched is not None and searched <= 1.0
-        if verdict["met"] or not kept_in_search or verdict.get("at_least") or not verdict["limit"]:
+        if verdict["met"] or not kept_in_search or not verdict["limit"]:
             continue
-        if over is None or not math.isfinite(over):
+        if verdict["metric"] in MARGINS:
+            yield from _of_loops(verdict)
+        elif over is None or not math.isfinite(over):
             yield f"{verdict['metric']}: kept in the search, but fresh trials fail or lack it: tune with {larger}"
         else:
             limit = f"{verdict['limit'] / (1.02 * over):.3g}"
@@ -115,6 +125,21 @@ def advice(summary: Summary) -> Iterator[str]:
             "fresh trials are less accurate than training ones by more than chance explains: the gains fit those too "
             f"closely; tune with {larger}"
         )
+
+
+def _of_loops(verdict: Summary) -> Iterator[str]:
+    """What to change where a margin is kept by the loops that a search looked at, and not by all that are judged."""
+    name, worst, limit, over = (verdict[key] for key in ("metric", "worst", "limit", "margin"))
+    if verdict["trials"] == 1:  # it is said of the tuned gains why
+        return
+    many = f"{verdict['failures']} of {verdict['trials']}"
+    broken = f"{name}: kept by the loops that the search looked at, but {many} fresh ones break it"
+    if over is None or not math.isfinite(over) or worst == 0.0:
+        yield f"{broken}, some with none left: tune with a stricter requirements.{name}, or draw less in [dispersion]"
+        return
+    farther = 1.02 * over
+    stricter = f"{limit * farther if verdict['at_least'] else limit / farther:.3g}"
+    yield f"{broken}, the worst with {worst:.3g} {verdict['unit']}: tune with requirements.{name} = {stricter}"
 
 
 def trust(summary: Summary) -> Iterator[str]:
