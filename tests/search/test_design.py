@@ -7,6 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ticks_of, vector
 from tuning.search import design
 from tuning.search.gains import with_gains
@@ -34,7 +35,7 @@ def largest(tables, t_f, trials):
 @pytest.mark.long
 def test_shortest_time_is_where_flown_trials_cross_the_limit():
     limit, trials = 0.6, 32
-    found = design.shortest_time(scenario.from_tables(FLOWN), limit, 4, np.arange(trials))
+    found = design.shortest_time(scenario.from_tables(FLOWN), Requirement("peak_torque", limit), 4, np.arange(trials))
     assert found.theory is not None
     assert found.simulated is not None
     assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance and noise: 1e-3 and 1 % of 0.6 N m
@@ -51,14 +52,14 @@ def test_shortest_time_from_rest_is_the_rule():
         "disturbance": {"kind": "none"},
         "initial": {"rotvec_deg": [0, 0, 90]},
     }
-    found = design.shortest_time(scenario.from_tables(tables), 0.25, 0, np.arange(1))
+    found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 0.25), 0, np.arange(1))
     rule = 4.0 * np.sqrt(2 * 14.0 * np.tan(np.pi / 4) / 0.25)
     assert found.theory == pytest.approx(rule, rel=2e-3)
     assert found.simulated == pytest.approx(rule, rel=2e-3)
 
 
 def test_a_limit_below_the_disturbance_cannot_be_kept():
-    found = design.shortest_time(scenario.from_tables({}), 0.009, 0, np.arange(1))
+    found = design.shortest_time(scenario.from_tables({}), Requirement("peak_torque", 0.009), 0, np.arange(1))
     assert (found.theory, found.simulated) == (None, None)
     assert str(found) == "no t_f up to 100 times the scenario's keeps peak_torque below 0.009 with the tuned gains"
 
@@ -71,12 +72,34 @@ def test_the_sentence_says_what_simulation_found():
 
 def test_shortest_time_of_a_chain():
     chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
-    found = design.shortest_time(chain, 5.0, 0, np.arange(1))
+    found = design.shortest_time(chain, Requirement("peak_torque", 5.0), 0, np.arange(1))
     assert found.theory is not None
     assert found.simulated == pytest.approx(found.theory, rel=5e-3)  # the disturbance is 0.01 of 5
     ready = scenario.study(scenario.replace(chain, controller__t_f=found.simulated))
     run = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(1))
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("confidence", "least"), [(None, 6), (0.5, 7)])
+def test_a_limit_on_a_share_of_the_trials_is_kept_by_that_share(confidence, least):
+    """It was the shortest t_f at which every trial keeps it."""
+    tables = {
+        "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+        "controller": {"t_f": 5.0, "delta": 0.5},
+        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.0},
+        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.5, 0.1]}},
+    }
+    trials, asked = np.arange(8), Requirement("peak_torque", 2.0, quantile=0.75, confidence=confidence)
+    found = design.shortest_time(scenario.from_tables(tables), asked, 4, trials)
+    ready = scenario.study(scenario.from_tables(tables))
+    assert found.simulated is not None
+    for factor, shown in ((1.0, True), (0.995, False)):
+        parts = with_gains(ready.parts, {"t_f": factor * found.simulated})
+        peaks = montecarlo.run(parts, ready.dispersion, 4, trials).metrics.peak_torque
+        assert asked.verdict(peaks, np.ones(8, bool)).met == shown
+        assert (np.sum(peaks <= 2.0) >= least) == shown
+    assert found.theory == pytest.approx(found.simulated, rel=0.05)
+    assert "peak_torque below 2 in 75 % of trials from t_f" in str(found)
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
@@ -127,7 +150,7 @@ SPINNING = {
 @pytest.mark.parametrize(("limit", "flown"), [(5.0, True), (0.14, False)])
 def test_a_reference_that_the_law_cannot_follow_for_longer_costs_only_the_flown_time(limit, flown):
     """The time after t_f stays what it was; where the law cannot follow for t_f itself, theory is left."""
-    found = design.shortest_time(scenario.from_tables(SPINNING), limit, 0, np.arange(1))
+    found = design.shortest_time(scenario.from_tables(SPINNING), Requirement("peak_torque", limit), 0, np.arange(1))
     assert found.theory is not None
     assert (found.theory < 20.0) == flown
     assert (found.simulated is not None) == flown

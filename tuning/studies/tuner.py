@@ -218,10 +218,10 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
     """The shortest t_f that the limit on the torque would allow; None without one, or where t_f itself is tuned."""
-    limit = judging.limit_of("peak_torque", judged.scenario)
-    if limit is None or T_F in posed.problem.names or not judged.scenario.controller.prescribed:
+    asked = next((one for one in posed.ready.requirements if one.metric == "peak_torque"), None)
+    if asked is None or T_F in posed.problem.names or not judged.scenario.controller.prescribed:
         return None
-    return shortest_time(judged.scenario, limit, judged.seed, judged.trials.trial)
+    return shortest_time(judged.scenario, asked, judged.seed, judged.trials.trial)
 
 
 def _trust(posed: Posed, judged: _Judged) -> Trust:
