@@ -84,8 +84,18 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
 
 def forget(folder: Path) -> None:
     """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's."""
-    for path in (folder / SUMMARY, *(path for made in MADE_OF_RESULTS for path in folder.glob(made))):
+    made = (path for pattern in MADE_OF_RESULTS for path in folder.glob(pattern))
+    for path in (folder / SUMMARY, *made, *_of_laws(folder)):
         path.unlink(missing_ok=True)
+
+
+def _of_laws(folder: Path) -> list[Path]:
+    """The scenarios of the laws of a comparison, which its summary names: others beside them may be a user's own."""
+    try:
+        laws = json.loads((folder / SUMMARY).read_text())["laws"]
+        return [path for path in folder.glob("scenarios/*.toml") if path.stem in laws]
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+        return []
 
 
 def _alike(new: Path, old: Path) -> bool:

@@ -75,6 +75,20 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
     assert moved[-1] == "summary.json"
 
 
+@pytest.mark.parametrize("laws", ['{"pd": {}, "../other": {}, "prescribed_time": {}}', "5", None])
+def test_scenarios_of_laws_that_are_compared_no_more_go_and_a_users_own_stay(tmp_path, laws):
+    """They would be flown as laws of the comparison that is there; a folder of projects has a `scenarios` too."""
+    out = tmp_path / "out"
+    for name in ("scenarios/pd.toml", "scenarios/prescribed_time.toml", "scenarios/mine.toml", "other.toml"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("kept")
+    (out / "summary.json").write_text("{}" if laws is None else f'{{"laws": {laws}}}')
+    store.begin(out, {}, TOLD, fresh=True)
+    stay = {"mine"} if laws and "pd" in laws else {"mine", "pd", "prescribed_time"}
+    assert {path.stem for path in (out / "scenarios").iterdir()} == stay
+    assert (out / "other.toml").exists()
+
+
 def test_check_refuses_files_and_full_folders(tmp_path):
     store.check(tmp_path / "new", force=False)
     store.check(tmp_path, force=False)  # empty
