@@ -102,6 +102,17 @@ def test_laws_of_ones_own_with_one_name_are_all_compared():
     assert len({law.get("code") for law in named.values()}) == 5
 
 
+def test_a_law_of_ones_own_is_one_however_it_is_written(tmp_path, monkeypatch):
+    """`./mine.py:Mine` began a comparison anew that `mine.py:Mine` had begun, and both were two laws."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("")
+    ways = ("mine.py:Mine", "./mine.py:Mine", f"{tmp_path}/mine.py:Mine")
+    base = scenario.from_tables(TABLES)
+    known = [compare.identity(base, 0, compare.Rivals((), (way,))) for way in ways]
+    assert known[0] == known[1] == known[2] == compare.identity(base, 0, compare.Rivals((), ways))
+    assert list(compare.Rivals((), ways).named) == ["prescribed_time", "Mine"]
+
+
 def test_a_baselines_own_scenario_keeps_its_own_bounds():
     own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller={"kind": "pd", "t_f": 5.0, "k_p": 2.0})
     own = scenario.replace(own, tune={"free": ["k_d"], "bounds": {"k_d": [0.5, 3.0]}, "trials": 8})

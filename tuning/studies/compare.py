@@ -113,15 +113,20 @@ class Rivals:
         """The law of the table [controller] of each, the paper's first, by what it is called."""
         kinds = laws() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
-        for where in dict.fromkeys(self.own):
-            place, _, name = where.rpartition(":")
-            code = f"{os.path.realpath(place)}:{name}" if place.endswith(".py") else where
-            tables[_free_name(name, tables)] = {"kind": "own", "code": code}
+        for code in self._codes:
+            tables[_free_name(code.rpartition(":")[2], tables)] = {"kind": "own", "code": code}
         return tables
+
+    @property
+    def _codes(self) -> list[str]:
+        """Where the laws of one's own stand, links followed: each once, in however many ways it is written."""
+        split = (where.rpartition(":") for where in self.own)
+        codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in split)
+        return list(dict.fromkeys(codes))
 
     def identity(self) -> dict[str, Any]:
         """What `versions.json` knows these rivals by; nothing where they are all the kinds that there are."""
-        digests = {where: systems.digest(where) for where in self.own}
+        digests = {code: systems.digest(code) for code in self._codes}
         return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
 
 
