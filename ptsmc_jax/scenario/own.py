@@ -163,7 +163,7 @@ def _with_keys(table: Any, found: Any) -> Any:
                 raise ValueError(f"the name of its gain {field.name} stands for one of another part")
             if table.prefix + field.name == "observer_gain":
                 raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
-            gains[table.prefix + field.name] = _bounds(field.name, gain)
+            gains[table.prefix + field.name] = _bounds(gain, f"gain {field.name} of the class {found.__name__}")
             _inside(field, gain.usual)
     summary = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
     return msgspec.defstruct(
@@ -229,10 +229,11 @@ def _inside(field: dataclasses.Field, usual: Any) -> None:
         )
 
 
-def _bounds(name: str, gain: Any) -> GainBounds:
+def _bounds(gain: Any, called: str) -> GainBounds:
+    """The bounds of a gain as its class has them; called: which gain of which class that is."""
     usual = gain.usual
     if usual is None:
-        raise ValueError(f"the gain {name} has no bounds; allowed is ptsmc_jax.gain(.., usual=(lower, upper))")
+        raise ValueError(f"the {called} has no bounds; allowed is ptsmc_jax.gain(.., usual=(lower, upper))")
     bounds_of: Callable = usual if callable(usual) else lambda t_f, period: usual
 
     def interval(choice: Choice) -> tuple[float, float]:
@@ -240,12 +241,13 @@ def _bounds(name: str, gain: Any) -> GainBounds:
             low, high = (float(v) for v in bounds_of(choice.t_f, choice.scenario.loop.period))
         except Exception as error:
             said = f"{type(error).__name__}: {error}"
-            raise ScenarioError(f"the usual bounds of controller.{name} fail: {said}") from None
-        if not (gain.above <= low < high <= gain.below and math.isfinite(high)):
-            between = f"between {gain.above:g} and {gain.below:g}"
+            raise ScenarioError(f"the usual bounds of the {called} fail: {said}") from None
+        if not gain.above < low < high < gain.below:
+            limits = (("above", gain.above), ("below", gain.below))
+            allowed = " and".join(f" {word} {limit:g}" for word, limit in limits if math.isfinite(limit))
             raise ScenarioError(
-                f"the usual bounds of controller.{name} are [{low:g}, {high:g}], but must be two numbers {between}, "
-                "the lower one first"
+                f"the usual bounds of the {called} are [{low:g}, {high:g}], but must be two numbers{allowed}, the "
+                "lower one first"
             )
         return low, high
 

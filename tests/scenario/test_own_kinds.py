@@ -269,14 +269,18 @@ BAD = [
         changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
         "acceleration needs the value", "jax.numpy in place of numpy and float()",
     ),
-    (changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {}, "the gain eta has no bounds", "usual=(lower, upper)"),
+    (changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {}, "the gain eta of the class Mine has no bounds", "usual=(lower, upper)"),
     (
         changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},
-        "the usual bounds of controller.eta are [6, 2.1]", "lower one first",
+        "the usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first",
+    ),
+    (  # they were told as tune.bounds.eta, which nobody had written
+        changed("(2.1, 6.0)", "(2.0, 6.0)"), {"tune": {}},
+        "the usual bounds of the gain eta of the class Mine are [2, 6]", "two numbers above 2, the lower one first",
     ),
     (
         changed("lambda t_f, h: (1.0 / t_f, 0.5 / h)", "lambda t_f: 1.0"), {"tune": {}},
-        "bounds of controller.k1 fail", "TypeError",
+        "the usual bounds of the gain k1 of the class Mine fail", "TypeError",
     ),
     (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number above 2"),
     (changed("(2.1, 6.0)", "(3.1, 6.0)"), {}, "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
