@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_bounds import rounded, size
 
 RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
@@ -24,12 +25,19 @@ class Bounds(NamedTuple):
 
 
 def of(scenario: Any) -> tuple[float, float] | None:
-    """K and c of a scenario's disturbance; None: it is one's own, and its code was not run."""
-    inputs, found = scenario.inputs, [term.bounds(scenario) for term in scenario.terms]
-    if any(one is None or one.size.shape != (inputs,) for one in found):  # of another length: `checks` refuses it
-        return None
-    largest = sum((one.size for one in found), np.zeros(inputs)) + _drawn_bias(scenario)
-    fastest = sum((one.rate for one in found), np.zeros(inputs))
+    """K and c of a scenario's disturbance; None: it is one's own, and its code was not run.
+
+    Raises ScenarioError where they are beyond all numbers.
+    """
+    inputs = scenario.inputs
+    with np.errstate(over="ignore"):
+        found = [term.bounds(scenario) for term in scenario.terms]
+        if any(one is None or one.size.shape != (inputs,) for one in found):  # of another length: `checks` refuses it
+            return None
+        largest = sum((one.size for one in found), np.zeros(inputs)) + _drawn_bias(scenario)
+        fastest = sum((one.rate for one in found), np.zeros(inputs))
+    if not np.all(np.isfinite([largest, fastest])):
+        raise ScenarioError("disturbance is larger or faster than any number; allowed are smaller numbers in it")
     return rounded(float(np.max(largest))), rounded(float(np.max(fastest)))
 
 
@@ -84,7 +92,7 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     drawn = getattr(scenario.dispersion, "inertia", None)
     off = 0.0 if drawn is None else SIGMAS * drawn.std
     apart = moments[2] * (1.0 + off) - moments[0] * (1.0 - off)
-    most = 3.0 * orbit_rate**2 * apart
+    most = 3.0 * orbit_rate * orbit_rate * apart
     return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
 
 

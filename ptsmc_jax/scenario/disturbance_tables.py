@@ -21,7 +21,6 @@ from ptsmc_jax.scenario.values import (
     Kind,
     Kinds,
     Number,
-    Positive,
     Three,
     ThreeNotNegative,
 )
@@ -142,7 +141,7 @@ class GravityGradient(Attitude, DisturbanceTable, frozen=True):
     """
 
     kind: Literal["gravity_gradient"] = "gravity_gradient"
-    orbit_rate: Positive = 1.1e-3
+    orbit_rate: Annotated[float, Meta(gt=0, le=1, description="a number greater than 0 and at most 1")] = 1.1e-3
     phase: Number = 0.0
 
     def check(self, name: str) -> None:

@@ -345,6 +345,13 @@ BAD = [
         "a list of 1 number",
     ),
     ("disturbance = { kind = 'gravity_gradient', orbit_rate = 0 }", "disturbance.orbit_rate is 0", "greater than 0"),
+    # its bounds overflowed, and so did those of others, with a warning of NumPy's
+    ("disturbance = { kind = 'gravity_gradient', orbit_rate = 1e155 }", "disturbance.orbit_rate is 1e", "at most 1"),
+    (
+        "disturbance = { amplitude = [1e200, 0, 0], frequency = [1e200, 0, 0] }",
+        "disturbance is larger or faster than any number",
+        "smaller numbers in it",
+    ),
     (
         "disturbance = { kind = 'gravity_gradient', mrp = [0, 0, 0], rotvec_deg = [0, 0, 0] }",
         "keys rotvec_deg and mrp",

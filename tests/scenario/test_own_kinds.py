@@ -269,7 +269,10 @@ BAD = [
         changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
         "acceleration needs the value", "jax.numpy in place of numpy and float()",
     ),
-    (changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {}, "the gain eta of the class Mine has no bounds", "usual=(lower, upper)"),
+    (
+        changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {},
+        "the gain eta of the class Mine has no bounds", "usual=(lower, upper)",
+    ),
     (
         changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},
         "the usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first",
