@@ -30,6 +30,11 @@ class Plant(ABC):
         """How many inputs m there are."""
         return self.inertia.shape[-1]
 
+    @property
+    def states(self) -> int | None:
+        """How many numbers its state has; None: it is no single array."""
+        return None
+
     @abstractmethod
     def velocity(self, x: Any) -> Float[Array, " m"]:
         """The velocity w of a state; of a state's derivative, w'."""

@@ -31,6 +31,11 @@ class Chain(Plant):
 
     inertia_inverse = inertia
 
+    @property
+    def states(self) -> int:
+        """The order n."""
+        return self.order
+
     def drift(self, x: Float[Array, " n"]) -> Float[Array, "1"]:
         """f(x), (1,)."""
         return jnp.zeros(1) if self.f is None else jnp.reshape(self.f(x), 1)

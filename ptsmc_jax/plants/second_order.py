@@ -31,6 +31,11 @@ class System(Plant):
     inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
     inertia_inverse: Leaf  # (n, n)
 
+    @property
+    def states(self) -> int:
+        """The length of x_1 and x_2 together."""
+        return 2 * self.inputs
+
     def split(self, x: Float[Array, " twice"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """x_1 and x_2."""
         n = self.inputs
@@ -126,6 +131,11 @@ class HiddenSystem(System):
 
     Z: Any  # -> (k,)
     z0: Leaf  # (k,)
+
+    @property
+    def states(self) -> int:
+        """The length of x_1, x_2 and z together."""
+        return 2 * self.inputs + self.z0.shape[-1]
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
         """H."""

@@ -75,6 +75,8 @@ def _check(parts: Parts) -> None:
     check_parts(parts)
     for name, size in (("q", 4), ("w", 3)) if parts.plant.attitude else ():
         _check_shape(f"initial.{name}", getattr(parts.initial, name, None), [(size,)])
+    if parts.plant.states is not None:
+        _check_shape("initial", parts.initial, [(parts.plant.states,)])
     if not callable(parts.disturbance):
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
     value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))

@@ -14,6 +14,7 @@ import pytest
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants import system
 from ptsmc_jax.signals.disturbances import Sinusoid
 from ptsmc_jax.signals.references import Fixed, Spin
 from ptsmc_jax.simulation import catalogues
@@ -63,6 +64,9 @@ def test_a_reference_may_return_a_list():
 
 
 RUN = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
+CHAIN = chain_parts([1.0, 0.0])
+LATE = system(1, lambda t, p, v: v, lambda t, p, v, z: z, lambda t, p, v: jnp.zeros((1, 1)),
+              Z=lambda t, p, v, z, u: u - z, z0=[0.0])  # fmt: skip
 FLIGHT = scenario.from_tables({})
 API: Any = ptsmc  # whose types say already what does not fit
 REFUSED = {
@@ -73,6 +77,14 @@ REFUSED = {
     "a list among the parts": (
         lambda: ptsmc.simulate_jit(replace(RUN, initial=RUN.initial._replace(q=[0.0, 0.0, 0.0, 1.0]))),
         r"initial.q must be an array \(4,\), but is of type list",
+    ),
+    "a start with more states than a chain has": (
+        lambda: ptsmc.simulate_jit(replace(CHAIN, initial=jnp.zeros(3))),
+        r"initial must be an array \(2,\), but is one of shape \(3,\)",
+    ),
+    "a start of a system without its hidden states": (
+        lambda: ptsmc.simulate_jit(replace(CHAIN, plant=LATE)),
+        r"initial must be an array \(3,\), but is one of shape \(2,\)",
     ),
     "a disturbance of another shape": (
         lambda: ptsmc.simulate_jit(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
