@@ -195,15 +195,18 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
         parameters: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any,
         tracking: Any, t: Any, *aged: Any,
     ) -> dict[str, Any]:  # fmt: skip
-        attitude_filter, measured, one = parameters["filter"], _unit(star), jnp.ones_like(dt)
+        attitude_filter, one = parameters["filter"], jnp.ones_like(dt)
+        measured = _unit(jnp.where(valid != 0, star, before))  # where there is none, whatever stands there is not read
         start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
         old = Estimate(start, bias)
         if aged:
-            age = jnp.clip(aged[0], 0.0, dt)
             estimate = jax.lax.cond(
                 valid != 0,
-                lambda: attitude_filter.correct_between(old, gyro_before, gyro, dt, measured, age, one),
-                lambda: attitude_filter.propagate(old, gyro_before, gyro, dt),
+                lambda age: attitude_filter.correct_between(
+                    old, gyro_before, gyro, dt, measured, jnp.clip(age, 0.0, dt), one
+                ),
+                lambda _: attitude_filter.propagate(old, gyro_before, gyro, dt),
+                aged[0],
             )
         else:
             ahead = attitude_filter.propagate(old, gyro_before, gyro, dt)

@@ -211,21 +211,16 @@ def _checks(code: Code, about: About) -> list[str]:
     required = [field for field in reals if field.name not in of_star]
     aged = any(field.name == "attitude_age" for field in reals)
     if about.spacecraft:
+        known = "in->attitude_valid == 0 ? state->attitude : " if about.filtered else ""
         lines += [
-            "    const real *const q = in->attitude;", "    const real *const w = in->rate;",
+            f"    const real *const q = {known}in->attitude;",
+            "    const real *const w = in->rate;",
             "    const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];",
             "    const real turn = (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) * p->period * p->period; /* [rad^2] */",
             "    const int rotation = isfinite(square) && square > R(0.25) && square < R(4);",
         ]  # fmt: skip
-        if about.filtered:
-            lines += [
-                "    const real *const known = state->attitude;",
-                "    const int aligned = known[0] * known[0] + known[1] * known[1] + known[2] * known[2] +",
-                "        known[3] * known[3] > R(0.25);",
-                f"    const int told = rotation{' && isfinite(in->attitude_age)' if aged else ''};",
-                "    const int attitude = in->attitude_valid != 0 ? told : aligned;",
-            ]
-        turned = ["attitude" if about.filtered else "rotation", "turn < R(1)"]
+        told = ["(in->attitude_valid == 0 || isfinite(in->attitude_age))"] if aged else []
+        turned = ["rotation", *told, "turn < R(1)"]
     else:
         turned = []
     terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)",

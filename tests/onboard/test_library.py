@@ -143,6 +143,42 @@ def test_a_star_tracker_without_an_attitude_is_not_missed(filtered):
     assert np.all(np.isfinite(outputs))
 
 
+# NumPy clears the flags, so that they are read at once
+WATCHED = """
+#include <fenv.h>
+void ptsmc_many(long, const double *, const double *, const double *, double *, double *, int *);
+void watched(long, const double *, const double *, const double *, double *, double *, int *);
+int raised(void);
+static int flags;
+void watched(long count, const double *p, const double *x, const double *in, double *after, double *out, int *status)
+{
+    feclearexcept(FE_ALL_EXCEPT);
+    ptsmc_many(count, p, x, in, after, out, status);
+    flags |= fetestexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
+}
+int raised(void) { return flags; }
+"""
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["filter", "star tracker out of step"])
+@pytest.mark.parametrize("attitude", [0.0, np.nan, 1e300])
+def test_an_attitude_that_is_not_there_is_not_computed_with(name, attitude, exported, tmp_path):
+    """Processors may trap: it was normalised, 0 / 0 of a tracker that says zeros, and what came of it was left."""
+    (tmp_path / "watched.c").write_text(WATCHED)
+    made, plain = exported(name)
+    library = Library(plain.folder, options=(str(tmp_path / "watched.c"),))
+    setattr(library._made, "ptsmc_many", library._made.watched)  # noqa: B010
+    samples, names = given(made), names_of(made.board)["in"]
+    samples[10, names.index("attitude_valid")] = 0.0
+    for column in [column for column in names if column.startswith("attitude[")] + ["attitude_age"]:
+        if column in names:
+            samples[10, names.index(column)] = attitude
+    statuses, _ = flown(library, samples)
+    assert library._made.raised() == 0
+    assert not statuses.any()
+
+
 @needs_compiler
 def test_the_age_of_an_attitude_is_one_of_the_period_or_is_refused(exported):
     """Of a star tracker with times of its own: what is no age is bad input where there is an attitude."""
