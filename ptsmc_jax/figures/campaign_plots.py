@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.simulation.catalogues import CATALOGUES, percent
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
 # flown to the end, but beyond a limit: of a requirement on shares of time, which may hold all the same, or on trials
@@ -44,8 +44,8 @@ class Column(NamedTuple):
         """The limit, and how many trials keep it."""
         limit, within = f"limit {self.limit:g} {self.unit}".rstrip(" -"), np.mean(self.values <= self.limit)
         if not self.of_time:
-            return f"{limit}: {100 * within:.6g} % within"
-        return f"{limit}: {100 * within:.6g} % of the trials within at all times\n{self.of_time}"
+            return f"{limit}: {percent(float(within))} % within"
+        return f"{limit}: {percent(float(within))} % of the trials within at all times\n{self.of_time}"
 
 
 def fan(

@@ -114,3 +114,14 @@ MARGINS = {
 def units(kind: str) -> dict[str, str]:
     """The unit of each metric of this kind of plant."""
     return {name: entry.unit for name, entry in CATALOGUES[kind].items()}
+
+
+def percent(share: float) -> str:
+    """A share in per cent, in three digits of it or of what is left to 100 %: how near that is, is what is asked.
+
+    >>> percent(59 / 60), percent(0.99973), percent(1.0), percent(0.000412), percent(0.5)
+    ('98.33', '99.973', '100', '0.0412', '50')
+    """
+    nearest = 100.0 * min(share, 1.0 - share)
+    decimals = min(2 - math.floor(math.log10(nearest)), 8) if nearest > 0.0 else 1
+    return f"{100.0 * share:.{decimals}f}".rstrip("0").rstrip(".")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.simulation.catalogues import CATALOGUE, WITHIN
+from ptsmc_jax.simulation.catalogues import CATALOGUE, WITHIN, percent
 
 
 def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
@@ -114,10 +114,10 @@ class Verdict:
         met = "met" if self.met else "NOT met"
         if self.interpretation == "temporal":
             beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
-            return f"{wanted}: the least of a run is {100 * share:.6g} %: {met}{beyond}"
-        seen = f"{100 * share:.6g} %"
+            return f"{wanted}: the least of a run is {percent(share)} %: {met}{beyond}"
+        seen = f"{percent(share)} %"
         if self.confidence is not None and self.shown is not None:
-            seen += f", at least {100 * self.shown:.6g} % at {100 * self.confidence:g} % confidence"
+            seen += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
         return f"{wanted}: {seen}: {met}"
 
     def _of_trials(self) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 from ptsmc_jax.campaigns import campaign
 from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation.catalogues import percent
 from tests.output.pages import checked
 from tuning.output import pointing_sentences
 
@@ -68,9 +69,9 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert [row[:7] for row in table.rows] == [
         ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
          pointing_sentences.angle(ensemble["margin"] * 0.02)),
-        ("APE", "half-cone", "2063 arcsec", "50 %", "mixed", "90 %", f"{100 * mixed['shown']:.6g} % of the time"),
+        ("APE", "half-cone", "2063 arcsec", "50 %", "mixed", "90 %", f"{percent(mixed['shown'])} % of the time"),
         ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "none asked",
-         f"{100 * temporal['shown']:.6g} % of the time"),
+         f"{percent(temporal['shown'])} % of the time"),
     ]  # fmt: skip
     assert [row[9] for row in table.rows] == ["22", "4", "every run flown"]  # 0.9^22 <= 0.1
 

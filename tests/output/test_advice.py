@@ -100,6 +100,18 @@ def tuned(times, counts, *, met=True, **more):
     return {"fresh": group, "training": group, "accuracy_gain_over_paper": times, "verdicts": [verdict], **more}
 
 
+def test_shares_are_told_in_digits_that_say_something():
+    """59 of 60 trials were 98.3333 %; near all of them it is what is missing that counts."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.95)
+    verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool)).in_summary()
+    more = {"share": 59 / 60, "share_interval": [0.91056, 0.99957], "share_bound": 0.92333}
+    said = sentences.verdict({**verdict, **more})
+    assert "98.33 % of trials keep the limit (95 %: 91.06 to 99.957 %)" in said
+    wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")
+    seen = wide.verdict(np.ones(3), np.ones(3, bool), np.array([1.0, 0.95, 1.0]))
+    assert str(seen).endswith("98.33 %: met")
+
+
 def test_less_accurate_gains_are_not_praised():
     """The interval of a ratio turns over with it: from 0.05..0.1 to 10..20."""
     less = tuned(0.08, {"ok": 64}, paper_is="paper, scaled", accuracy_gain_interval=[0.05, 0.1])
@@ -162,7 +174,7 @@ def test_a_command_that_actuators_cut_is_said_where_nothing_was_required_of_it(m
     summary["fresh"] |= {"saturated": {"mean": 0.0059, "max": most}}
     lines = list(sentences.accuracy(summary))
     assert len(lines) == said
-    assert all("for 0.59 % of a fresh trial on average and 6.3 % at most" in line for line in lines)
+    assert all("for 0.59 % of a fresh trial on average and 6.33 % at most" in line for line in lines)
 
 
 @pytest.mark.parametrize(("without", "largest"), [(1, "57.2"), (2, "none")])

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 
-from ptsmc_jax.simulation.catalogues import AXES, INDICES
+from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
 from tuning.output.cells import Summary, Table
 
 USUAL = (0.9, 0.95)  # confidences that reviews ask for
@@ -86,7 +86,7 @@ def _row(verdict: Summary) -> tuple[str, ...]:
     if kind == "ensemble":
         shown = angle(None if margin is None else margin * verdict["limit"])
     else:
-        shown = f"{100 * verdict['shown']:.6g} % of the time"
+        shown = f"{percent(verdict['shown'])} % of the time"
     return (
         INDICES[index].partition(",")[0],
         "half-cone" if axis == "boresight" else axis,

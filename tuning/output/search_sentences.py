@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 
-from ptsmc_jax.simulation.catalogues import MARGINS
+from ptsmc_jax.simulation.catalogues import MARGINS, percent
 from tuning.output import margin_sentences
 from tuning.output.cells import Summary, lost, valued
 
@@ -23,7 +23,7 @@ def search(summary: Summary) -> Iterator[str]:
         yield (
             f"{count['metric']} {'confirmed' if count['held'] else 'NOT confirmed'} on {count['trials']} trials that "
             f"the search did not see: {count['beyond']} beyond the limit, {most}; the verdict on fresh trials is met "
-            f"with a probability of {100 * count['probability']:.3g} %"
+            f"with a probability of {percent(count['probability'])} %"
         )
     if record.get("hardest") is not None:
         yield _worst_case(record["hardest"], tuned_for=record.get("worst_case", False))

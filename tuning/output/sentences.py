@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
+from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, percent
 from tuning.output import pointing_sentences
 from tuning.output.cells import Summary, Table, digits, lost, valued
 
@@ -20,9 +20,9 @@ def verdict(entry: Summary) -> str:
     if entry.get("share_of_time") is not None or "share_interval" not in entry:
         return text
     low, high = entry["share_interval"]
-    text += f"; {100 * entry['share']:.6g} % of trials keep the limit (95 %: {100 * low:.6g} to {100 * high:.6g} %)"
+    text += f"; {percent(entry['share'])} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
     if entry["quantile"] is not None and entry["confidence"] is not None:
-        text += f", at least {100 * entry['share_bound']:.6g} % at {100 * entry['confidence']:g} % one-sided confidence"
+        text += f", at least {percent(entry['share_bound'])} % at {100 * entry['confidence']:g} % one-sided confidence"
         if entry["share"] > entry["quantile"]:
             so_many = "so many failures" if entry["failures"] else "no failure"
             text += f"; with {so_many} {entry['fewest_trials']} trials would do"
@@ -154,7 +154,7 @@ def accuracy(summary: Summary) -> Iterator[str]:
     yield from paper_refused(summary)
     cut = fresh.get("saturated")
     if cut and cut["max"]:
-        often = f"{100 * cut['mean']:.2g} % of a fresh trial on average and {100 * cut['max']:.2g} % at most"
+        often = f"{percent(cut['mean'])} % of a fresh trial on average and {percent(cut['max'])} % at most"
         yield f"limits of the actuators cut the command of the tuned gains, for {often}"
     trained, fresh = summary["training"]["window_error"], fresh["window_error"]
     before = summary.get("before")

@@ -19,6 +19,7 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, floor_of, margins_of, unjudged
@@ -380,7 +381,7 @@ def _of_time(verdict: Verdict) -> str:
         return ""
     asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
     least = "at least " if verdict.interpretation == "temporal" else ""
-    return f"{asked}; seen: {least}{100 * verdict.share_of_time:.6g} %"
+    return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
 
 
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:
