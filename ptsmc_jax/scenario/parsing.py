@@ -215,6 +215,13 @@ def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
     return f"known are {', '.join(form.format(one) for one in known)}"
 
 
+def like(name: str, known: Iterable[str], all_of_them: str) -> str:
+    """Of too many known names to list, those most like one, and where all of them are, in words."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
+    return f"the nearest of {len(known)} known ones are {', '.join(close)}; {all_of_them}"
+
+
 def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: bool = False) -> Table:
     if not isinstance(kinds, Mapping):
         return _fields(name, raw, kinds)

@@ -266,7 +266,10 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
     code, _, error = command("replay", FOLDER, "--trial", 250)
     assert (code, "--trial is 250, but must be a whole number from 0 to 249" in error) == (2, True)
     code, _, error = command("worst", FOLDER, "--by", "peek_torque")
-    assert (code, "nearest known one is peak_torque" in error) == (2, True)
+    assert (code, "known ones are peak_torque, " in error) == (2, True)
+    code, _, error = command("worst", FOLDER, "--by", "xyz")  # all columns were listed where none is like it
+    assert (code, "worst.csv, which ptsmc worst writes without --by, has all of them" in error) == (2, True)
+    assert error.count(",") < 8
 
 
 def test_a_replay_that_differs_from_its_row_is_told(command, flown):

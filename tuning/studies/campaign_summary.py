@@ -228,7 +228,8 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     names = list(pl.read_parquet_schema(parts[0].path))
     allowed = [name for name in names if name not in (plans.TRIAL, *plans.HEADING, *plans.OF_ROWS.values())]
     if by not in allowed:
-        raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.nearest(by, allowed)}")
+        listed = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"
+        raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.like(by, allowed, listed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
     failed = ~flying.finished(frame)
     chosen = _most_extreme(by, frame[by].fill_null(float("nan")).to_numpy(), failed, count)
