@@ -103,7 +103,7 @@ HOUSE = {
         "studies": """
             campaign_folder judging mapping reproduction single stability table
             campaign_summary posing
-            tuner
+            reasons tuner
             compare pareto tune_files
             slew_times
             fronts

@@ -57,6 +57,7 @@ class Quantity(NamedTuple):
     checked: Checked = lambda rows: rows  # numbers (rows, n) of a plan -> as they are flown; raises UnfitError
     check_with: Callable[[Given, Parts], None] = lambda given, parts: None  # raises it where others forbid them
     unit: str | tuple[str, ...] = "-"  # a spacecraft's, of all its numbers or of each
+    categories: tuple[str, ...] = ()  # columns that say which of several things: of such numbers none is more
 
 
 def of_field(

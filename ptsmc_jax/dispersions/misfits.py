@@ -112,7 +112,7 @@ def _check_coupling(given: Given, parts: Parts) -> None:
 
 
 _OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
-_FAILURE = ["wheel_failure_time", "wheel_failure_wheel"]
+_FAILURE = ("wheel_failure_time", "wheel_failure_wheel")
 OF_MISFITS: dict[str, Quantity] = {
     "actuator_scale": Quantity(
         lambda parts: numbered("actuator_scale_", _size(parts)),
@@ -141,11 +141,12 @@ OF_MISFITS: dict[str, Quantity] = {
         "s",
     )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else _OUTAGE),
     "wheel_failure": Quantity(
-        lambda parts: [] if parts.effective_actuators.wheels is None else _FAILURE,
+        lambda parts: [] if parts.effective_actuators.wheels is None else list(_FAILURE),
         _failure,
         _with_failure,
         check_with=_check_wheel,
         unit=("s", "-"),
+        categories=_FAILURE[1:],
     ),
     "timing_jitter": Quantity(
         lambda parts: ["timing_jitter"] if parts.clock.sampled else [],

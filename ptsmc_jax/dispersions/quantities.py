@@ -158,6 +158,10 @@ QUANTITIES: dict[str, Quantity] = {
 }
 
 
+# columns that say which of several things, such as the number of a wheel
+CATEGORIES = tuple(column for quantity in QUANTITIES.values() for column in quantity.categories)
+
+
 def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
     """The numbers of these quantities by their columns, [rad], [rad/s], [kg m^2] or [N m]: `write` of them = parts."""
     by_column = {}

@@ -1,7 +1,7 @@
 """Statistics of a campaign: shares and quantiles with intervals, and which inputs drive a metric."""
 
 import bisect
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -107,8 +107,11 @@ def value_at(ordered: np.ndarray, quantile: float) -> float:
 
 
 def drivers(
-    inputs: Mapping[str, np.ndarray], metric: np.ndarray, ranked: dict[str, tuple] | None = None
-) -> dict[str, dict[str, float]]:
+    inputs: Mapping[str, np.ndarray],
+    metric: np.ndarray,
+    ranked: dict[str, tuple] | None = None,
+    categories: Collection[str] = (),
+) -> dict[str, dict[str, float | None]]:
     """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
 
     The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
@@ -120,6 +123,8 @@ def drivers(
             its quaternion, the first one speaks for all.
         metric: (trials,).
         ranked: what the inputs are ranked to, kept here for other metrics of the same trials.
+        categories: names of inputs that say which of several things. They have no rank, and instead of bins their
+            trials with the same number.
 
     Returns:
         {"rank_correlation", "first_order"} by the input's name; empty where the metric or every input has one value.
@@ -131,6 +136,10 @@ def drivers(
     for name, values in inputs.items():
         if np.ptp(values) == 0.0:
             continue
+        if name in categories:
+            bins = [metric_ranks[values == one] for one in np.unique(values)]
+            effects[name] = {"rank_correlation": None, "first_order": _first_order(bins, metric.size)}
+            continue
         if name not in ranked:
             ranks = _ranks(values)
             duplicate = any(abs(np.mean(ranks * other)) > SAME_INPUT for other, _ in filter(None, ranked.values()))
@@ -139,13 +148,18 @@ def drivers(
             continue
         ranks, order = ranked[name]
         bins = np.array_split(metric_ranks[order], SOBOL_BINS)
-        between = sum(part.size * part.mean() ** 2 for part in bins) / metric.size
-        by_chance = (SOBOL_BINS - 1) / (metric.size - SOBOL_BINS) * (1.0 - between)
         effects[name] = {
             "rank_correlation": float(np.mean(ranks * metric_ranks)),
-            "first_order": max(0.0, float(between - by_chance)),
+            "first_order": _first_order(bins, metric.size),
         }
     return effects
+
+
+def _first_order(bins: Sequence[np.ndarray], count: int) -> float:
+    """The share of the variance of `count` ranks that is one of the means over bins, less what chance would show."""
+    between = sum(part.size * part.mean() ** 2 for part in bins) / count
+    by_chance = (len(bins) - 1) / max(1, count - len(bins)) * (1.0 - between)
+    return max(0.0, float(between - by_chance))
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:

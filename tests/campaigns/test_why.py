@@ -8,9 +8,10 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
-from tuning.output import campaign_terminal
-from tuning.studies import campaign_summary
+from tuning.output import campaign_terminal, sentences
+from tuning.studies import campaign_summary, reasons
 
 
 class Rows:
@@ -35,11 +36,11 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     })  # fmt: skip
     monkeypatch.setattr(campaign_summary.pl, "read_parquet_schema", lambda path: dict(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
-    why: Any = inspect.unwrap(campaign_summary.why)  # which would refuse these rows by their type
+    why: Any = inspect.unwrap(reasons.why)  # which would refuse these rows by their type
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 says what the angle does
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
-                       "unit": "rad", "percentile": 100.0, "median": 1.0,
+                       "unit": "rad", "percentile": 100.0, "median": 1.0, "share": None,
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05)}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
@@ -51,4 +52,21 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
     campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
     assert "goes with nothing that was drawn" in capsys.readouterr().out
+    # of the number of a wheel none is more: what fails is one of four, here the second, whose number is no middle
+    wheel = np.arange(401) % 4 + 1.0
+    table = table.with_columns(peak_torque=(wheel == 2.0) + 1e-3 * rate, wheel_failure_wheel=wheel)
+    told = why(Rows(), ["peak_torque"], 1)
+    (one,) = [row for row in told if row["input"] == "wheel_failure_wheel"]
+    assert (one["percentile"], one["median"], one["share"]) == (None, None, pytest.approx(100 / 401))
+    assert one["rank_correlation"] is None
+    assert one["first_order"] > 0.5
+    campaign_terminal.why(told, "spacecraft")
+    assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in capsys.readouterr().out
+    drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
+                                                 table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
+    (said,) = sentences.campaign_drivers({"verdicts": [{"metric": "peak_torque"}], "drivers": drivers})
+    assert ", wheel_failure_wheel (56 %): rank correlation" in said
+    table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")  # of one that failed: what is unusual in it
+    assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]

@@ -221,7 +221,7 @@ def worst(
     _configured(folder)
     from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
-    from tuning.studies import campaign_folder, campaign_summary
+    from tuning.studies import campaign_folder, campaign_summary, reasons
 
     opened = campaign_folder.opened(folder)
     frame = campaign_summary.worst(opened, by, n)
@@ -229,7 +229,7 @@ def worst(
     inputs = []
     if why:
         required = [requirement.metric for requirement in scenarios.requirements(opened.scenario)]
-        inputs = campaign_summary.why(opened, list(dict.fromkeys((by, *required))), n)
+        inputs = reasons.why(opened, list(dict.fromkeys((by, *required))), n)
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
         campaign_terminal.worst(frame, by, folder, opened.scenario.plant.kind, own_code=bool(opened.programs))

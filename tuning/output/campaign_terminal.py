@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.catalogues import percent
 from tuning.output import pointing_sentences, sentences, terminal
 from tuning.output.cells import Table
 from tuning.output.progress_lines import Bar
@@ -92,7 +93,7 @@ def why(inputs: list[dict[str, Any]], kind: str) -> None:
     """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
-    inputs: rows as `campaign_summary.why` makes them; kind: of the plant.
+    inputs: rows as `reasons.why` makes them; kind: of the plant.
     """
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
@@ -101,14 +102,23 @@ def why(inputs: list[dict[str, Any]], kind: str) -> None:
         if with_share and math.isfinite(value):
             rows = sorted((row for row in with_share if _explained(row) >= COUNTS), key=_explained, reverse=True)
         else:
-            rows.sort(key=lambda row: -abs(row["percentile"] - 50.0))
-        texts = [
-            f"{row['input']} {_of(row['drawn'], row['unit'])} at {row['percentile']:.1f} % (median {row['median']:.3g})"
-            for row in rows[:4]
-        ]
+            rows.sort(key=_unusual, reverse=True)
+        texts = [f"{row['input']} {_of(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
         unit = catalogues.units(kind).get(metric, "")  # of one of one's own none is known
         terminal.say(f"{metric} {_of(value, unit)} in trial {trial}: {', '.join(texts) or nothing}")
+
+
+def _among(row: dict[str, Any]) -> str:
+    """Where an input of a trial stands among those of all trials, in words."""
+    if row["share"] is not None:
+        return f"as in {percent(row['share'])} % of the trials"
+    return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
+
+
+def _unusual(row: dict[str, Any]) -> float:
+    """How far an input is from the middle of all trials, or how few of them have the same, 50 at most."""
+    return 50.0 * (1.0 - row["share"]) if row["share"] is not None else abs(row["percentile"] - 50.0)
 
 
 def _of(value: float, unit: str) -> str:
@@ -118,7 +128,7 @@ def _of(value: float, unit: str) -> str:
 
 def _explained(row: dict[str, Any]) -> float:
     """The share of its metric's variance that an input explains."""
-    return max(row["first_order"], row["rank_correlation"] ** 2)
+    return max(row["first_order"], (row["rank_correlation"] or 0.0) ** 2)
 
 
 COUNTS = 0.05  # of a metric's variance, that an input explains at least to be named as a reason

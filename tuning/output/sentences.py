@@ -377,11 +377,12 @@ def campaign_drivers(summary: Summary) -> Iterator[str]:
     """What drives the error and the metrics of the requirements."""
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
         drivers = summary["drivers"].get(name, {})
-        strength = {key: max(map(abs, driver.values())) for key, driver in drivers.items()}
+        strength = {key: max(abs(v) for v in driver.values() if v is not None) for key, driver in drivers.items()}
         strongest = sorted((key for key in drivers if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
         if strongest:
-            shown = ((key, drivers[key]["rank_correlation"], drivers[key]["first_order"]) for key in strongest)
-            texts = (f"{key} {rank:+.2f} ({100 * share:.0f} %)" for key, rank, share in shown)
+            ranks = {key: drivers[key]["rank_correlation"] for key in strongest}  # None of a number of a wheel, say
+            each = {key: key if rank is None else f"{key} {rank:+.2f}" for key, rank in ranks.items()}
+            texts = (f"{text} ({100 * drivers[key]['first_order']:.0f} %)" for key, text in each.items())
             yield f"{name} hangs on {', '.join(texts)}: rank correlation (share of its variance)"
 
 

@@ -14,6 +14,7 @@ from ptsmc_jax.campaigns import campaign as flying
 from ptsmc_jax.campaigns import plans, rows, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions import quantities
+from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
@@ -98,7 +99,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     ]
     quantiles, drivers = {}, {}
     ranks: dict[bytes, dict[str, tuple]] = {}  # of the inputs, by the trials that they are ranked among
-    drawn = _drawn(folder, parts)
+    drawn = drawn_columns(folder, parts)
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
     for name in (*scenario.catalogue(folder.scenario), *folder.own_names):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
@@ -106,7 +107,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         known = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
         of = {key: inputs[key].to_numpy()[known] for key in drawn}
         ranked = ranks.setdefault(known.tobytes(), {})
-        drivers[name] = statistics.drivers(of, values[:SEARCHED][known], ranked) if known.sum() > 1 else {}
+        drivers[name] = statistics.drivers(of, values[:SEARCHED][known], ranked, CATEGORIES) if known.sum() > 1 else {}
     done = int(head.height)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
@@ -129,7 +130,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     }
 
 
-def _drawn(folder: Folder, parts: list[rows.Part]) -> list[str]:
+def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     """The columns that say what trials flew with: those from the initial angle on, but for metrics of one's own."""
     names = list(pl.read_parquet_schema(parts[0].path))
     return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
@@ -232,49 +233,14 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
         raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.like(by, allowed, listed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
     failed = ~flying.finished(frame)
-    chosen = _most_extreme(by, frame[by].fill_null(float("nan")).to_numpy(), failed, count)
+    chosen = most_extreme(by, frame[by].fill_null(float("nan")).to_numpy(), failed, count)
     return rows.read(parts).head(folder.trials)[chosen]
 
 
-def _most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
+def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
+    """Indices of the worst of trials (trials,) by a metric, failed ones first; see `statistics.most_extreme`."""
     better = metric in catalogues.LARGER_IS_BETTER
     return statistics.most_extreme(values, failed, count, larger_is_better=better)
-
-
-def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
-    """What was drawn in the worst trials by each metric: each input as a percentile of all trials, and their median.
-
-    Failed trials first, as in `worst`; of inputs that rank the trials alike only the first. Beside each stands how the
-    metric goes with it over all trials that end, see `statistics.drivers`; None where so few trials do not show it.
-    """
-    parts, unit_of = folder.whole_parts(), units(folder)
-    drawn = _drawn(folder, parts)
-    frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
-    inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
-    distinct = statistics.distinct({name: values for name, values in inputs.items() if np.ptp(values) > 0.0})
-    failed = ~flying.finished(frame)
-    explained: list[dict[str, Any]] = []
-    for metric in metrics:
-        values = frame[metric].fill_null(float("nan")).to_numpy()
-        known = np.isfinite(values) & ~failed
-        of = {name: inputs[name][known] for name in distinct}
-        drivers = statistics.drivers(of, values[known]) if known.any() else {}
-        for at in _most_extreme(metric, values, failed, count):
-            explained += [
-                {
-                    "metric": metric,
-                    "trial": int(frame["trial"][int(at)]),
-                    "value": float(values[at]),
-                    "input": name,
-                    "drawn": float(inputs[name][at]),
-                    "unit": unit_of.get(name, ""),
-                    "percentile": statistics.percentile(inputs[name], float(inputs[name][at])),
-                    "median": float(np.median(inputs[name])),
-                    **drivers.get(name, {"rank_correlation": None, "first_order": None}),
-                }
-                for name in distinct
-            ]
-    return explained
 
 
 @dataclass(frozen=True)
