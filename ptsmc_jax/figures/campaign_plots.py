@@ -61,7 +61,8 @@ def fan(
         kind: of the plant.
     """
     unit = CATALOGUES[kind]["terminal_error"].unit
-    figure, axes = figure_of(f"Error of {len(errors)} trials, median in white", f"2-norm of the error [{unit}]")
+    trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
+    figure, axes = figure_of(f"Error of {trials}, median in white", f"2-norm of the error [{unit}]")
     for share, grey in BANDS:
         low, high = np.percentile(errors, [50.0 - share / 2, 50.0 + share / 2], axis=0)
         axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{share:g} % of the trials")
@@ -137,9 +138,9 @@ def torque_by_angle(
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     finished = torque[np.isin(outcome, FLOWN) & np.isfinite(torque)]
     if finished.size and finished.min() > 0.0:
-        top = max(finished.max(), limit or 0.0)
+        shown = [*finished, limit] if limit else finished
         logarithmic(axes, "y")
-        axes.set_ylim(finished.min() / 1.3, top * 1.5)
+        axes.set_ylim(min(shown) / 1.3, max(shown) * 1.5)
     axes.legend(fontsize=9)
     return figure
 

@@ -14,16 +14,19 @@ from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
 
-FAR_OFF = 3.0  # times what is drawn, from which on a limit is not drawn
+FAR_OFF = 3.0  # times what is drawn, from which on a limit, or a command that is not delivered, is not drawn
+SMALLEST = 1e-16  # of errors and s that are shown
 EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact motion is drawn, and a bound
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
-    figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), "torque": torque(parts, log, limit)}
-    if parts.controller.prescribed:
-        figures["convergence"] = convergence(parts, log)
+    figures = {"torque": torque(parts, log, limit)}
+    if np.any(log.error):  # else there is nothing that log axes show
+        figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), **figures}
+        if parts.controller.prescribed and any(map(np.any, solutions.exact_sizes(parts, log.t[:1]))):
+            figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
@@ -59,7 +62,7 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
     symbol, _, _ = _names(parts)
     figure, axes = figure_of("Error", symbol)
     size = np.linalg.norm(log.error, axis=1)
-    axes.semilogy(log.t, np.maximum(size, 1e-16), color=STYLES[0][0], label="flown")
+    axes.semilogy(log.t, _positive(size), color=STYLES[0][0], label="flown")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, envelopes.error_bound(parts, before), **BOUND)
@@ -68,6 +71,7 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
         axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="floor: no controller beats it")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
+    _above_smallest(axes)
     _mark(axes, parts)
     axes.legend()
     return figure
@@ -87,15 +91,21 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     _, ylabel, unit = _names(parts)
     figure, axes = figure_of(title or ("Control torque" if unit else "Control"), ylabel)
     _components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
+    reach = FAR_OFF * np.nanmax(np.abs(log.u)) or np.inf  # what is asked for beyond it would make the curves flat
     if parts.controller.prescribed:
         t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
         axes.plot(t, u, **EXACT)
         axes.plot([], [], **EXACT, label="exact, perfect estimate")
+        if np.nanmax(np.abs(u)) > reach:
+            axes.set_ylim(-reach, reach)
     row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
     peak = log.commanded[row, column]
     of = "peak" if np.array_equal(log.u, log.commanded) else "peak of the command"  # which then lies off the curves
     label = f"{of} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
-    axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
+    if abs(peak) > reach:
+        axes.plot([], [], color="none", label=f"{label}, beyond this axis")
+    else:
+        axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
         _limit(axes, limit, unit)
     _mark(axes, parts)
@@ -130,11 +140,12 @@ def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, un
 def sliding(parts: Parts, log: Log) -> Figure:
     """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
     figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
-    _components(axes, log.t, np.maximum(np.abs(log.s), 1e-16), "s")
+    _components(axes, log.t, _positive(np.abs(log.s)), "s")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND)
     axes.set_yscale("log")
+    _above_smallest(axes)
     _mark(axes, parts)
     axes.legend()
     return figure
@@ -164,8 +175,9 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
     guides = [(above, eta, "$\\eta$", 6)]
     if n > 2:
         guides.append((float(np.interp(-span[0], -tau, np.minimum(*exact))) / 30.0, eta + n - 2, "$\\eta+n-2$", -14))
-    for start, slope, name, shift in guides:
+    for start, slope, name, shift in guides if span[1] < span[0] else ():
         line = start * (span / span[0]) ** slope
+        bottom = min(bottom, line[1])
         axes.loglog(span, line, color="black", lw=1.0)
         axes.annotate(f"slope {name} = {slope:g}", (np.sqrt(span[0] * span[1]), np.sqrt(line[0] * line[1])),
                       fontsize=10, xytext=(6, shift), textcoords="offset points",
@@ -232,6 +244,17 @@ def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwar
         width = {"lw": 0.8} if k >= len(STYLES) else {}
         label = f"${symbol}_{{{k + 1}}}$"
         axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **kwargs)
+
+
+def _positive(sizes: np.ndarray) -> np.ndarray:
+    """Sizes as a log axis shows them: none where they are 0."""
+    return np.where(sizes > 0.0, sizes, np.nan)
+
+
+def _above_smallest(axes: Axes) -> None:
+    """What is below `SMALLEST`, of whatever is drawn, leaves the axis."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
 
 
 def _limit(axes: Axes, limit: float, unit: str) -> None:

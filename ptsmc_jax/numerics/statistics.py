@@ -155,6 +155,18 @@ def drivers(
     return effects
 
 
+def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
+    """Whether one of `drivers` says more than unrelated numbers do among so many trials, by three sigma.
+
+    >>> weak = {"rank_correlation": 0.1, "first_order": 0.01}
+    >>> beyond_chance(weak, 300), beyond_chance(weak, 3000)
+    (False, True)
+    """
+    by_chance = {"rank_correlation": 1.0 / np.sqrt(trials), "first_order": np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials}
+    shown = ((driver[name], sigma) for name, sigma in by_chance.items())
+    return any(value is not None and abs(value) > 3.0 * sigma for value, sigma in shown)
+
+
 def _first_order(bins: Sequence[np.ndarray], count: int) -> float:
     """The share of the variance of `count` ranks that is one of the means over bins, less what chance would show."""
     between = sum(part.size * part.mean() ** 2 for part in bins) / count

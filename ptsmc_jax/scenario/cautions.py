@@ -77,9 +77,10 @@ def _noisy(scenario: Scenario, largest: float) -> list[str]:
         return []
     gain = scenario.observer.gain
     shown = errors.brief(gain[0] if len(set(gain)) == 1 else gain)
+    unit = " N m" if scenario.motion == "spacecraft" else ""
     return [
-        f"observer.gain is {shown}, with which the estimate has {noise:.2g} of noise (1 sigma), more than the "
-        f"disturbance that it estimates, at most {largest:g}: look at a smaller gain"
+        f"observer.gain is {shown}, with which the estimate has {noise:.2g}{unit} of noise (1 sigma), more than the "
+        f"disturbance that it estimates, at most {largest:.3g}{unit}: look at a smaller gain"
     ]
 
 

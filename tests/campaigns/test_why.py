@@ -44,13 +44,13 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05)}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    campaign_terminal.why(told, "spacecraft")
+    campaign_terminal.why(told, "spacecraft", 401)
     (said,) = capsys.readouterr().out.splitlines()
     assert (
         said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
     )  # the rate is drawn apart from it
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft", 401)
     assert "goes with nothing that was drawn" in capsys.readouterr().out
     # of the number of a wheel none is more: what fails is one of four, here the second, whose number is no middle
     wheel = np.arange(401) % 4 + 1.0

@@ -40,6 +40,15 @@ def test_each_outcome_is_counted_and_drawn():
     assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
 
 
+@pytest.mark.parametrize("limit", [1e-3, 1e3])
+def test_a_limit_in_the_legend_is_on_the_axis(limit):
+    """Far below torques of 10 kN m, which no wheel gave, the line of 0.5 N m was not."""
+    x, outcome = np.arange(1.0, 4.0), np.full(3, "missed", dtype=object)
+    (axes,) = campaign_plots.torque_by_angle(x, x, outcome, {"missed": 3}, limit).axes
+    low, high = axes.get_ylim()
+    assert low < limit < high
+
+
 def test_the_legend_of_a_narrow_figure_stays_inside_it():
     outcome = np.array([campaign_plots.AT_TIMES, campaign_plots.BEYOND, "ok"], dtype=object)
     x, totals = np.arange(3.0), dict.fromkeys(campaign_plots.MARKS, 1000)

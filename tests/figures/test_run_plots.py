@@ -2,11 +2,13 @@
 
 import re
 
+import numpy as np
 import pytest
 
 import ptsmc_jax
+from ptsmc_jax.figures import run_plots
 from ptsmc_jax.scenario import from_tables
-from tests.helpers import SHORT, untuned
+from tests.helpers import SHORT, SHORT_CHAIN, untuned
 
 
 @pytest.mark.parametrize(("delay", "said"), [(0, r"peak \d"), (1, r"peak of the command \d")])
@@ -25,3 +27,25 @@ def test_the_time_to_go_has_plain_numbers():
     labels = [label.get_text() for label in axes.get_xticklabels(which="both") if label.get_text()]
     assert labels
     assert all(re.fullmatch(r"[\d.]+", label) for label in labels)
+
+
+@pytest.mark.parametrize(("disturbance", "drawn"), [("none", set()), ("sinusoid", {"error", "sliding"})])
+def test_what_log_axes_cannot_show_is_not_drawn(disturbance, drawn):
+    """A run that begins on its target: its errors are zero, or have no exact motion that theory knows."""
+    tables = untuned(SHORT_CHAIN) | {"disturbance": {"kind": disturbance}, "hardware": {}}
+    figures = ptsmc_jax.simulate(ptsmc_jax.replace(from_tables(tables), plant__x0=[0.0, 0.0])).plot()
+    assert {"error", "sliding", "convergence"} & set(figures) == drawn
+    for name in drawn:
+        (axes,) = figures[name].axes
+        assert np.isnan(axes.lines[0].get_ydata()[0])  # the first sample's zero is no 1e-16
+        assert axes.get_ylim()[0] >= run_plots.SMALLEST
+
+
+def test_a_command_far_beyond_what_is_delivered_leaves_its_axis():
+    """Wheels were drawn as a line at zero, the 970 N m that were asked of them far below."""
+    weak = ptsmc_jax.replace(from_tables(untuned(SHORT_CHAIN)), hardware__torque_limit=1e-3)
+    flight = ptsmc_jax.simulate(weak)
+    (axes,) = flight.plot("torque")["torque"].axes
+    assert flight.metrics["peak_torque"] > 100 * 1e-3
+    assert max(map(abs, axes.get_ylim())) == pytest.approx(run_plots.FAR_OFF * 1e-3)
+    assert any(label.endswith("beyond this axis") for label in axes.get_legend_handles_labels()[1])

@@ -96,6 +96,19 @@ def test_of_inputs_that_rank_the_trials_alike_only_the_first_is_a_driver():
     assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]
 
 
+def test_what_chance_shows_is_not_said_to_drive_a_metric():
+    """Of twenty inputs that a metric does not know, some had a correlation of 0.1 with it, and were named."""
+    rng = np.random.default_rng(0)
+    inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
+    drivers = statistics.drivers(inputs, metric)
+    assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
+    summary = {"verdicts": [], "flown": 300, "drivers": {"window_error": drivers}}
+    assert not list(sentences.campaign_drivers(summary))
+    summary["drivers"] = {"window_error": statistics.drivers({"y": metric + rng.normal(size=300)}, metric)}
+    (said,) = sentences.campaign_drivers(summary)
+    assert said.startswith("window_error hangs on y +0.")
+
+
 @pytest.mark.parametrize(
     ("off", "rounding", "said", "unsaid"),
     [

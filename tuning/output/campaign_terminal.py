@@ -89,17 +89,20 @@ def worst(frame: "pl.DataFrame", by: str, folder: Path, kind: str, *, own_code: 
     terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 
-def why(inputs: list[dict[str, Any]], kind: str) -> None:
+def why(inputs: list[dict[str, Any]], kind: str, trials: int) -> None:
     """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
-    inputs: rows as `reasons.why` makes them; kind: of the plant.
+    inputs: rows as `reasons.why` makes them; kind: of the plant; trials: of the campaign.
     """
+    from ptsmc_jax.numerics import statistics
+
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
         value = rows[0]["value"]
         with_share = [row for row in rows if row["first_order"] is not None]
         if with_share and math.isfinite(value):
+            with_share = [row for row in with_share if statistics.beyond_chance(row, trials)]
             rows = sorted((row for row in with_share if _explained(row) >= COUNTS), key=_explained, reverse=True)
         else:
             rows.sort(key=_unusual, reverse=True)

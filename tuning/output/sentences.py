@@ -1,7 +1,7 @@
 """What a result's `summary.json` says, as tables and sentences: the same in the terminal and on the page."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ptsmc_jax.simulation import catalogues
@@ -116,7 +116,8 @@ def tuning(summary: Summary) -> Table:
         rows.append((label, *(digits(v, ".4g") for v in values), CATALOGUES[kind][metric].unit))
         if label == "RMS window error" and summary["fresh"].get("floor"):
             floors = [group.get("floor") for group in groups.values()]
-            rows.append(("times the floor", *(digits(v, ".3g") for v in map(over_floor, values, floors)), ""))
+            times = map(over_floor, values, floors)
+            rows.append(("times the floor", *("-" if v is None else ratio(v) for v in times), ""))
     rows.append(("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), ""))
     return Table(("", *groups, "unit"), rows)
 
@@ -146,11 +147,11 @@ def accuracy(summary: Summary) -> Iterator[str]:
         within = summary.get("accuracy_gain_interval")
         but = f", but break {' and '.join(broken)}" if broken else ""
         if times >= 1.0:
-            yield f"the tuned gains are {times:.3g} times as accurate as {paper}{_between(within, '.3g')}{but}"
+            yield f"the tuned gains are {ratio(times)} times as accurate as {paper}{_between(within, ratio)}{but}"
         else:
             within = None if within is None else [1.0 / v for v in reversed(within)]
-            worse = f"the tuned gains are less accurate than {paper}: they leave {1.0 / times:.3g} times the error"
-            yield f"{worse}{_between(within, '.3g')}{but}"
+            worse = f"the tuned gains are less accurate than {paper}: they leave {ratio(1.0 / times)} times the error"
+            yield f"{worse}{_between(within, ratio)}{but}"
     yield from paper_refused(summary)
     cut = fresh.get("saturated")
     if cut and cut["max"]:
@@ -162,7 +163,7 @@ def accuracy(summary: Summary) -> Iterator[str]:
         yield "the scenario's own gains are more accurate than the tuned ones: see tune.bounds and the requirements"
     if trained and fresh:
         errors = ", ".join(
-            f"{error['rms']:.3e} on the {where} trials" + _between(error.get("rms_interval"), ".3e")
+            f"{error['rms']:.3e} on the {where} trials" + _between(error.get("rms_interval"), "{:.3e}".format)
             for where, error in (("training", trained), ("fresh", fresh))
         )
         yield f"the tuned gains' RMS window error is {errors}{floor(fresh['rms'], summary['fresh'].get('floor'))}"
@@ -195,8 +196,8 @@ def paper_refused(summary: Summary) -> Iterator[str]:
         yield f"the paper's gains cannot fly this scenario, and are left out: {summary['paper_refused']}"
 
 
-def _between(interval: Sequence[float] | None, digits: str) -> str:
-    return "" if interval is None else f" (95 %: {interval[0]:{digits}} to {interval[1]:{digits}})"
+def _between(interval: Sequence[float] | None, text: Callable[[float], str]) -> str:
+    return "" if interval is None else f" (95 %: {text(interval[0])} to {text(interval[1])})"
 
 
 def front(summary: Summary) -> Table:
@@ -212,12 +213,14 @@ def front(summary: Summary) -> Table:
         gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
         cells = [digits(value, ".4g") for value in gains]
         if summary.get("floor"):
-            cells.insert(0, digits(over_floor(point["rms"], summary["floor"]), ".3g"))
+            times = over_floor(point["rms"], summary["floor"])
+            cells.insert(0, "-" if times is None else ratio(times))
         numbers = (digits(point["peak"], ".4g"), digits(point["mean_peak"], ".4g"), digits(point["rms"], ".3e"))
         rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
     torque, error = units["peak_torque"].unit, units["window_error"].unit
     beside = ("times the floor",) if summary.get("floor") else ()
-    return Table(("", f"largest peak [{torque}]", "mean peak", f"RMS error [{error}]", "+-", *beside, *names, ""), rows)
+    head = ("", f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{error}]", "+-", *beside, *names, "")
+    return Table(head, rows)
 
 
 def _spread(point: Summary) -> str:
@@ -336,7 +339,7 @@ def campaign_counts(summary: Summary) -> Iterator[str]:
         yield f"NOT finished: {name} is asked for and not judged yet; the same `ptsmc montecarlo` again judges it"
     counts = ", ".join(f"{count} {status}" for status, count in summary["counts"].items() if count)
     of = f"the plan {summary['plan']} and seed" if summary.get("plan") else "seed"
-    yield f"{summary['flown']} trials of {of} {summary['seed']}: {counts}"
+    yield f"{summary['flown']} trial{'s' if summary['flown'] != 1 else ''} of {of} {summary['seed']}: {counts}"
     for reason in summary["reasons"]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
@@ -374,9 +377,12 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
 
 
 def campaign_drivers(summary: Summary) -> Iterator[str]:
-    """What drives the error and the metrics of the requirements."""
+    """What drives the error and the metrics of the requirements, by more than chance shows among so many trials."""
+    from ptsmc_jax.numerics import statistics
+
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
         drivers = summary["drivers"].get(name, {})
+        drivers = {key: one for key, one in drivers.items() if statistics.beyond_chance(one, summary["flown"])}
         strength = {key: max(abs(v) for v in driver.values() if v is not None) for key, driver in drivers.items()}
         strongest = sorted((key for key in drivers if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
         if strongest:

@@ -294,7 +294,7 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if finished.any():
         if folder.ready is not None:  # its histories are not kept, but flown for it
-            figures["fan"] = _fan(folder, frame, finished)
+            figures |= _fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
@@ -351,11 +351,14 @@ def _of_time(verdict: Verdict) -> str:
     return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
 
 
-def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> Figure:
-    """Errors over time of the first trials, and of that with the largest window error, flown again."""
+def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
+    """Errors over time of the first trials, and of that with the largest window error, flown again.
+
+    None where there is nothing that a log axis shows: no such trial ends, or none has an error.
+    """
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
     t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
-    flown, worst = folder.scenario, (int(trials[hardest]), error[-1])
-    return plots.fan(t, error[:-1][finished[: shown.size]], worst, flown.controller.t_f, flown.plant.kind)
+    flown, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
+    return {"fan": plots.fan(t, ended, worst, flown.controller.t_f, flown.plant.kind)} if ended.any() else {}
