@@ -116,8 +116,7 @@ def tuning(summary: Summary) -> Table:
         rows.append((label, *(digits(v, ".4g") for v in values), CATALOGUES[kind][metric].unit))
         if label == "RMS window error" and summary["fresh"].get("floor"):
             floors = [group.get("floor") for group in groups.values()]
-            times = map(over_floor, values, floors)
-            rows.append(("times the floor", *("-" if v is None else ratio(v) for v in times), ""))
+            rows.append(("times the floor", *(ratio(v) for v in map(over_floor, values, floors)), ""))
     rows.append(("failed or missed", *(str(trials - group["counts"]["ok"]) for group in groups.values()), ""))
     return Table(("", *groups, "unit"), rows)
 
@@ -180,9 +179,9 @@ def floor(error: float | None, least: float | None) -> str:
     return "" if times is None else f", {ratio(times)} times the floor {least:.2e} that no controller can beat"
 
 
-def ratio(times: float) -> str:
-    """How many times, in three digits, without an exponent below a million."""
-    return f"{times:.0f}" if 1000.0 <= times < 1e6 else f"{times:.3g}"
+def ratio(times: float | None) -> str:
+    """How many times, in three digits, without an exponent below a million; - where there is no number."""
+    return digits(times, ".0f" if times is not None and 1000.0 <= times < 1e6 else ".3g")
 
 
 def over_floor(error: float | None, least: float | None) -> float | None:
@@ -213,14 +212,12 @@ def front(summary: Summary) -> Table:
         gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
         cells = [digits(value, ".4g") for value in gains]
         if summary.get("floor"):
-            times = over_floor(point["rms"], summary["floor"])
-            cells.insert(0, "-" if times is None else ratio(times))
+            cells.insert(0, ratio(over_floor(point["rms"], summary["floor"])))
         numbers = (digits(point["peak"], ".4g"), digits(point["mean_peak"], ".4g"), digits(point["rms"], ".3e"))
         rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
-    torque, error = units["peak_torque"].unit, units["window_error"].unit
-    beside = ("times the floor",) if summary.get("floor") else ()
-    head = ("", f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{error}]", "+-", *beside, *names, "")
-    return Table(head, rows)
+    torque, beside = units["peak_torque"].unit, ("times the floor",) if summary.get("floor") else ()
+    head = f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{units['window_error'].unit}]", "+-"
+    return Table(("", *head, *beside, *names, ""), rows)
 
 
 def _spread(point: Summary) -> str:
@@ -284,8 +281,8 @@ def slew_times_lines(summary: Summary) -> Iterator[str]:
                 yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
                        f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
         if fast["rms"] and slow["rms"]:
-            error, ratio = valued(fast["rms"], "window_error", summary["plant"]), fast["rms"] / slow["rms"]
-            yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {ratio:.3g} times that at {slow['t_f']:g} s"
+            error, times = valued(fast["rms"], "window_error", summary["plant"]), ratio(fast["rms"] / slow["rms"])
+            yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {times} times that at {slow['t_f']:g} s"
     for t_f in summary["without"]:
         yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"
     if summary["requirements"] and not any(slew["meets"] for slew in slews):
@@ -382,9 +379,9 @@ def campaign_drivers(summary: Summary) -> Iterator[str]:
 
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
         drivers = summary["drivers"].get(name, {})
-        drivers = {key: one for key, one in drivers.items() if statistics.beyond_chance(one, summary["flown"])}
-        strength = {key: max(abs(v) for v in driver.values() if v is not None) for key, driver in drivers.items()}
-        strongest = sorted((key for key in drivers if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
+        seen = [key for key, driver in drivers.items() if statistics.beyond_chance(driver, summary["flown"])]
+        strength = {key: max(abs(v) for v in drivers[key].values() if v is not None) for key in seen}
+        strongest = sorted((key for key in strength if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
         if strongest:
             ranks = {key: drivers[key]["rank_correlation"] for key in strongest}  # None of a number of a wheel, say
             each = {key: key if rank is None else f"{key} {rank:+.2f}" for key, rank in ranks.items()}
