@@ -149,3 +149,14 @@ def test_times_without_gains_are_told():
     nothing = {**told, "slews": [], "requirements": []}
     assert sentences.slew_times(nothing).rows == []
     assert np.isfinite(len(list(sentences.slew_times_lines(nothing))))
+
+
+def test_the_usual_bounds_of_delta_lie_below_the_shortest_time():
+    """Those of t_f = 8 s reach to 4.025 s: a time of 4 s was refused, by a key that nobody had given."""
+    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "controller": {"t_f": 8.0}, "loop": {"mode": "sampled"}}
+    known = scenario.from_tables({**tables, "tune": {}})
+    assert known.search.bounds["delta"] == (0.05, 4.025)
+    slew_times.check(known, (4.0, 8.0))
+    given = scenario.from_tables({**tables, "tune": {"bounds": {"delta": [0.05, 4.1]}}})
+    with pytest.raises(ScenarioError, match=r"tune\.bounds\.delta is \[0\.05, 4\.1\]"):
+        slew_times.check(given, (4.0, 8.0))

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import cautions, own, parsing, study
+from ptsmc_jax.scenario import cautions, free_gains, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -85,8 +86,13 @@ def check(scenario: Scenario, times: Sequence[float]) -> None:
 
 
 def _at(scenario: Scenario, t_f: float) -> Scenario:
-    """The scenario with another prescribed time [s]."""
-    return gains.in_scenario(scenario, {"t_f": t_f})
+    """The scenario with another prescribed time [s], below which the usual bounds of delta lie anew."""
+    tune = scenario.search
+    own_bounds = {name: both for name, both in tune.bounds.items() if name != "delta"}
+    if tune.bounds.get("delta") not in (None, free_gains.usual(scenario, "delta")):
+        own_bounds["delta"] = tune.bounds["delta"]
+    at = gains.in_scenario(scenarios.replace(scenario, tune=None), {"t_f": t_f})
+    return scenarios.replace(at, tune={**parsing.plain(tune), "bounds": own_bounds})
 
 
 def trace(
