@@ -22,6 +22,7 @@ from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
+STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
 class Margins(NamedTuple):
@@ -198,24 +199,32 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
-        value = -crossings.one_axis(linear.delayed_axis(loop, z, jnp.maximum(at[1], 0.0), axis), axis)
+        value = -crossings.one_axis(linear.delayed_axis(loop, z, at[1], axis), axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
     def step(x: Array) -> Array:
         (a, b), (c, d) = jax.lax.stop_gradient(jax.jacfwd(off)(x))
         far = off(x)
         by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
-        return jnp.clip(by, -0.5 - 0.1 * jnp.abs(x), 0.5 + 0.1 * jnp.abs(x))
+        most = jnp.stack([0.2 * jnp.ones_like(a), 0.5 + 0.1 * jnp.abs(x[1])])
+        return jnp.clip(by, -most, most)
 
-    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        k, x, _ = state
+    def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        steps, starts, x, _ = state
         by = step(x)
-        return k + 1, x - by, jnp.any(jnp.abs(by) > 1e-9 * jnp.abs(x))  # the last one, below, is of its square
+        x = x - by
+        settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.abs(x))  # the last step, below, is of its square
+        found = settled & (x[1] > 0.0)
+        lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
+        starts = starts + lost
+        x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
+        return jnp.where(lost, 0, steps + 1), starts, x, found
 
-    first = (jnp.zeros((), int), jnp.where(known, start, 1.0), known)
-    _, root, _ = jax.lax.while_loop(lambda at: (at[0] < 12) & at[2], newton, jax.lax.stop_gradient(first))
-    root = jax.lax.stop_gradient(root)
-    return jnp.where(known, (root - step(root))[1] * loop.period, jnp.inf)
+    zero = jnp.zeros((), int)
+    first = (zero, zero, jnp.where(known, start, 1.0), ~known)
+    *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), newton, jax.lax.stop_gradient(first))
+    root = jax.lax.stop_gradient(jnp.where(found, root, 1.0))
+    return jnp.where(found & known, (root - step(root))[1] * loop.period, sizes[j])
 
 
 def together(loop: Loop) -> dict[str, float]:

@@ -284,6 +284,19 @@ def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherev
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
 
 
+def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
+    """By poles; Newton's search stepped beyond that frequency, or to the border of an advance, and found no number."""
+    found = []
+    for k1, rate in ((1.97, 17.39), (4.514, 17.341)):
+        _, loop, _ = chain(
+            plant={"kind": "chain", "order": 3, "x0": [0.1, 0.0, 0.0]}, loop__t_end=12.0,
+            controller={**CHAIN["controller"], "eta": 4.0, "k1": k1, "surface_rate": rate, "disturbance_bound": 1e-6},
+        )  # fmt: skip
+        found.append((float(of(loop).delay[0]), margins.together(loop)["delay"]))
+    assert found == [pytest.approx((late, late), rel=1e-4) for _, late in found]
+    assert all(0.01 < late < 0.02 for _, late in found)
+
+
 def test_the_sensitivity_of_all_inputs_at_once_is_the_largest_singular_value():
     """Of (I + L)^-1, here on an even grid of its own; no axis alone has a larger one."""
     law = {"t_f": 10.0, "delta": 0.5, "k1": 3.0, "sign_width": 0.05}
