@@ -1,5 +1,6 @@
 """Progress where the output is redirected."""
 
+import re
 import time
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from ptsmc_jax.numerics import statistics
 from tuning.output import campaign_terminal, law_sentences, progress_lines, sentences, terminal
+from tuning.output.cells import Table
 from tuning.output.progress_lines import Lines
 
 
@@ -124,3 +126,16 @@ def test_round_off_of_a_replay_does_not_read_as_a_fault(capsys, off, rounding, s
     out = capsys.readouterr().out
     assert all(words in out for words in said)
     assert unsaid not in out
+
+
+def test_a_narrow_terminal_cuts_no_numbers(capsys, monkeypatch):
+    """Of 0.000194 it left 0.00 and three dots; sentences still break at their words."""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal
+    monkeypatch.setenv("COLUMNS", "40")
+    row = ("peak_torque_delivered", "0.000194", "0.000382..0.00102", "N m s", "largest delivered torque about one axis")
+    terminal.table(Table(("metric", "median", "its 95 % interval", "unit", "meaning"), [row]))
+    out = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert all(cell in out for cell in row[:4])
+    assert "…" not in out
+    assert set(row[4].split()) <= set(out.split())
+    assert len(out.splitlines()) > 2

@@ -68,7 +68,7 @@ class Bar:
             *([progress.MofNCompleteColumn()] if counted else []),
             progress.TimeElapsedColumn(),
             progress.TextColumn("left"),
-            progress.TimeRemainingColumn(elapsed_when_finished=True),
+            progress.TimeRemainingColumn(),
             console=console,
             disable=quiet or not console.is_terminal,
         )

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from tuning.studies.mapping import Cell
 
 WIDE = 1000  # columns of what is no terminal
+UNBROKEN = 24  # columns that a cell may have and stay in one piece
 
 
 class Progress(Bar):
@@ -112,16 +113,27 @@ def say(*lines: str) -> None:
         Console(highlight=False).print(line, soft_wrap=True, markup=False)
 
 
+def _narrowest(cell: str) -> int:
+    """Into how many columns a cell fits: a number, a name or a unit is in one piece, a sentence breaks at its words."""
+    return len(cell) if len(cell) <= UNBROKEN else max(map(len, cell.split()))
+
+
 def table(content: "Content", **style: Any) -> None:
     """Print a table; style: of rich's `Table`."""
     from rich.console import Console
     from rich.markup import escape
+    from rich.measure import Measurement
     from rich.table import Table
     from rich.text import Text
 
-    printed = Table(*map(escape, content.head), pad_edge=False, **{"box": None, **style})
+    printed = Table(pad_edge=False, **{"box": None, **style})
+    for k, name in enumerate(content.head):
+        printed.add_column(escape(name), min_width=max((_narrowest(row[k]) for row in content.rows), default=1))
     for row in content.rows:
         printed.add_row(*map(Text, row))
-    # a file or a pipe has no width: what does not fit into 80 columns would be cut
-    width = None if Console().is_terminal else WIDE
+    # a file or a pipe has no width; numbers that do not fit into a terminal's would be cut, so it breaks the lines
+    width, here = WIDE, Console()
+    if here.is_terminal:
+        wide = Console(width=WIDE)
+        width = max(here.width, Measurement.get(wide, wide.options, printed).minimum + len(content.head))  # and padding
     Console(highlight=False, width=width).print(printed)
