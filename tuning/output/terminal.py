@@ -135,5 +135,5 @@ def table(content: "Content", **style: Any) -> None:
     width, here = WIDE, Console()
     if here.is_terminal:
         wide = Console(width=WIDE)
-        width = max(here.width, Measurement.get(wide, wide.options, printed).minimum + len(content.head))  # and padding
-    Console(highlight=False, width=width).print(printed)
+        width = max(here.width, Measurement.get(wide, wide.options, printed).minimum)
+    Console(highlight=False, width=width).print(printed, crop=False)
