@@ -213,7 +213,7 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
         steps, starts, x, _ = state
         by = step(x)
         x = x - by
-        settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.abs(x))  # the last step, below, is of its square
+        settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # the last step, below, is of its square
         found = settled & (x[1] > 0.0)
         lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
         starts = starts + lost

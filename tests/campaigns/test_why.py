@@ -60,13 +60,14 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert (one["percentile"], one["median"], one["share"]) == (None, None, pytest.approx(100 / 401))
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
-    campaign_terminal.why(told, "spacecraft")
+    campaign_terminal.why(told, "spacecraft", 401)
     assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in capsys.readouterr().out
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
-    (said,) = sentences.campaign_drivers({"verdicts": [{"metric": "peak_torque"}], "drivers": drivers})
+    summary = {"verdicts": [{"metric": "peak_torque"}], "drivers": drivers, "flown": 401}
+    (said,) = sentences.campaign_drivers(summary)
     assert ", wheel_failure_wheel (56 %): rank correlation" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")  # of one that failed: what is unusual in it
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft", 401)  # of one that failed: what is unusual in it
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
