@@ -103,6 +103,24 @@ def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped)
     assert any(cell.radius < 1.0 for cell in cells)
 
 
+def test_margins_of_every_law_stand_in_the_map():
+    """PD on two integrators, held over a period, in closed form; they were those of the paper's law alone."""
+    text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
+    text = text.replace('{ kind = "nonlinear", gain = [10.0] }', '{ kind = "none" }')
+    _, _, _, cells = flown("controller.k_p=1:2:2", "controller.k_d=2:3:2", text, trials=1)
+    h = 0.1
+    for cell in cells:
+        moved, pushed = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h / 2.0], [h]])
+
+        def radius(factor, cell=cell, moved=moved, pushed=pushed):
+            return np.abs(np.linalg.eigvals(moved - factor * pushed @ np.array([[cell.x, cell.y]]))).max()
+
+        assert cell.hold_radius == pytest.approx(1.0, abs=1e-9)  # of a memory that nothing is written into
+        assert radius(0.999 * cell.hold_gain_margin) < 1.0 < radius(1.001 * cell.hold_gain_margin)
+        assert 0.0 < cell.hold_delay_margin < 10.0
+        assert np.isnan(cell.linear_window_error)  # which was compared with flown trials of the paper's law alone
+
+
 @pytest.mark.long
 def test_keys_of_every_kind_can_be_mapped():
     """One with a number for each axis, and one that counts."""

@@ -180,14 +180,15 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     parts = common(ready.parts)
-    if ready.scenario.sampled and parts.controller.prescribed:
+    if ready.scenario.sampled:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
             # the factor on the gain of the worst axis up to which the loop is stable; below 1 where it is not
             figures[f"{prefix}gain_margin"] = float(10.0 ** (left.gain_up.min() / 20.0))
             figures[f"{prefix}delay_margin"] = float(left.delay.min())
             figures[f"{prefix}radius"] = radius
-        if covariance.predicts(parts) and figures["radius"] < 1.0 + margins.NEUTRAL:
+        # of other laws it has not been set beside flown trials
+        if parts.controller.prescribed and covariance.predicts(parts) and figures["radius"] < 1.0 + margins.NEUTRAL:
             expected = covariance.noise(parts)
             figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
