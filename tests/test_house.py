@@ -116,7 +116,7 @@ HOUSE = {
             page terminal
             campaign_terminal
         """,
-        "cli": "options | campaign_commands flight_commands convert new searches | writing_commands | main",
+        "cli": "options | convert flight_commands new searches | campaign_commands | writing_commands | main",
     },
 }
 

@@ -203,6 +203,20 @@ def test_trials_until_the_share_is_known(command, tmp_path):
     assert summary(tmp_path / FOLDER)["flown"] == 600  # what was flown besides counts
 
 
+@pytest.mark.parametrize(("made", "said"), [("tune", 1), ("montecarlo", 0)])
+def test_trials_that_gains_were_found_with_are_told(command, tmp_path, made, said):
+    """`tune --seed 1000` and a campaign by default fly the same draws and noise: a proof of nothing."""
+    found = tmp_path / "found"
+    found.mkdir()
+    (found / "versions.json").write_text(json.dumps({"command": made, "seed": 1000}))
+    (found / "tuned.toml").write_text((tmp_path / "s.toml").read_text())
+    asked = "montecarlo", found / "tuned.toml", "--trials", 4, "--dry-run", "--quiet"
+    for seed, times in ((), said), (("--seed", 7, "--out", "other"), 0):
+        code, _, error = command(*asked, *seed)
+        assert code == 0
+        assert error.count("with trials of seed 1000, which are flown again: for a proof give another --seed") == times
+
+
 def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--dry-run")
     folder = tmp_path / FOLDER

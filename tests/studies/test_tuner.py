@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ROOT, SHORT_CHAIN, small_search
 from tuning.output import search_sentences
@@ -17,6 +18,15 @@ from tuning.search.objective import FAILED
 from tuning.studies import judging, posing, tune_files, tuner
 
 LIMIT = 0.6  # of the peak torque
+
+
+@pytest.mark.parametrize("seed", [0, 1000, 654735429, 2933870671, 188629158])
+def test_fresh_trials_have_another_seed_than_those_of_the_search_and_of_other_turns(seed):
+    """The hash that they follow by takes one seed of all to itself, and another one for each later turn."""
+    seeds = [seed, *(judging.seed_of_judge(seed, turn) for turn in range(tuner.TRIES))]
+    assert len(set(seeds)) == len(seeds)
+    plain = [draws.derive(seed, name) for name in ("fresh trials", "fresh trials 1", "fresh trials 2")]
+    assert (seeds[1:] == plain) == (seed not in plain)
 
 
 def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from tuning.cli import searches
 from tuning.cli.options import (
     INTERRUPTED,
     Device,
@@ -131,6 +132,8 @@ def montecarlo(
         table = plans.read(plan)
         place = path if out is not None else path.with_name(f"{path.name}-{plan.stem}")
         folder = replace(folder, path=place, trials=table.height, plan=plan.name, table=table)
+    if scenario is not None:
+        searches.say_seen(scenario, seed)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
     try:
         with _elsewhere(cluster, tls) as elsewhere:

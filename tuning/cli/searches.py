@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
     from tuning.search.journal import Journal
 
+COMMANDS = ("tune", "pareto", "compare")
 STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
 
 
@@ -27,6 +28,21 @@ class LongSearch:
     summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of it
     show: Callable[[dict[str, Any], Path, str], None]  # prints such a summary, the folder, and how it came about
     check: Callable[[], Any] = lambda: None  # raises what is refused besides the scenario, before a folder is begun
+
+
+def say_seen(scenario: Path, seed: int) -> None:
+    """Say so where a search found the gains of a scenario with the very trials of this seed, which prove nothing."""
+    from ptsmc_jax.campaigns import store
+    from tuning.search import own_parts
+
+    folder = own_parts.results_of(scenario)
+    made = {} if folder is None else store.read_versions(folder)
+    if made.get("command") in COMMANDS and made.get("seed") == seed:
+        print(
+            f"ptsmc: {made['command']} found the gains of {scenario} with trials of seed {seed}, which are flown "
+            "again: for a proof give another --seed",
+            file=sys.stderr,
+        )
 
 
 def with_tune(scenario: "Scenario") -> "Scenario":

@@ -28,7 +28,7 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
 
     Raises RefusedError.
     """
-    programs, folder = named(scenario), _results(path)
+    programs, folder = named(scenario), results_of(path)
     if folder is not None:
         allow(programs, path, store.read_versions(folder), trusted)
         return
@@ -106,7 +106,7 @@ def _say(programs: Mapping[str, str], where_named: Path) -> None:
         print(f"ptsmc: runs {systems.location(where)}, which {key} of {where_named} names", file=sys.stderr)
 
 
-def _results(scenario: Path) -> Path | None:
+def results_of(scenario: Path) -> Path | None:
     """The folder that a command left and a scenario file lies in, itself or in a folder of it; links count as both."""
     paths = Path(os.path.abspath(scenario)), Path(os.path.realpath(scenario))
     folders = (folder for path in paths for folder in path.parents[:2])

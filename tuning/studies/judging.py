@@ -17,8 +17,20 @@ from tuning.search import confirm, gains, trust
 
 
 def seed_of_judge(seed: int, turn: int = 0) -> int:
-    """The seed of the fresh trials; of others each turn, where gains that had broken a limit on some were tuned on."""
-    return draws.derive(seed, f"fresh trials {turn}" if turn else "fresh trials")
+    """The seed of the fresh trials; of others each turn, where gains that had broken a limit on some were tuned on.
+
+    Never the search's own, nor that of another turn. A hash of 2^32 seeds has fixed points: that of seed 654735429 is
+    itself, and of two later turns one each is (all were tried).
+    """
+    taken = [seed]
+    for k in range(turn + 1):
+        name = f"fresh trials {k}" if k else "fresh trials"
+        fresh = draws.derive(seed, name)
+        while fresh in taken:
+            name += ", others"
+            fresh = draws.derive(seed, name)
+        taken.append(fresh)
+    return taken[-1]
 
 
 def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
