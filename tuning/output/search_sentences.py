@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 
-from ptsmc_jax.simulation.catalogues import MARGINS, percent
+from ptsmc_jax.simulation.catalogues import MARGINS, NO_SIGN, percent
 from tuning.output import margin_sentences
 from tuning.output.cells import Summary, lost, valued
 
@@ -158,7 +158,7 @@ def trust(summary: Summary) -> Iterator[str]:
     yield from margin_sentences.tuned(record.get("margins"))
     if record["slopes_off_central_differences"] is None:
         if record.get("margins"):
-            yield "the exact sign has no slope: margins are those of the loop without its switching term"
+            yield NO_SIGN
         yield (
             "the gains were found by evolution, since the exact sign has no slopes to go by; with sign_width free, its "
             "width is a gain too"

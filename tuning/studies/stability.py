@@ -13,13 +13,11 @@ from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
 from ptsmc_jax.theory import margins, rest, run_margins
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.rest import Swing
 from ptsmc_jax.theory.run_margins import Course
-
-_NO_SIGN = "the exact sign has no slope: these margins are those of the loop without its switching term"
 
 
 def find(scenario: Scenario) -> tuple[Study, Course]:
@@ -110,7 +108,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
-        "said": _NO_SIGN if ready.scenario.exact_sign else None,
+        "said": NO_SIGN if ready.scenario.exact_sign else None,
         **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }
