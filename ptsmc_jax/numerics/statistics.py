@@ -111,7 +111,7 @@ def drivers(
     metric: np.ndarray,
     ranked: dict[str, tuple] | None = None,
     categories: Collection[str] = (),
-) -> dict[str, dict[str, float | None]]:
+) -> dict[str, dict[str, Any]]:
     """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
 
     The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
@@ -127,7 +127,8 @@ def drivers(
             trials with the same number.
 
     Returns:
-        {"rank_correlation", "first_order"} by the input's name; empty where the metric or every input has one value.
+        {"rank_correlation", "first_order"} by the input's name, the first None of a category; empty where the metric or
+        every input has one value.
     """
     ranked = {} if ranked is None else ranked
     if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
