@@ -9,7 +9,7 @@ import io
 import json
 import os
 import re
-import tempfile
+import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,16 +51,15 @@ class Rows:
         """Write a part from a file's content; raises OSError where it does not fit on the disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
-        handle, name = tempfile.mkstemp(prefix=_MAKING, dir=self.folder)
+        making = self.folder / f"{_MAKING}{secrets.token_hex(8)}"
         try:
-            with os.fdopen(handle, "wb") as file:
+            with making.open("xb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(name, 0o644)
-            os.replace(name, path)
+            os.replace(making, path)
         except BaseException:
-            Path(name).unlink(missing_ok=True)
+            making.unlink(missing_ok=True)
             raise
         return Part(first, count, path)
 

@@ -1,5 +1,6 @@
 """Result folders: which are refused, and their files, written so that a folder is complete or not there."""
 
+import contextlib
 import csv
 import importlib.metadata
 import json
@@ -7,9 +8,9 @@ import math
 import os
 import platform
 import re
+import secrets
 import shutil
-import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,14 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
 
     fresh: forget what the folder's journal holds, and the summary of what was there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    if fresh:
-        end(folder)
-        forget(folder)
-    record(folder, scenario, made_by)
-    (folder / JOURNAL).touch()
+
+    def fill(making: Path) -> None:
+        record(making, scenario, made_by)
+        if fresh:
+            (making / JOURNAL).touch()
+            forget(folder)
+
+    write(folder, fill)
     return folder / JOURNAL
 
 
@@ -139,6 +142,9 @@ def check(folder: Path, force: bool) -> None:
         raise RefusedError(f"--out is {folder}, which lies below the file {above}; allowed is a new folder")
     if folder.exists() and not folder.is_dir():
         raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    if not os.access(there, os.W_OK):
+        raise RefusedError(f"--out is {folder}, but nothing may be written into {there}; allowed is a folder elsewhere")
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
@@ -157,17 +163,20 @@ def check_file(file: Path, force: bool, way: str = "--force") -> None:
 def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place.
 
-    Of another result that was there, known by its summary, figures and tables go; the new summary is moved last, since
-    it says that the result is whole.
+    Where nothing may stand beside it, or on another disk only, the new one is inside it. Of another result that was
+    there, known by its summary, figures and tables go; the new summary is moved last, since it says that the result is
+    whole.
     """
+    asked, folder = folder, Path(os.path.realpath(folder))  # of a link, what it leads to
     folder.parent.mkdir(parents=True, exist_ok=True)
+    inside = folder.is_mount() or (folder.is_dir() and not os.access(folder.parent, os.W_OK))
+    making = (folder if inside else folder.parent) / f".{folder.name}-{secrets.token_hex(4)}"
     try:
-        making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        making.mkdir()
     except OSError as error:  # names a folder that nobody asked for
-        raise OSError(error.errno, error.strerror, str(folder)) from None
+        raise OSError(error.errno, error.strerror, str(asked)) from None
     try:
         fill(making)
-        making.chmod(0o755)
         if not folder.exists():
             try:
                 making.rename(folder)
@@ -210,17 +219,31 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """A text file that is whole or not there."""
-    making = path.with_name(f".{path.name}-{os.getpid()}")
-    making.write_text(text, encoding="utf-8")
-    os.replace(making, path)
+    with _whole(path) as making:
+        making.write_text(text, encoding="utf-8")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A CSV file; numbers with as many digits as it takes to read them back exactly."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    """A CSV file that is whole or not there; numbers with as many digits as it takes to read them back exactly."""
+    with _whole(path) as making, making.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """The file beside it that is written first, and then moved into place, or is gone where that fails."""
+    making = path.with_name(f".{path.name}-{os.getpid()}")
+    try:
+        yield making
+        os.replace(making, path)
+    except OSError as error:
+        if error.filename is not None:
+            error.filename = str(path)  # instead of one that nobody asked for
+        raise
+    finally:
+        making.unlink(missing_ok=True)
 
 
 def _one_line(array: re.Match[str]) -> str:

@@ -160,6 +160,83 @@ def test_write_makes_the_folder_and_nothing_beside_it(tmp_path, before):
     assert folder.stat().st_mode & 0o777 == 0o755  # the temporary folder's mode would lock others out
 
 
+@pytest.fixture
+def umask():
+    """Sets what is taken from the modes of new files, and sets it back."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o755), (0o002, 0o775), (0o077, 0o700)])
+def test_folders_are_for_those_whom_the_user_lets_in(tmp_path, umask, mask, mode):
+    umask(mask)
+    store.write(tmp_path / "out", fill)
+    assert (tmp_path / "out").stat().st_mode & 0o777 == mode
+
+
+def test_where_a_link_leads_and_what_is_mounted_are_written_without_leaving_their_disk(tmp_path, monkeypatch):
+    """A file is moved within one disk only."""
+    made, mounted = [], tmp_path / "mounted"
+
+    def note(folder):
+        made.append(folder.parent)
+        fill(folder)
+
+    for name in ("links", "elsewhere", "mounted"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "links" / "out").symlink_to(tmp_path / "elsewhere" / "out")
+    for _ in range(2):  # it leads nowhere yet, and then to a folder
+        store.write(tmp_path / "links" / "out", note)
+    monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == mounted)
+    store.write(mounted, note)
+    assert made == [tmp_path / "elsewhere", tmp_path / "elsewhere", mounted]
+    written = {"figures/a.png": b"new", "summary.json": b"new"}
+    assert tree(tmp_path / "elsewhere" / "out") == tree(mounted) == written
+    assert len(list(mounted.iterdir())) == 2
+
+
+def test_a_folder_is_written_where_nothing_may_stand_beside_it(tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr(store.os, "access", lambda path, _: path == tmp_path / "out")
+    store.check(tmp_path / "out", force=False)
+    store.write(tmp_path / "out", lambda folder: fill(folder) if folder.parent == tmp_path / "out" else None)
+    assert tree(tmp_path / "out") == {"figures/a.png": b"new", "summary.json": b"new"}
+    with pytest.raises(
+        store.RefusedError, match=f"--out is .*new, but nothing may be written into {tmp_path}; allowed"
+    ):
+        store.check(tmp_path / "new", force=False)
+
+
+def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
+    def rows():
+        yield [1.0]
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "a.csv").write_text("before")
+    with pytest.raises(OSError, match="No space left"):
+        store.write_csv(tmp_path / "a.csv", ["x"], rows())
+    with pytest.raises(FileNotFoundError, match=r"'.*/none/b.json'"):
+        store.write_json(tmp_path / "none" / "b.json", {})
+    assert tree(tmp_path) == {"a.csv": b"before"}
+
+
+def test_a_run_that_finds_no_room_has_not_begun(tmp_path, monkeypatch):
+    tables = {"controller": {"eta": 3.0}}
+    finished(tmp_path / "old", tables)
+    before = tree(tmp_path)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store, "write_json", full)  # after scenario.toml
+    for name in ("old", "new"):
+        with pytest.raises(OSError, match="No space left"):
+            store.begin(tmp_path / name, tables, TOLD, fresh=True)
+    assert tree(tmp_path) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+
+
 @pytest.mark.parametrize("stop", [RuntimeError, KeyboardInterrupt, OSError])
 def test_write_stopped_halfway_leaves_nothing_and_touches_nothing(tmp_path, stop):
     def stopped(folder):
