@@ -67,13 +67,13 @@ class Program:
         key, said, given = known
         ready = self._ready.get(key)
         if ready is None or isinstance(ready, Future):
-            ready, loaded = self._begun(key, said, given) if ready is None else ready.result()
+            ready, loaded = (ready or _apart(self._begun, key, said, given)).result()
             if loaded:
                 try:
                     result = jax.block_until_ready(ready(given))
                 except Exception:  # it was whole, and yet does not run here
                     _path(said).unlink(missing_ok=True)
-                    ready = self._compiled(key, said, given)
+                    ready = _apart(self._compiled, key, said, given).result()
                 else:
                     self._ready[key] = ready
                     return result
@@ -96,7 +96,7 @@ class Program:
 
         None: it cannot be kept.
         """
-        if configure.programs is None:
+        if configure.programs is None or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
         bound = self._signature.bind(*args, **kwargs)  # without defaults: they are constants of the function
         given = {name: v for name, v in bound.arguments.items() if name not in self._static}
@@ -197,6 +197,18 @@ def _plain(value: Any) -> Any:
 def _beside() -> ThreadPoolExecutor:
     """Threads that compile beside the one that goes on."""
     return ThreadPoolExecutor(max(1, len(jax.local_devices()) - 1), "compiling")
+
+
+def _apart(function: Callable, *args: Any) -> Future:
+    """What a function returns, called in a thread of its own, which no Ctrl-C interrupts.
+
+    Where one ends the waiting for a program, XLA goes on compiling it, for a client that may be gone by then: a
+    segmentation fault. An exit waits for threads.
+    """
+    alone = ThreadPoolExecutor(1, "compiling")
+    future = alone.submit(function, *args)
+    alone.shutdown(wait=False)
+    return future
 
 
 def stop() -> None:

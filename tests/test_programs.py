@@ -4,6 +4,7 @@ import importlib
 import os
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -52,6 +53,27 @@ def test_a_program_is_compiled_once_and_loaded_by_the_next_process(folder):
         np.testing.assert_array_equal(ours["both"], theirs["both"])
     assert not traced
     np.testing.assert_allclose(first[1]["both"], np.sin(4 * X) + 5.0, rtol=1e-15)
+
+
+def test_compiling_is_out_of_reach_of_a_ctrl_c(folder, monkeypatch):
+    """XLA goes on with it, for a client that an exit takes away: a segmentation fault in place of the status."""
+    compiled, threads = programs.Program._compiled, []
+    monkeypatch.setattr(
+        programs.Program, "_compiled", lambda *known: (threads.append(threading.current_thread()), compiled(*known))[1]
+    )
+    program, _ = spied()
+    program(X)
+    program(X[:3])
+    assert len(threads) == 2
+    assert threading.main_thread() not in threads
+    assert not [thread for thread in threads if thread.daemon]  # an exit waits for it
+
+
+def test_what_is_not_to_be_compiled_is_not(folder):
+    program, _ = spied()
+    with jax.disable_jit():
+        np.testing.assert_allclose(program(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
+    assert not folder.exists()
 
 
 @pytrees.pytree

@@ -110,6 +110,18 @@ def test_more_trials_add_to_what_is_there(command, flown):
     assert "--trials is 300, but must be at least 420" in said
 
 
+def test_a_campaign_interrupted_while_it_is_summed_up_is_not_said_to_be_nothing(command, flown, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(campaign_summary, "summarise", stopped)
+    assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--quiet") == (
+        130,
+        "",
+        "ptsmc: interrupted; the same command goes on from here\n",
+    )
+
+
 def test_the_same_command_again_flies_nothing(command, flown):
     files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")

@@ -143,14 +143,14 @@ def montecarlo(
                     campaign_folder.write_plan(folder, report)
                 else:
                     folder = _flown(folder, share, report, elsewhere, until_confident)
+        if not a_part:
+            return _summarised(folder, quiet, figures)
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED
-    if a_part:
-        if not quiet:
-            campaign_terminal.share_done(folder, share, planned=dry_run)
-        return 0
-    return _summarised(folder, quiet, figures)
+    if not quiet:
+        campaign_terminal.share_done(folder, share, planned=dry_run)
+    return 0
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":

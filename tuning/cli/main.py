@@ -1,7 +1,11 @@
 """The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
 
+import _thread
 import functools
+import os
+import signal
 import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -314,6 +318,7 @@ for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS, *fligh
 def main() -> None:
     """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
     status: object = None
+    unraisable, sys.unraisablehook = sys.unraisablehook, _once_more
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
     except UnusedCliTokensError as error:
@@ -332,9 +337,23 @@ def main() -> None:
         where = "" if error.filename is None else f": {error.filename}"  # of a full disk it is not known
         _fail(f"{error.strerror or error}{where}")
     finally:
+        sys.unraisablehook = unraisable
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _once_more(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Let a Ctrl-C come again that came where nothing can be raised: while garbage is collected, JAX is called."""
+
+    def interrupt() -> None:
+        time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        _thread.start_new_thread(interrupt, ())  # which takes no lock that may be held here
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _too_many(error: UnusedCliTokensError) -> str:

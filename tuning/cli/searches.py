@@ -76,10 +76,10 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     try:
         with terminal.Progress(quiet, search.goal) as report:
             outcome = search.work(report, journal)
+        store.write(folder, lambda making: search.write(making, outcome))
     except KeyboardInterrupt:
         print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
         return STATUS["interrupted"]
-    store.write(folder, lambda making: search.write(making, outcome))
     if outcome.status != "interrupted":
         store.end(folder)
     if not quiet:

@@ -1,0 +1,52 @@
+"""Ctrl-C where it came to nothing, or was told wrongly."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from ptsmc_jax import scenario
+from tests.helpers import ROOT, SHORT_CHAIN, tree
+from tuning.cli import searches
+
+SWALLOWED = """
+import sys, time
+from tuning.cli import main
+
+class Garbage:
+    def __del__(self):
+        raise KeyboardInterrupt  # as where JAX is called while garbage is collected
+
+def working(*_, **__):
+    Garbage()
+    time.sleep(60.0)
+
+main.app = working
+main.main()
+"""
+
+
+def test_a_ctrl_c_that_comes_while_garbage_is_collected_ends_the_command():
+    done = subprocess.run([sys.executable, "-c", SWALLOWED], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
+
+
+def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, capsys):
+    def stopped(making, outcome):
+        (making / "summary.json").write_text(outcome.status)
+        raise KeyboardInterrupt
+
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    search = searches.LongSearch(
+        {"command": "tune", "seed": 0},
+        "window error",
+        work=lambda report, journal: SimpleNamespace(status=journal.get(b"asked", lambda: {}) or "met"),
+        write=stopped,
+        summary=lambda _: {},
+        show=lambda *_: pytest.fail("there is nothing to show"),
+    )
+    loaded = scenario.read(tmp_path / "s.toml")
+    assert searches.run(search, loaded, tmp_path / "out", force=False, quiet=True) == 130
+    assert capsys.readouterr().err == "ptsmc: interrupted; the same command goes on from here\n"
+    assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
