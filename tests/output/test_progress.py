@@ -1,5 +1,7 @@
 """Progress where the output is redirected."""
 
+import contextlib
+import os
 import re
 import time
 
@@ -39,6 +41,30 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
     with terminal.Progress(quiet=True):
         time.sleep(0.2)
     assert not capsys.readouterr().err
+
+
+@pytest.fixture
+def unread():
+    """A stream into a pipe that nobody reads any more."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with contextlib.suppress(OSError), os.fdopen(writing, "w") as stream:
+        yield stream
+
+
+def test_a_reader_that_has_read_enough_changes_nothing(unread, monkeypatch):
+    """As `head`: rich would exit with 1, which is the status of requirements that are not met."""
+    monkeypatch.setattr("sys.stdout", unread)
+    terminal.say("told", "to nobody")
+    terminal.table(Table(("head",), [("row",)]))
+
+
+def test_progress_that_nobody_reads_stops_nothing(unread, monkeypatch):
+    monkeypatch.setattr("sys.stderr", unread)
+    at = iter([0.0, 11.0, 22.0])
+    tell = Lines(silent=False, clock=lambda: next(at))
+    tell("searching", 1, 7)
+    tell("searching", 2, 7)
 
 
 def test_the_gains_that_a_campaign_flew_with_have_their_units():

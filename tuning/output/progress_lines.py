@@ -1,5 +1,6 @@
 """Progress on the error stream: a bar where that is a terminal, else a line every ten seconds."""
 
+import contextlib
 import sys
 import threading
 import time
@@ -47,7 +48,8 @@ class Lines:
             what, done, total = self._doing
             # so many of a hundred are a percentage, as searches report
             share = "" if not total else f", {done} %" if total == 100 else f", {done} of {total}"
-            print(f"ptsmc: {what}{share}, {now - self._begun:.0f} s", file=sys.stderr, flush=True)
+            with contextlib.suppress(OSError):  # nobody reads them any more, or a disk is full: no reason to stop
+                print(f"ptsmc: {what}{share}, {now - self._begun:.0f} s", file=sys.stderr, flush=True)
 
 
 class Bar:

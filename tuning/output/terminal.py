@@ -1,5 +1,6 @@
 """What the commands print: progress while they work, results when they are done."""
 
+import contextlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,10 +108,8 @@ def front(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 def say(*lines: str) -> None:
     """Print lines that the terminal breaks, not we."""
-    from rich.console import Console
-
     for line in lines:
-        Console(highlight=False).print(line, soft_wrap=True, markup=False)
+        _print(line, soft_wrap=True, markup=False)
 
 
 def _narrowest(cell: str) -> int:
@@ -136,4 +135,12 @@ def table(content: "Content", **style: Any) -> None:
     if here.is_terminal:
         wide = Console(width=WIDE)
         width = max(here.width, Measurement.get(wide, wide.options, printed).minimum)
-    Console(highlight=False, width=width).print(printed, crop=False)
+    _print(printed, width, crop=False)
+
+
+def _print(content: Any, width: int | None = None, **how: Any) -> None:
+    """Print for who reads; where they have read enough, as `head` has, what a command returns is told all the same."""
+    from rich.console import Console
+
+    with contextlib.suppress(SystemExit):  # rich's way of ending then; from there on it prints into nothing
+        Console(highlight=False, width=width).print(content, **how)
