@@ -218,9 +218,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A text file that is whole or not there."""
+    """A text file that is whole or not there; bytes of a file's name that are no UTF-8 become escapes."""
     with _whole(path) as making:
-        making.write_text(text, encoding="utf-8")
+        making.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

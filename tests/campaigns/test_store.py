@@ -221,6 +221,11 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
     assert tree(tmp_path) == {"a.csv": b"before"}
 
 
+def test_names_that_are_no_text_are_written_with_escapes(tmp_path):
+    store.write_text(tmp_path / "a.txt", os.fsdecode(b"gr\xf6\xdfe \xce\xb1"))
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "gr\\udcf6\\udcdfe \u03b1"
+
+
 def test_a_run_that_finds_no_room_has_not_begun(tmp_path, monkeypatch):
     tables = {"controller": {"eta": 3.0}}
     finished(tmp_path / "old", tables)

@@ -1,5 +1,6 @@
 """What `ptsmc new` writes: the scenario asked for, every key of its plant, and what is off is allowed as it stands."""
 
+import io
 import os
 import re
 import subprocess
@@ -155,6 +156,14 @@ def test_the_command_writes_a_file_that_flies(command, tmp_path):
     code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
     assert code == 1  # with the paper's gains, over its limit
     assert "peak_torque" in said
+
+
+def test_a_name_is_told_where_the_output_lacks_its_letters(command, tmp_path, monkeypatch):
+    plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", plain)
+    assert command("new", "größe.toml")[::2] == (0, "")
+    plain.seek(0)
+    assert plain.read() == "scenario in gr\\xf6\\xdfe.toml\n"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import _thread
 import functools
+import io
 import os
 import signal
 import sys
@@ -318,6 +319,8 @@ for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS, *fligh
 def main() -> None:
     """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
     status: object = None
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # as the error stream's are: names have any letters
     unraisable, sys.unraisablehook = sys.unraisablehook, _once_more
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
