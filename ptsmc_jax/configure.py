@@ -258,8 +258,11 @@ sys.exit(any(np.max(np.abs(np.asarray(a) - b)) > 1e-12 for a, b in zip(got, expe
 """
 
 
-def _cache_folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+def _cache_folder() -> Path | None:
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # a user whom the machine does not know, in a container
+        return None
     return Path(base) / "ptsmc-jax" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
 
 

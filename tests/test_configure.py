@@ -57,7 +57,20 @@ def test_the_cache_lies_where_the_desktop_standard_says(tmp_path, monkeypatch, s
     """$XDG_CACHE_HOME, or ~/.cache where that is not set or empty."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / said) if said else "")
-    assert setup._cache_folder().parent == tmp_path / (said or ".cache") / "ptsmc-jax"
+    folder = setup._cache_folder()
+    assert folder is not None
+    assert folder.parent == tmp_path / (said or ".cache") / "ptsmc-jax"
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch):
+    """As in a container, under a number that is nobody's."""
+
+    def unknown():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(setup.Path, "home", unknown)
+    assert setup._cache_folder() is None
 
 
 def test_the_verdict_is_kept_and_not_asked_for_again(tried, tmp_path):

@@ -337,8 +337,8 @@ def main() -> None:
         print("ptsmc: interrupted; nothing was written", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
-        where = "" if error.filename is None else f": {error.filename}"  # of a full disk it is not known
-        _fail(f"{error.strerror or error}{where}")
+        name = error.filename2 or error.filename  # where it was to be moved; of a full disk it is not known
+        _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
     finally:
         sys.unraisablehook = unraisable
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
