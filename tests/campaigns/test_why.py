@@ -68,6 +68,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     (said,) = sentences.campaign_drivers(summary)
     assert ", wheel_failure_wheel (56 %): rank correlation" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft", 401)  # of one that failed: what is unusual in it
+    told = why(Rows(), ["peak_torque"], 1)
+    campaign_terminal.why(told, "spacecraft", 401)  # of one that failed: what is unusual in it
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]

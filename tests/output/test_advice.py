@@ -201,7 +201,7 @@ def test_how_far_the_global_check_is_off_is_told_by_the_goals_themselves(times, 
 def test_margins_of_the_exact_sign_are_told_to_be_without_it(slopes):
     hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 3.0}
     found = {"influence": {}, "margins": {"hold": hold}, "slopes_off_central_differences": slopes}
-    said = " ".join(search_sentences.trust({"trust": found, "at_bound": {}}))
+    said = " ".join(search_sentences.trust({"trust": found, "at_bound": {}, "verdicts": []}))
     assert "gain 9 dB" in said
     assert (NO_SIGN in said) == (slopes is None)
 
@@ -209,7 +209,7 @@ def test_margins_of_the_exact_sign_are_told_to_be_without_it(slopes):
 def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
     """With steps of 1 mN m on a large satellite they were off by 3 in a loop that neither chatters nor breaks off."""
     found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}
-    (said,) = search_sentences.trust({"trust": found, "at_bound": {}})
+    (said,) = search_sentences.trust({"trust": found, "at_bound": {}, "verdicts": []})
     assert "hardware.torque_step" in said
 
 

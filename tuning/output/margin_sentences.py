@@ -61,16 +61,22 @@ def left(summary: Summary) -> str:
     return _shown(summary["worst"])
 
 
-def tuned(worst: Mapping[str, Any] | None) -> Iterator[str]:
-    """What tuned gains leave, see `stability.worst`, and whether an engineer would ask for more."""
+def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[str]:
+    """What tuned gains leave, see `stability.worst`, and whether an engineer would ask for more.
+
+    asked: a margin is among the requirements already.
+    """
+    short = False
     for where, place in (("hold", "in hold"), ("before", "before the hand-over")):
         if worst is None or where not in worst:
             continue
         margins = worst[where]
         if "swing" in margins:
+            short = True
             yield _swings(margins["swing"])
             continue
         if not margins["stable"]:
+            short = True
             yield f"with the tuned gains the frozen loop is NOT stable {place}"
             continue
         yield f"margins that the tuned gains leave {place}: {_shown(margins)}"
@@ -80,7 +86,11 @@ def tuned(worst: Mapping[str, Any] | None) -> Iterator[str]:
             if margins[name] is not None and margins[name] < enough
         )
         if few:
+            short = True
             yield f"the loop has less than {few} {place}: what the model leaves out may cost the stability"
+    if short and not asked:
+        more = " and ".join(f"requirements.{name} = {enough:g}" for name, enough in ENOUGH.items())
+        yield f"gains that keep more, at the price of accuracy, are found with {more}"
 
 
 def _swings(swing: Mapping[str, Any]) -> str:

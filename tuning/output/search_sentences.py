@@ -155,7 +155,9 @@ def trust(summary: Summary) -> Iterator[str]:
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
     if record is None:
         return
-    yield from margin_sentences.tuned(record.get("margins"))
+    # where no gain is flown with the exact sign, whose loop has no margins to ask for
+    asked = record["slopes_off_central_differences"] is None or any(v["metric"] in MARGINS for v in summary["verdicts"])
+    yield from margin_sentences.tuned(record.get("margins"), asked=asked)
     if record["slopes_off_central_differences"] is None:
         if record.get("margins"):
             yield NO_SIGN
