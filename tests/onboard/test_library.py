@@ -161,19 +161,18 @@ int raised(void) { return flags; }
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["filter", "star tracker out of step"])
-@pytest.mark.parametrize("attitude", [0.0, np.nan, 1e300])
-def test_an_attitude_that_is_not_there_is_not_computed_with(name, attitude, exported, tmp_path):
+@pytest.mark.parametrize("name", short(["filter", "star tracker out of step"], ["star tracker out of step"]))
+def test_an_attitude_that_is_not_there_is_not_computed_with(name, exported, tmp_path):
     """Processors may trap: it was normalised, 0 / 0 of a tracker that says zeros, and what came of it was left."""
     (tmp_path / "watched.c").write_text(WATCHED)
     made, plain = exported(name)
     library = Library(plain.folder, options=(str(tmp_path / "watched.c"),))
     setattr(library._made, "ptsmc_many", library._made.watched)  # noqa: B010
     samples, names = given(made), names_of(made.board)["in"]
-    samples[10, names.index("attitude_valid")] = 0.0
-    for column in [column for column in names if column.startswith("attitude[")] + ["attitude_age"]:
-        if column in names:
-            samples[10, names.index(column)] = attitude
+    of_star = [k for k, column in enumerate(names) if column.startswith("attitude")]
+    for at, said in ((10, 0.0), (15, np.nan), (20, 1e300)):
+        samples[at, of_star] = said
+        samples[at, names.index("attitude_valid")] = 0.0
     statuses, _ = flown(library, samples)
     assert library._made.raised() == 0
     assert not statuses.any()
