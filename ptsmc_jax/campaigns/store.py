@@ -234,7 +234,7 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[Path]:
     """The file beside it that is written first, and then moved into place, or is gone where that fails."""
-    making = path.with_name(f".{path.name}-{os.getpid()}")
+    making = path.with_name(f".making-{secrets.token_hex(8)}")
     try:
         yield making
         os.replace(making, path)
@@ -243,7 +243,8 @@ def _whole(path: Path) -> Iterator[Path]:
             error.filename = str(path)  # instead of one that nobody asked for
         raise
     finally:
-        making.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            making.unlink()
 
 
 def _one_line(array: re.Match[str]) -> str:

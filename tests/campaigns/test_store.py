@@ -218,7 +218,10 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
         store.write_csv(tmp_path / "a.csv", ["x"], rows())
     with pytest.raises(FileNotFoundError, match=r"'.*/none/b.json'"):
         store.write_json(tmp_path / "none" / "b.json", {})
-    assert tree(tmp_path) == {"a.csv": b"before"}
+    store.write_text(tmp_path / ("a" * 250), "as long a name as there is")
+    with pytest.raises(OSError, match=r"File name too long: '.*/b{300}'"):
+        store.write_text(tmp_path / ("b" * 300), "")
+    assert tree(tmp_path) == {"a.csv": b"before", "a" * 250: b"as long a name as there is"}
 
 
 def test_names_that_are_no_text_are_written_with_escapes(tmp_path):
