@@ -211,6 +211,9 @@ def test_what_is_no_result_is_refused(command, flown, tmp_path):
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
         ("scenario.toml", "a = [", "run holds a file that cannot be read: "),
         ("trajectory.csv", None, "run holds a simulate that is not finished"),
+        ("trajectory.csv", "", "run holds a file that cannot be read: "),
+        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1", "run holds a file that cannot be read: "),
+        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1,1.0e-", "run holds a file that cannot be read: "),
     ):
         if content is None:
             (flown / name).unlink()

@@ -131,6 +131,8 @@ def build(folder: Path) -> str:
     except KeyError as error:
         by = result.versions.get("ptsmc-jax")
         raise RefusedError(f"{folder} lacks {error}, as results of another version do ({by}); make it again") from None
+    except (csv.Error, IndexError, ValueError) as error:  # a table that is cut
+        raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     sections = [*sections, *_pictures(result), *_origin(result)]
     drawing = (HERE / "page.js").read_text(encoding="utf-8")
     library = get_plotlyjs() if result.charts else ""
