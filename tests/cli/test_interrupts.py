@@ -32,7 +32,8 @@ def test_a_ctrl_c_that_comes_while_garbage_is_collected_ends_the_command():
     assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
 
 
-def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, capsys):
+@pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
+def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, capsys, force, same):
     def stopped(making, outcome):
         (making / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
@@ -47,6 +48,6 @@ def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, ca
         show=lambda *_: pytest.fail("there is nothing to show"),
     )
     loaded = scenario.read(tmp_path / "s.toml")
-    assert searches.run(search, loaded, tmp_path / "out", force=False, quiet=True) == 130
-    assert capsys.readouterr().err == "ptsmc: interrupted; the same command goes on from here\n"
+    assert searches.run(search, loaded, tmp_path / "out", force=force, quiet=True) == 130
+    assert capsys.readouterr().err == f"ptsmc: interrupted; {same} goes on from here\n"
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}

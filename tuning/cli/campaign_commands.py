@@ -1,7 +1,6 @@
 """The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
 
 import contextlib
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +9,6 @@ from cyclopts import Parameter
 
 from tuning.cli import searches
 from tuning.cli.options import (
-    INTERRUPTED,
     Device,
     Figures,
     Force,
@@ -19,6 +17,7 @@ from tuning.cli.options import (
     ScenarioFile,
     Seed,
     Trust,
+    interrupted,
     number_between,
     prepare,
     whole_number,
@@ -146,8 +145,7 @@ def montecarlo(
         if not a_part:
             return _summarised(folder, quiet, figures)
     except KeyboardInterrupt:
-        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
-        return INTERRUPTED
+        return interrupted(force)
     if not quiet:
         campaign_terminal.share_done(folder, share, planned=dry_run)
     return 0

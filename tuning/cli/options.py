@@ -95,6 +95,13 @@ Times = Annotated[
 INTERRUPTED = 130  # exit status
 
 
+def interrupted(force: bool) -> int:
+    """Say how to go on with what was interrupted, where --force would begin it anew; returns the exit status."""
+    same = "the same command without --force" if force else "the same command"
+    print(f"ptsmc: interrupted; {same} goes on from here", file=sys.stderr)
+    return INTERRUPTED
+
+
 def times_against(against: str, times: str | None, points: int | None) -> tuple[float, ...]:
     """The times of --times, two or more between commas [s], none without it; raises UsageError where none fit."""
     if against not in ("torque", "t_f"):

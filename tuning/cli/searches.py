@@ -1,12 +1,11 @@
 """What `tune`, `pareto` and `compare` share: a long search that is shown again, gone on with, or begun."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tuning.cli.options import INTERRUPTED
+from tuning.cli.options import INTERRUPTED, interrupted
 from tuning.output import terminal
 
 if TYPE_CHECKING:
@@ -78,10 +77,11 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))
     except KeyboardInterrupt:
-        print("ptsmc: interrupted; the same command goes on from here", file=sys.stderr)
-        return STATUS["interrupted"]
+        return interrupted(force)
     if outcome.status != "interrupted":
         store.end(folder)
+    elif force:
+        interrupted(force)
     if not quiet:
         search.show(search.summary(outcome), folder, "interrupted" if outcome.status == "interrupted" else "done")
     return STATUS[outcome.status]
