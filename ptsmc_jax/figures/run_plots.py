@@ -16,6 +16,7 @@ from ptsmc_jax.theory.error_floor import Floor
 
 FAR_OFF = 3.0  # times what is drawn, from which on a limit, or a command that is not delivered, is not drawn
 SMALLEST = 1e-16  # of errors and s that are shown
+MANY_POINTS = 200_000  # of curves, from which on a place for the legend takes as long to find as they take to draw
 EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact motion is drawn, and a bound
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
@@ -44,7 +45,7 @@ def attitude(parts: Parts, log: Log, title: str = "Attitude") -> Figure:
     axes.plot(log.t, log.reference.q, color="0.6", lw=1.0, zorder=1)
     axes.plot([], [], color="0.6", lw=1.0, label="reference")
     _mark(axes, parts)
-    axes.legend(ncols=3, loc="best")
+    _legend(axes, ncols=3)
     return figure
 
 
@@ -53,7 +54,7 @@ def states(parts: Parts, log: Log, title: str = "States") -> Figure:
     figure, axes = figure_of(title, "state")
     _components(axes, log.t, log.x, "x")
     _mark(axes, parts)
-    axes.legend(ncols=2)
+    _legend(axes, ncols=2)
     return figure
 
 
@@ -73,7 +74,7 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _above_smallest(axes)
     _mark(axes, parts)
-    axes.legend()
+    _legend(axes)
     return figure
 
 
@@ -82,7 +83,7 @@ def rate(parts: Parts, log: Log) -> Figure:
     figure, axes = figure_of("Body rate", "rate [rad/s]")
     _components(axes, log.t, log.x.w, "w")
     _mark(axes, parts)
-    axes.legend()
+    _legend(axes)
     return figure
 
 
@@ -109,7 +110,7 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     if limit is not None:
         _limit(axes, limit, unit)
     _mark(axes, parts)
-    axes.legend()
+    _legend(axes)
     return figure
 
 
@@ -133,7 +134,7 @@ def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, un
     if limit is not None:
         _limit(axes, float(limit), f" {unit}")
     _mark(axes, parts)
-    axes.legend(ncols=2)
+    _legend(axes, ncols=2)
     return figure
 
 
@@ -147,7 +148,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
     axes.set_yscale("log")
     _above_smallest(axes)
     _mark(axes, parts)
-    axes.legend()
+    _legend(axes)
     return figure
 
 
@@ -199,7 +200,7 @@ def disturbance(parts: Parts, log: Log) -> Figure:
     axes.plot(log.t, log.disturbance, color="black", lw=1.2, ls=(0, (5, 2)), zorder=5)
     axes.plot([], [], color="black", lw=1.2, ls=(0, (5, 2)), label="true $d_i$")
     _mark(axes, parts)
-    axes.legend(ncols=2)
+    _legend(axes, ncols=2)
     return figure
 
 
@@ -255,6 +256,12 @@ def _above_smallest(axes: Axes) -> None:
     """What is below `SMALLEST`, of whatever is drawn, leaves the axis."""
     low, high = axes.get_ylim()
     axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
+
+
+def _legend(axes: Axes, ncols: int = 1) -> None:
+    """The legend where it covers least of the curves; at a corner where these have too many points to look for that."""
+    points = sum(np.size(line.get_xdata()) for line in axes.lines)
+    axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")
 
 
 def _limit(axes: Axes, limit: float, unit: str) -> None:

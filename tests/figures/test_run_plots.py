@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import ptsmc_jax
 from ptsmc_jax.figures import run_plots
@@ -49,3 +50,14 @@ def test_a_command_far_beyond_what_is_delivered_leaves_its_axis():
     assert flight.metrics["peak_torque"] > 100 * 1e-3
     assert max(map(abs, axes.get_ylim())) == pytest.approx(run_plots.FAR_OFF * 1e-3)
     assert any(label.endswith("beyond this axis") for label in axes.get_legend_handles_labels()[1])
+
+
+@pytest.mark.parametrize(("points", "where"), [(100, "best"), (300_000, "upper right")])
+def test_the_legend_of_a_long_run_has_its_corner(points, where):
+    """Matplotlib looks for a place at each point of each curve, and warns of it where that is slow."""
+    axes = Figure().subplots()
+    axes.plot(np.zeros(points), label="q")
+    run_plots._legend(axes)
+    legend = axes.get_legend()
+    assert legend is not None
+    assert legend._loc == legend.codes[where]
