@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +16,7 @@ from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
 
 FAR_OFF = 3.0  # times what is drawn, from which on a limit, or a command that is not delivered, is not drawn
-SMALLEST = 1e-16  # of errors and s that are shown
+SMALLEST, LARGEST = 1e-16, 1e100  # of errors and s that are shown; of all that a run that diverges leaves
 MANY_POINTS = 200_000  # of curves, from which on a place for the legend takes as long to find as they take to draw
 EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact motion is drawn, and a bound
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
@@ -23,6 +24,7 @@ BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"
 
 def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
+    log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
     figures = {"torque": torque(parts, log, limit)}
     if np.any(log.error):  # else there is nothing that log axes show
         figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), **figures}
@@ -99,9 +101,10 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
         axes.plot([], [], **EXACT, label="exact, perfect estimate")
         if np.nanmax(np.abs(u)) > reach:
             axes.set_ylim(-reach, reach)
-    row, column = np.unravel_index(np.argmax(np.abs(log.commanded)), log.commanded.shape)
+    row, column = np.unravel_index(np.argmax(np.nan_to_num(np.abs(log.commanded))), log.commanded.shape)
     peak = log.commanded[row, column]
-    of = "peak" if np.array_equal(log.u, log.commanded) else "peak of the command"  # which then lies off the curves
+    delivered = np.array_equal(log.u, log.commanded, equal_nan=True)  # else it lies off the curves
+    of = "peak" if delivered else "peak of the command"
     label = f"{of} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
     if abs(peak) > reach:
         axes.plot([], [], color="none", label=f"{label}, beyond this axis")

@@ -1,6 +1,7 @@
 """What figures of a run say, read back from their legends."""
 
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -61,3 +62,17 @@ def test_the_legend_of_a_long_run_has_its_corner(points, where):
     legend = axes.get_legend()
     assert legend is not None
     assert legend._loc == legend.codes[where]
+
+
+def test_a_run_that_diverges_is_drawn_without_warnings():
+    """Beyond 1e154 squares are infinite: the axis of s ended at 10, and the peak of the command was "nan"."""
+    tables = untuned(SHORT_CHAIN) | {"loop": {"mode": "sampled", "period": 0.3, "t_end": 400.0}}
+    flight = ptsmc_jax.simulate(ptsmc_jax.replace(from_tables(tables), controller__k1=100.0))
+    assert flight.status == "diverged"
+    with warnings.catch_warnings(action="error"):
+        figures = flight.plot("torque", "sliding", "error", "convergence")
+        for figure in figures.values():
+            figure.draw_without_rendering()
+    (torque,), (sliding,) = figures["torque"].axes, figures["sliding"].axes
+    assert not any("nan" in label for label in torque.get_legend_handles_labels()[1])
+    assert sliding.get_ylim()[1] > 1e90

@@ -56,4 +56,5 @@ def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch
     monkeypatch.setattr(campaign_summary.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
     tables = SimpleNamespace(controller=SimpleNamespace(t_f=1.0), plant=SimpleNamespace(kind="spacecraft"))
     folder: Any = SimpleNamespace(flights=None, scenario=tables)
-    assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == ([100, 250], 250)
+    assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == {"fan": ([100, 250], 250)}
+    assert campaign_summary._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes

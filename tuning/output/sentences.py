@@ -75,9 +75,9 @@ def run_lines(summary: Summary) -> list[str]:
     bad_time = summary["bad_time"]
     when = "" if bad_time is None or bad_time != bad_time else f", at {bad_time:.4g} s"
     what = f", {summary['reason']}{when}" if summary["reason"] else ""
-    beside = floor(summary.get("window_error"), summary.get("floor"))
-    error = [f"window error {summary['window_error']:.3e}{beside}"] if summary.get("window_error") is not None else []
-    return [f"status: {summary['status']}{what}", *error]
+    error = summary.get("window_error")
+    told = [] if error is None or error != error else [f"window error {error:.3e}{floor(error, summary.get('floor'))}"]
+    return [f"status: {summary['status']}{what}", *told]
 
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:

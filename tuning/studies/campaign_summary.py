@@ -303,14 +303,11 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     fine = np.isin(outcome, ("ok", plots.AT_TIMES))
     bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
     some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
-    figures["torque_by_angle"] = plots.torque_by_angle(
-        frame["initial_angle"].to_numpy()[some],
-        frame["peak_torque"].to_numpy()[some],
-        outcome[some],
-        totals,
-        limits.get("peak_torque"),
-        kind,
-    )
+    angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
+    if np.isfinite(torque).any():
+        figures["torque_by_angle"] = plots.torque_by_angle(
+            angle, torque, outcome[some], totals, limits.get("peak_torque"), kind
+        )
     drivers = summary["drivers"].get("window_error", {})
     strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
     if strongest:
