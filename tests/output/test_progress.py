@@ -117,6 +117,12 @@ def test_a_comparison_says_which_requirement_each_law_breaks_and_in_how_many_tri
     assert [row[-2:] for row in table.rows] == [("12 of 1000: NOT met", "no"), ("0 of 1000", "yes")]
 
 
+def test_numbers_of_laws_have_no_exponents_below_a_million():
+    """An effort of 2697 N m s stood there as 2.7e+03, 1500 times the floor as 1.5e+03."""
+    assert law_sentences._cell(law_sentences.FLOOR, {"window_error": 1.5e-3, "floor": 1e-6}) == "1500"
+    assert law_sentences._cell(law_sentences.FLOOR, {"window_error": None, "floor": 1e-6}) == "-"
+
+
 def test_of_inputs_that_rank_the_trials_alike_only_the_first_is_a_driver():
     rng = np.random.default_rng(0)
     angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)

@@ -185,7 +185,9 @@ def _beyond(verdict: Summary) -> str:
 
 def _cell(value: Value, law: Summary) -> str:
     number = value.of(law)
-    return "unlimited" if number is not None and math.isinf(number) else digits(number, value.digits)
+    if number is not None and math.isinf(number):
+        return "unlimited"
+    return sentences.ratio(number) if value.digits == ".3g" else digits(number, value.digits)
 
 
 def lines(summary: Summary) -> Iterator[str]:
