@@ -28,7 +28,7 @@ class Progress(Bar):
         if total != self._total:
             self._total = total
             self._bar.reset(self._task, total=total or None)
-        limits = "limits met" if over == 0.0 else f"{100 * over:.3g} % beyond a limit"
+        limits = "limits met" if over == 0.0 else f"{sentences.ratio(100.0 * over)} % beyond a limit"
         best = f": {self._goal} {value:.4g}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done, total=total or None, description=what + best)
         self._lines(what + best, done, total)
