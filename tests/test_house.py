@@ -112,7 +112,7 @@ HOUSE = {
             cells made_again page_captions page_charts progress_lines
             margin_sentences pointing_sentences
             search_sentences sentences
-            law_sentences
+            campaign_sentences front_sentences law_sentences
             page terminal
             campaign_terminal
         """,

@@ -10,7 +10,7 @@ import pytest
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
-from tuning.output import campaign_terminal, sentences
+from tuning.output import campaign_sentences, campaign_terminal
 from tuning.studies import campaign_summary, reasons
 
 
@@ -65,7 +65,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
     summary = {"verdicts": [{"metric": "peak_torque"}], "drivers": drivers, "flown": 401}
-    (said,) = sentences.campaign_drivers(summary)
+    (said,) = campaign_sentences.drivers(summary)
     assert ", wheel_failure_wheel (56 %): rank correlation" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
     told = why(Rows(), ["peak_torque"], 1)

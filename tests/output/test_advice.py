@@ -9,7 +9,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.simulation.catalogues import MARGINS, NO_SIGN
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.cli import campaign_commands
-from tuning.output import search_sentences, sentences
+from tuning.output import campaign_sentences, search_sentences, sentences
 from tuning.search import gains
 from tuning.studies import tune_files, tuner
 
@@ -183,7 +183,9 @@ def test_no_largest_settling_time_is_said_where_a_run_that_ended_never_settled(w
     at = {"value": 56.0, "low": 55.0, "high": 57.0}
     settling = {"without_value": without, "max": 57.2, "0.5": at, "0.9973": at}
     counts = {"ok": 58, "missed": 1, "diverged": 1}
-    (table,) = sentences.campaign({"plant": "spacecraft", "counts": counts, "quantiles": {"settling_time": settling}})
+    (table,) = campaign_sentences.quantiles(
+        {"plant": "spacecraft", "counts": counts, "quantiles": {"settling_time": settling}}
+    )
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
 
 

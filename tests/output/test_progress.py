@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.numerics import statistics
-from tuning.output import campaign_terminal, law_sentences, progress_lines, sentences, terminal
+from tuning.output import campaign_sentences, campaign_terminal, law_sentences, progress_lines, terminal
 from tuning.output.cells import Table
 from tuning.output.progress_lines import Lines
 
@@ -72,7 +72,7 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
         "controller": {"kind": "prescribed_time", "eta": 3.0},
         "observer": {"kind": "nonlinear", "gain": [1.0, 2.0, 3.0]},
     }
-    rows = sentences.flown_gains(tables, "spacecraft").rows
+    rows = campaign_sentences.flown_gains(tables, "spacecraft").rows
     assert rows == [
         ("controller.kind", "prescribed_time", ""),
         ("controller.eta", "3", ""),
@@ -83,12 +83,12 @@ def test_the_gains_that_a_campaign_flew_with_have_their_units():
         "controller": {"kind": "pd", "disturbance_bound": 0.1},
         "observer": {"kind": "finite_time", "gain": [0.02]},
     }
-    assert sentences.flown_gains(bounds, "spacecraft").rows[1::2] == [
+    assert campaign_sentences.flown_gains(bounds, "spacecraft").rows[1::2] == [
         ("controller.disturbance_bound", "0.1", "N m"),
         ("observer.gain", "0.02", "N m/s"),  # the nonlinear one's is in N m s
     ]
     own = {"controller": {"kind": "own", "t_f": 30.0, "k": 2.0}}  # whose class may say another unit than a built-in k
-    assert sentences.flown_gains(own, "spacecraft").rows[1:] == [
+    assert campaign_sentences.flown_gains(own, "spacecraft").rows[1:] == [
         ("controller.t_f", "30", "s"),
         ("controller.k", "2", ""),
     ]
@@ -137,9 +137,9 @@ def test_what_chance_shows_is_not_said_to_drive_a_metric():
     drivers = statistics.drivers(inputs, metric)
     assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
     summary = {"verdicts": [], "flown": 300, "drivers": {"window_error": drivers}}
-    assert not list(sentences.campaign_drivers(summary))
+    assert not list(campaign_sentences.drivers(summary))
     summary["drivers"] = {"window_error": statistics.drivers({"y": metric + rng.normal(size=300)}, metric)}
-    (said,) = sentences.campaign_drivers(summary)
+    (said,) = campaign_sentences.drivers(summary)
     assert said.startswith("window_error hangs on y +0.")
 
 

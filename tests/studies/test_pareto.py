@@ -13,7 +13,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
 from tests.output.pages import checked
-from tuning.output import sentences, terminal
+from tuning.output import front_sentences, terminal
 from tuning.studies import judging, pareto
 
 
@@ -79,19 +79,21 @@ def test_a_front_with_gains_that_never_fly_can_be_told():
     lost = {"gains": {"eta": 3.0}, "peak": None, "mean_peak": None, "rms": None, "interval": None, "failures": 9,
             "knee": False, "meets": False, "dominated": False}  # fmt: skip
     summary = {"plant": "spacecraft", "points": [lost], "requirements": [], "paper": lost, "paper_refused": None}
-    assert sentences.front(summary).rows == [
+    assert front_sentences.front(summary).rows == [
         ("", "-", "-", "-", "-", "3", "9 failed or missed"),
         ("paper", "-", "-", "-", "-", "3", "9 failed or missed"),
     ]
-    assert not any("without a point" in line for line in sentences.front_lines({**summary, "steps": 1}))
-    assert any("without a point of their own: 2," in line for line in sentences.front_lines({**summary, "steps": 3}))
+    assert not any("without a point" in line for line in front_sentences.front_lines({**summary, "steps": 1}))
+    assert any(
+        "without a point of their own: 2," in line for line in front_sentences.front_lines({**summary, "steps": 3})
+    )
 
 
 def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
     each = {"gains": {"observer_gain_1": 5.0, "observer_gain_2": 6.0}, "peak": 0.3, "mean_peak": 0.2, "rms": 1e-5,
             "interval": None, "failures": 0, "knee": False, "meets": True, "dominated": False}  # fmt: skip
     others = {"paper": {**each, "gains": {"observer_gain": 10.0}}, "before": {**each, "gains": {}}}
-    rows = sentences.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
+    rows = front_sentences.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
     assert [row[5:7] for row in rows] == [("5", "6"), ("10", "10"), ("-", "-")]
 
 

@@ -12,7 +12,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
-from tuning.output import sentences
+from tuning.output import front_sentences
 from tuning.studies import judging, posing, slew_times
 
 
@@ -138,17 +138,17 @@ def test_times_without_gains_are_told():
     slew = {"t_f": 8.0, "gains": {"eta": 3.0}, "rms": 1e-5, "interval": [0.9e-5, 1.1e-5], "costs": {"peak_torque": 0.2},
             "failures": 2, "meets": False}  # fmt: skip
     told = {"plant": "spacecraft", "slews": [slew], "without": [4.0], "requirements": ["peak_torque"], "trials": 1000}
-    assert list(sentences.slew_times_lines(told)) == [
+    assert list(front_sentences.slew_times_lines(told)) == [
         "no gains keep the limits on the training trials at t_f = 4 s",
         "at none of these times do gains meet every requirement on the fresh trials",
     ]
-    assert sentences.slew_times(told).rows == [
+    assert front_sentences.slew_times(told).rows == [
         ("8", "1.000e-05", "10.0 %", "0.2", "3", "2 failed or missed"),
     ]
-    assert sentences.slew_times_heading(told) == "gains tuned for 1 prescribed time, judged on 1000 fresh trials"
+    assert front_sentences.slew_times_heading(told) == "gains tuned for 1 prescribed time, judged on 1000 fresh trials"
     nothing = {**told, "slews": [], "requirements": []}
-    assert sentences.slew_times(nothing).rows == []
-    assert np.isfinite(len(list(sentences.slew_times_lines(nothing))))
+    assert front_sentences.slew_times(nothing).rows == []
+    assert np.isfinite(len(list(front_sentences.slew_times_lines(nothing))))
 
 
 def test_the_usual_bounds_of_delta_lie_below_the_shortest_time():

@@ -16,7 +16,7 @@ from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import error_floor
 from ptsmc_jax.theory.error_floor import Model
 from tests.helpers import chain_parts, parts, vector
-from tuning.output import sentences
+from tuning.output import campaign_sentences, front_sentences, sentences
 
 PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
 
@@ -248,11 +248,11 @@ def test_where_there_is_no_floor_nothing_is_said(least):
     flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
     for known in ({}, {"floor": least}):
         assert sentences.run_lines({**run, **known}) == ["status: ok", "window error 1.000e-05"]
-        assert list(sentences.campaign_error({**flown, **known})) == []
-        assert list(sentences.front_lines({**front, **known})) == []
-        assert "times the floor" not in sentences.front({**front, **known}).head
-    assert sentences.front({**front, "floor": 5e-6}).head[5] == "times the floor"
-    assert sentences.front({**front, "floor": 5e-6}).rows[0][5] == "2"
+        assert list(campaign_sentences.error({**flown, **known})) == []
+        assert list(front_sentences.front_lines({**front, **known})) == []
+        assert "times the floor" not in front_sentences.front({**front, **known}).head
+    assert front_sentences.front({**front, "floor": 5e-6}).head[5] == "times the floor"
+    assert front_sentences.front({**front, "floor": 5e-6}).rows[0][5] == "2"
 
 
 def test_a_floor_is_shown_by_its_number_and_not_by_its_course():

@@ -1,5 +1,6 @@
 """What `tune`, `pareto` and `compare` share: a long search that is shown again, gone on with, or begun."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

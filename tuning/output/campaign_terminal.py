@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import percent
-from tuning.output import pointing_sentences, sentences, terminal
+from tuning.output import campaign_sentences, pointing_sentences, sentences, terminal
 from tuning.output.cells import Table
 from tuning.output.progress_lines import Bar
 
@@ -42,16 +42,16 @@ class Progress(Bar):
 
 def campaign(summary: dict[str, Any], folder: Path) -> None:
     """Counts, quantiles and verdicts, as `summary.json` says."""
-    terminal.say(*sentences.campaign_counts(summary))
-    for table in sentences.campaign(summary):
+    terminal.say(*campaign_sentences.counts(summary))
+    for table in campaign_sentences.quantiles(summary):
         terminal.table(table)
     terminal.say(*pointing_sentences.heading(summary))
     for table in pointing_sentences.tables(summary):
         terminal.table(table)
     terminal.say(
-        *sentences.campaign_error(summary),
+        *campaign_sentences.error(summary),
         *map(sentences.verdict, summary["verdicts"]),
-        *sentences.campaign_drivers(summary),
+        *campaign_sentences.drivers(summary),
         *sentences.cautions(summary),
         f"results in {folder}",
     )

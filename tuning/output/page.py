@@ -21,7 +21,9 @@ from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 from tuning.output import (
+    campaign_sentences,
     cells,
+    front_sentences,
     law_sentences,
     made_again,
     margin_sentences,
@@ -266,19 +268,19 @@ def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."
     sections = [
         Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
-        Section("Points", [_table(sentences.front(summary)), _text(sentences.front_lines(summary))]),
+        Section("Points", [_table(front_sentences.front(summary)), _text(front_sentences.front_lines(summary))]),
     ]
     gains = "Gains" if summary["status"] == "met" else "No gains"
-    lines = [*search_sentences.along_the_front(summary), sentences.front_heading(summary)]
+    lines = [*search_sentences.along_the_front(summary), front_sentences.front_heading(summary)]
     return _with_headline(summary, lines, f"{gains} on the front meet every requirement"), sections
 
 
 def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    blocks = [_table(sentences.slew_times(summary)), _text(sentences.slew_times_lines(summary))]
+    blocks = [_table(front_sentences.slew_times(summary)), _text(front_sentences.slew_times_lines(summary))]
     met, times = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
     headline = f"At {met} of {times} prescribed times gains meet every requirement"
-    lines = [*search_sentences.fastest(summary), sentences.slew_times_heading(summary)]
+    lines = [*search_sentences.fastest(summary), front_sentences.slew_times_heading(summary)]
     return _with_headline(summary, lines, headline), [Section("What a faster slew costs", blocks)]
 
 
@@ -319,16 +321,18 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
         "Shares of time within a limit, of which more is better: what 99.73 % of the trials reach, and the smallest. A "
         "failed trial counts as 0."
     )
-    quantiles = [_table(table, said) for table, said in zip(sentences.campaign(summary), (note, larger), strict=False)]
+    quantiles = [
+        _table(table, said) for table, said in zip(campaign_sentences.quantiles(summary), (note, larger), strict=False)
+    ]
     sections = [
         *_limits(summary["verdicts"]),
-        Section("Metrics", [*quantiles, _text(sentences.campaign_drivers(summary))]),
-        Section("Gains", [_table(sentences.flown_gains(result.scenario, result.kind))]),
+        Section("Metrics", [*quantiles, _text(campaign_sentences.drivers(summary))]),
+        Section("Gains", [_table(campaign_sentences.flown_gains(result.scenario, result.kind))]),
     ]
     pointing = [_table(table) for table in pointing_sentences.tables(summary)]
     if pointing:
         sections.insert(-1, Section("Pointing", [_text(pointing_sentences.heading(summary)), *pointing]))
-    lines = [*sentences.campaign_counts(summary), *sentences.campaign_error(summary)]
+    lines = [*campaign_sentences.counts(summary), *campaign_sentences.error(summary)]
     return _verdict(summary, lines, bool(summary["verdicts"])), sections
 
 

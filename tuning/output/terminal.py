@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tuning.output import margin_sentences, search_sentences, sentences
+from tuning.output import front_sentences, margin_sentences, search_sentences, sentences
 from tuning.output.progress_lines import Bar
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
-    from tuning.output import law_sentences
+    from tuning.output import law_sentences, sentences
 
     alike = f"each law is tuned alike and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
     say(f"comparison {how}: {alike}")
@@ -96,13 +96,13 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
     """A front of accuracy against torque, or against t_f, as its `summary.json` says."""
     if "slews" in summary:
-        say(f"{how}: {sentences.slew_times_heading(summary)}")
-        table(sentences.slew_times(summary))
-        say(*sentences.slew_times_lines(summary))
+        say(f"{how}: {front_sentences.slew_times_heading(summary)}")
+        table(front_sentences.slew_times(summary))
+        say(*front_sentences.slew_times_lines(summary))
     else:
-        say(f"front {how}: {sentences.front_heading(summary)}")
-        table(sentences.front(summary))
-        say(*sentences.front_lines(summary))
+        say(f"front {how}: {front_sentences.front_heading(summary)}")
+        table(front_sentences.front(summary))
+        say(*front_sentences.front_lines(summary))
     say(*sentences.cautions(summary), f"results in {folder}")
 
 

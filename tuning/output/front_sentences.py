@@ -1,0 +1,107 @@
+"""What the fronts of `ptsmc pareto` say: accuracy against torque, and against the prescribed time."""
+
+from collections.abc import Iterator
+
+from ptsmc_jax.simulation.catalogues import CATALOGUES
+from tuning.output import sentences
+from tuning.output.cells import Summary, Table, digits, valued
+
+
+def front(summary: Summary) -> Table:
+    """Points that no other one beats, and the paper's and the scenario's own gains."""
+    from tuning.search.gains import base
+
+    units = CATALOGUES[summary["plant"]]
+    points = [("", point) for point in summary["points"] if not point["dominated"]]
+    names = list(points[0][1]["gains"]) if points else []
+    points += [(name, summary[name]) for name in ("paper", "before") if name in summary]
+    rows: list[tuple[str, ...]] = []
+    for name, point in points:
+        gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
+        cells = [digits(value, ".4g") for value in gains]
+        if summary.get("floor"):
+            cells.insert(0, sentences.ratio(sentences.over_floor(point["rms"], summary["floor"])))
+        numbers = (digits(point["peak"], ".4g"), digits(point["mean_peak"], ".4g"), digits(point["rms"], ".3e"))
+        rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
+    torque, beside = units["peak_torque"].unit, ("times the floor",) if summary.get("floor") else ()
+    head = f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{units['window_error'].unit}]", "+-"
+    return Table(("", *head, *beside, *names, ""), rows)
+
+
+def _spread(point: Summary) -> str:
+    """Half the interval of a point's RMS error, as a share of that error."""
+    if not point["interval"]:
+        return "-"
+    low, high = point["interval"]
+    return f"{50 * (high - low) / point['rms']:.1f} %"
+
+
+def _marks(point: Summary) -> str:
+    """What is worth knowing of a point besides its numbers."""
+    marks = [word for word in ("knee", "meets") if point.get(word)]
+    return ", ".join(marks + ([f"{point['failures']} failed or missed"] if point["failures"] else []))
+
+
+def front_lines(summary: Summary) -> Iterator[str]:
+    """What is left out of a front, and whether anything on it will do."""
+    yield from sentences.paper_refused(summary)
+    if summary.get("floor"):
+        yield f"the floor is {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
+    kept = [point for point in summary["points"] if not point["dominated"]]
+    found = len(summary["points"])
+    without = summary.get("steps", found) - found
+    if without:
+        yield f"limits without a point of their own: {without}, which no gains keep, or the same gains as at another"
+    lost = found - len(kept)
+    if lost:
+        yield f"points left out: {lost}, each beaten by another in error and torque by more than its interval"
+    if summary["requirements"] and not any(point["meets"] for point in kept):
+        yield "no gains on the front meet every requirement"
+
+
+def front_heading(summary: Summary) -> str:
+    """How many points, and on what they were judged."""
+    kept = sum(not point["dominated"] for point in summary["points"])
+    return f"{kept} points, each judged on {summary['trials']} fresh trials"
+
+
+def slew_times(summary: Summary) -> Table:
+    """Each prescribed time: the error, what it costs, its gains."""
+    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
+    costs, names = (list(slews[0][key]) if slews else [] for key in ("costs", "gains"))
+    rows: list[tuple[str, ...]] = []
+    for slew in slews:
+        numbers = (f"{slew['t_f']:g}", digits(slew["rms"], ".3e"), _spread(slew))
+        cells = [digits(slew["costs"][name], ".4g") for name in costs] + [f"{slew['gains'][n]:.4g}" for n in names]
+        rows.append((*numbers, *cells, _marks(slew)))
+    head = (f"{name.replace('_', ' ')} [{units[name].unit}]" for name in costs)
+    return Table(("t_f [s]", f"RMS error [{units['window_error'].unit}]", "+-", *head, *names, ""), rows)
+
+
+def slew_times_lines(summary: Summary) -> Iterator[str]:
+    """What the fastest slew costs beside the slowest, and which times have no gains."""
+    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
+    if len(slews) > 1:
+        fast, slow = slews[0], slews[-1]
+        for name in fast["costs"]:
+            one, other = fast["costs"][name], slow["costs"][name]
+            if one and other:
+                yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
+                       f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
+        if fast["rms"] and slow["rms"]:
+            error, times = (
+                valued(fast["rms"], "window_error", summary["plant"]),
+                sentences.ratio(fast["rms"] / slow["rms"]),
+            )
+            yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {times} times that at {slow['t_f']:g} s"
+    for t_f in summary["without"]:
+        yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"
+    if summary["requirements"] and not any(slew["meets"] for slew in slews):
+        yield "at none of these times do gains meet every requirement on the fresh trials"
+
+
+def slew_times_heading(summary: Summary) -> str:
+    """How many times, and on what they were judged."""
+    many = len(summary["slews"]) != 1
+    times = f"{len(summary['slews'])} prescribed time{'s' if many else ''}"
+    return f"gains tuned for {times}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
