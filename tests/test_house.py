@@ -110,7 +110,7 @@ HOUSE = {
         """,
         "output": """
             cells made_again page_captions page_charts progress_lines
-            margin_sentences pointing_sentences
+            margin_sentences page_parts pointing_sentences
             search_sentences sentences
             campaign_sentences front_sentences law_sentences
             page terminal
