@@ -175,7 +175,7 @@ def test_a_narrow_terminal_cuts_no_numbers(capsys, monkeypatch):
 
 def test_how_far_beyond_a_limit_has_no_exponent(capsys):
     """A search beyond twenty times a limit said "1.92e+03 % beyond a limit"."""
-    with terminal.Progress(quiet=False, goal="error") as tell:  # the tests' output is no terminal
-        tell._lines = Lines(silent=False, clock=iter([0.0, 99.0]).__next__)
-        tell("searching", 1, 7, 1e-5, 19.2)
+    tell = terminal.Progress(quiet=False, goal="error")  # the tests' output is no terminal
+    tell._lines = Lines(silent=False, clock=iter([0.0, 99.0]).__next__)
+    tell("searching", 1, 7, 1e-5, 19.2)
     assert "1920 % beyond a limit" in capsys.readouterr().err

@@ -68,6 +68,8 @@ def test_the_sentence_says_what_simulation_found():
     said = "the tuned gains keep peak_torque below 0.5 from t_f = 20.12 s on by theory"
     assert str(design.ShortestTime(0.5, 20.1234, 20.5, 1)) == f"{said}, 20.5 s as flown"
     assert str(design.ShortestTime(0.5, 20.1234, None, 1)) == f"{said}; none was found by simulation"
+    share = str(design.ShortestTime(0.5, 20.1234, 20.5, 1000, 0.9, "N m"))
+    assert share.startswith("the tuned gains keep peak_torque below 0.5 N m in 90 % of trials from t_f = 20.12 s on")
 
 
 def test_shortest_time_of_a_chain():

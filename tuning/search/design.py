@@ -32,11 +32,12 @@ class ShortestTime:
     simulated: float | None  # as flown; None: not found
     trials: int
     quantile: float | None = None  # share of trials that must keep it; None: every one
+    unit: str | None = None  # of the limit
 
     def __str__(self) -> str:
         """All of it in one line."""
         share = "" if self.quantile is None else f" in {100 * self.quantile:g} % of trials"
-        limit = f"peak_torque below {self.limit:g}{share}"
+        limit = f"peak_torque below {self.limit:g} {self.unit or ''}".rstrip() + share
         if self.theory is None:
             return f"no t_f up to {FARTHEST:g} times the scenario's keeps {limit} with the tuned gains"
         flown = "; none was found by simulation" if self.simulated is None else f", {self.simulated:.4g} s as flown"
@@ -53,6 +54,7 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     ready = scenario.study(flown)
     drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
     limit, quantile = asked.limit, None if len(trials) == 1 else asked.implied_by.quantile
+    told = len(trials), quantile, asked.unit
     deciding = (must_keep(len(trials), quantile, asked.confidence) or len(trials)) - 1  # of peaks in order
 
     def predicted(t_f: float) -> float:
@@ -62,7 +64,7 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
     rule = _smallest(predicted, limit, own, lowest, FARTHEST * own, CLOSE, 60)
     if rule is None:
-        return ShortestTime(limit, None, None, len(trials), quantile)
+        return ShortestTime(limit, None, None, *told)
 
     def simulated_in(ready: scenario.Study, longest: float) -> float | None:
         def simulated(t_f: float) -> float:
@@ -81,7 +83,7 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
         with contextlib.suppress(ScenarioError):  # a reference that runs into the law's singularity later, say
             roomy = scenario.study(scenario.replace(flown, controller__t_f=longest, loop__t_end=t_end))
             shortest = simulated_in(roomy, longest)
-    return ShortestTime(limit, rule, shortest, len(trials), quantile)
+    return ShortestTime(limit, rule, shortest, *told)
 
 
 @programs.jit
