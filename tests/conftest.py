@@ -34,7 +34,7 @@ CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studie
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)
 
-MANY = 40_000  # mappings of memory; Linux allows a process 65 530, and a worker comes to some 33 000
+MANY = 15_000  # mappings of memory; Linux allows a process 65 530, but with 33 000 a worker came to 7 GB, now to 5 or 6
 
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
