@@ -71,7 +71,7 @@ HOUSE = {
             build cautions own_checks reading
             flyable tuned
         """,
-        "campaigns": "margin_verdicts montecarlo rows store | plans runs | campaign | cluster",
+        "campaigns": "margin_verdicts montecarlo store | plans rows runs | campaign | cluster",
         "onboard": """
             expressions
             control derived origins rules

@@ -9,7 +9,6 @@ import io
 import json
 import os
 import re
-import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,10 @@ from typing import Any
 
 import polars as pl
 
+from ptsmc_jax.campaigns import store
+
 FOLDER = "trials"
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
-_MAKING = ".making-"  # how the name of a file begins that is being written
 
 
 @dataclass(frozen=True, order=True)
@@ -51,16 +51,10 @@ class Rows:
         """Write a part from a file's content; raises OSError where it does not fit on the disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
-        making = self.folder / f"{_MAKING}{secrets.token_hex(8)}"
-        try:
-            with making.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(making, path)
-        except BaseException:
-            making.unlink(missing_ok=True)
-            raise
+        with store.whole(path) as making, making.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
         return Part(first, count, path)
 
     def parts(self) -> tuple[list[Part], list[Path]]:
@@ -81,7 +75,7 @@ class Rows:
 
     def tidy(self, parts: Iterable[Part]) -> None:
         """Remove what a killed process left unfinished, and all parts but these, which `parts` found whole."""
-        for path in self.folder.glob(f"{_MAKING}*"):
+        for path in self.folder.glob(f"{store.MAKING}*"):
             path.unlink(missing_ok=True)
         whole = {part.path for part in parts}
         for path in self.folder.glob("*.parquet"):

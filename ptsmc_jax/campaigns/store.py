@@ -20,6 +20,7 @@ from ptsmc_jax.scenario import parsing
 
 JOURNAL = "journal.bin"  # of a run that is not finished
 SUMMARY = "summary.json"  # of one that is
+MAKING = ".making-"  # how the name of a file begins that is being written
 MADE_OF_RESULTS = ("figures/*.png", "report.html", "worst.csv", "why.csv")  # they would pass for those of the next one
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
@@ -219,22 +220,22 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """A text file that is whole or not there; bytes of a file's name that are no UTF-8 become escapes."""
-    with _whole(path) as making:
+    with whole(path) as making:
         making.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """A CSV file that is whole or not there; numbers with as many digits as it takes to read them back exactly."""
-    with _whole(path) as making, making.open("w", newline="", encoding="utf-8") as file:
+    with whole(path) as making, making.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
 
 
 @contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
+def whole(path: Path) -> Iterator[Path]:
     """The file beside it that is written first, and then moved into place, or is gone where that fails."""
-    making = path.with_name(f".making-{secrets.token_hex(8)}")
+    making = path.with_name(f"{MAKING}{secrets.token_hex(8)}")
     try:
         yield making
         os.replace(making, path)

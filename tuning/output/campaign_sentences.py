@@ -92,12 +92,12 @@ def drivers(summary: Summary) -> Iterator[str]:
     from ptsmc_jax.numerics import statistics
 
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
-        drivers = summary["drivers"].get(name, {})
-        seen = [key for key, driver in drivers.items() if statistics.beyond_chance(driver, summary["flown"])]
-        strength = {key: max(abs(v) for v in drivers[key].values() if v is not None) for key in seen}
+        known = summary["drivers"].get(name, {})
+        seen = [key for key, driver in known.items() if statistics.beyond_chance(driver, summary["flown"])]
+        strength = {key: max(abs(v) for v in known[key].values() if v is not None) for key in seen}
         strongest = sorted((key for key in strength if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
         if strongest:
-            ranks = {key: drivers[key]["rank_correlation"] for key in strongest}  # None of a number of a wheel, say
+            ranks = {key: known[key]["rank_correlation"] for key in strongest}  # None of a number of a wheel, say
             each = {key: key if rank is None else f"{key} {rank:+.2f}" for key, rank in ranks.items()}
-            texts = (f"{text} ({100 * drivers[key]['first_order']:.0f} %)" for key, text in each.items())
+            texts = (f"{text} ({100 * known[key]['first_order']:.0f} %)" for key, text in each.items())
             yield f"{name} hangs on {', '.join(texts)}: rank correlation (share of its variance)"

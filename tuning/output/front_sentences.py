@@ -89,10 +89,8 @@ def slew_times_lines(summary: Summary) -> Iterator[str]:
                 yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
                        f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
         if fast["rms"] and slow["rms"]:
-            error, times = (
-                valued(fast["rms"], "window_error", summary["plant"]),
-                sentences.ratio(fast["rms"] / slow["rms"]),
-            )
+            error = valued(fast["rms"], "window_error", summary["plant"])
+            times = sentences.ratio(fast["rms"] / slow["rms"])
             yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {times} times that at {slow['t_f']:g} s"
     for t_f in summary["without"]:
         yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"

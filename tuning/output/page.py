@@ -266,9 +266,8 @@ def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
         "Shares of time within a limit, of which more is better: what 99.73 % of the trials reach, and the smallest. A "
         "failed trial counts as 0."
     )
-    quantiles = [
-        _table(table, said) for table, said in zip(campaign_sentences.quantiles(summary), (note, larger), strict=False)
-    ]
+    tables = campaign_sentences.quantiles(summary)
+    quantiles = [_table(table, said) for table, said in zip(tables, (note, larger), strict=False)]
     sections = [
         *_limits(summary["verdicts"]),
         Section("Metrics", [*quantiles, _text(campaign_sentences.drivers(summary))]),

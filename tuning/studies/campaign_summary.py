@@ -351,7 +351,7 @@ def _of_time(verdict: Verdict) -> str:
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
     """Errors over time of the first trials, and of that with the largest window error, flown again.
 
-    None where there is nothing that a log axis shows: no such trial ends, or none has an error.
+    No figure where there is nothing that a log axis shows: no such trial ends, or none has an error.
     """
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
     shown = trials[:DRAWN]
