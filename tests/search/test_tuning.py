@@ -498,7 +498,7 @@ def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
     own = np.array([15.13, 0.79])  # handed over at 14.34 s, between samples 71 and 72
     share = evaluate.bounds.share(own)
     run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
-    moved = [np.asarray(evaluate.bounds.gains(jnp.asarray(one))) for one in run._with_the_hand_over_on_a_sample(some)]
+    moved = [np.asarray(evaluate.bounds.gains(jnp.asarray(one))) for one in run._on_samples(some, run.share)]
     on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
     np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
     with_delta = sorted(delta for t_f, delta in moved if abs(t_f - own[0]) < 1e-9)
@@ -513,10 +513,35 @@ def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not()
     evaluate = Evaluator(shares.Bounds(("t_f",), (10.0,), (20.0,)))
     run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
     run._take(descent.Best(evaluate.bounds.share(np.array([15.13])), 0, 0.0), some, 0, afresh=True)
-    moved = [float(evaluate.bounds.gains(jnp.asarray(one))[0]) for one in run._with_the_hand_over_on_a_sample(some)]
+    moved = [float(evaluate.bounds.gains(jnp.asarray(one))[0]) for one in run._on_samples(some, run.share)]
     delta = float(some.parts.controller.delta)
     before = np.floor((15.13 - delta) / 0.2)
     np.testing.assert_allclose(moved, delta + 0.2 * (before + np.arange(descents.LATER)), atol=1e-9)
+
+
+class Narrow(Evaluator):
+    """F = (delta - 1.1)^2 up to delta = 2, where a limit is broken next to the samples, every 0.2 s; 1 + .. beyond it."""
+
+    def slopes(self, problem, share):
+        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
+        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(share)))[:, 0, 0]
+        delta = gains[:, 0]
+        near, off = delta < 2.0, np.abs(delta / 0.2 - np.round(delta / 0.2))
+        f = np.where(near, (delta - 1.1) ** 2, 1.0 + (delta - 3.5) ** 2)
+        f_slope = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
+        broken = np.where(near, 0.3 - off, -1.0)[:, None, None]
+        shape = (len(share), 1, problem.trials.size)
+        return Sloped(gains, f, np.broadcast_to(broken, shape), f, f_slope[:, None], np.zeros((*shape, 1)))
+
+
+def test_a_hand_over_that_breaks_a_limit_on_a_sample_gives_way_to_that_of_another_start():
+    """It took the place of what kept the limits: the search ended with "not met" where it knew gains that meet them."""
+    some = replace(problem(peak_torque=1.0), names=("delta",))
+    evaluate = Narrow(shares.Bounds(("delta",), (0.2,), (5.0,)))
+    run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
+    run.descend(some, {k: evaluate.bounds.share(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
+    assert run.best.over == 0.0
+    np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples beside 3.5 s
 
 
 def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():

@@ -226,8 +226,7 @@ class Descents:
 
     def again(self, problem: Problem) -> None:
         """Go on from where the best starts ended, with what has joined the problem."""
-        ranked = sorted(self._ends.items(), key=lambda item: item[1].rank)[:AGAIN]
-        self._instead(problem, [(start, end.share) for start, end in ranked])
+        self._instead(problem, [(start, end.share) for start, end in _ranked(self._ends)[:AGAIN]])
         self._finish(problem)
 
     def start_over(self, problem: Problem, starts: int, seed: int) -> None:
@@ -243,10 +242,10 @@ class Descents:
             if not better:
                 self._best, self._problem, self._from, self._ends = found
 
-    def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]], fixed: Sequence[int] = ()) -> None:
+    def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]]) -> None:
         """Descend from each of these (start, shares); the best point found takes the place of the best so far."""
         for k, (start, share) in enumerate(ends):
-            self._descend(problem, start, Start(share, CAREFUL, fixed), self._steps, afresh=k == 0)
+            self._descend(problem, start, Start(share, CAREFUL), self._steps, afresh=k == 0)
 
     def sweep(self, problem: Problem, own: np.ndarray) -> None:
         """The best of the scenario's gains and of points spread widely, where there are no slopes."""
@@ -273,7 +272,7 @@ class Descents:
                    partial(self._keep, 0), size)  # fmt: skip
         finally:  # interrupted too
             self._take(best, tightened, 0, afresh=True)
-        on_samples = np.asarray(self._with_the_hand_over_on_a_sample(problem))
+        on_samples = np.asarray(self._on_samples(problem, self.share))
         if on_samples.size:
             best, _ = self._best_of(tightened, on_samples)
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
@@ -281,9 +280,8 @@ class Descents:
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.so_far)
         self._descend(problem, self._from, Start(self.share, CAREFUL), self._steps, close=FINISH * CLOSE)
+        self._hand_over_on_a_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
-        ends = [(self._from, share) for share in self._with_the_hand_over_on_a_sample(problem)]
-        self._instead(problem, ends, fixed=times)
         others = [k for k in range(len(problem.names)) if k not in times]
         if self._own is not None and others:
             self._take_back(problem, self._own, others)
@@ -309,8 +307,23 @@ class Descents:
     def _as_good(self, best: Best) -> bool:
         return best.beyond <= self.best.beyond and best.f <= self.best.f + SAME
 
-    def _with_the_hand_over_on_a_sample(self, problem: Problem) -> list[np.ndarray]:
-        """The best gains with the nearest hand-overs that are flown as they are trained; none where all are.
+    def _hand_over_on_a_sample(self, problem: Problem) -> None:
+        """The best point whose hand-over is flown as it is trained, the other gains anew, in place of the best so far.
+
+        Where that was admissible and what it becomes is not, from where other starts ended.
+        """
+        admissible, moved = self.best.over == 0.0, False
+        times = [k for k, name in enumerate(problem.names) if name in TIMES]
+        others = [(k, end) for k, end in _ranked(self._ends) if k != self._from]
+        for number, end in [(self._from, self.best), *others]:
+            for share in self._on_samples(problem, end.share):
+                self._descend(problem, number, Start(share, CAREFUL, times), self._steps, afresh=not moved)
+                moved = True
+            if not admissible or self.best.over == 0.0:
+                return
+
+    def _on_samples(self, problem: Problem, share: np.ndarray) -> list[np.ndarray]:
+        """Shares, (gains,), with the nearest hand-overs that are flown as they are trained; none where all are.
 
         A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
         """
@@ -319,7 +332,8 @@ class Descents:
         at = {name: k for k, name in enumerate(problem.names) if name in TIMES}
         if not at or not clock.anchored or "delta" not in law.tunable:  # a law without it does not hand over
             return []
-        t_f, delta = (float(self.gains[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
+        own = np.asarray(bounds.gains(jnp.asarray(share)))
+        t_f, delta = (float(own[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
         period = float(clock.period)
         samples = (t_f - delta) / period
         before, behind = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
@@ -330,10 +344,10 @@ class Descents:
         shares = []
         for k, time in moves:
             if bounds.lower[k] * (1 - 1e-9) <= time <= bounds.upper[k]:
-                gains, share = self.gains.copy(), self.share.copy()
+                gains, there = own.copy(), share.copy()
                 gains[k] = time
-                share[k] = bounds.share(gains)[k]
-                shares.append(share)
+                there[k] = bounds.share(gains)[k]
+                shares.append(there)
         return shares
 
     def _descend(
@@ -361,3 +375,8 @@ class Descents:
     def tightened(self, problem: Problem) -> Problem:
         """With the margin kept from the limits."""
         return problem.tightened(1.0 - self._margin)
+
+
+def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:
+    """Where starts ended, the best first."""
+    return sorted(ends.items(), key=lambda item: item[1].rank)
