@@ -105,7 +105,7 @@ HOUSE = {
             campaign_summary posing
             reasons tuner
             compare pareto tune_files
-            slew_times
+            robustness slew_times
             fronts
         """,
         "output": """

@@ -49,6 +49,15 @@ class MapAxis(NamedTuple):
         return np.exp(edges) if self.logarithmic else edges
 
 
+class Ladder(NamedTuple):
+    """What some points were looked for at."""
+
+    title: str
+    label: str  # what it is, and its unit
+    values: Sequence[float]
+    ticks: Sequence[str] | None = None  # what is written at them; None: the numbers
+
+
 def _looks(count: int) -> list[tuple[str, str]]:
     """A colour and a marker for each of many sets, no two alike up to 25."""
     size = len(STYLES)
@@ -234,34 +243,39 @@ def front(
 
 
 @styled
-def slew_times(slews: Sequence[Any], units: Mapping[str, str], limits: Mapping[str, float]) -> Figure:
-    """Error and what it costs over the prescribed time, a panel each; dashed: what the scenario allows.
+def costs(points: Sequence[Any], ladder: Ladder, panels: Mapping[str, tuple[Sequence[float], float | None]]) -> Figure:
+    """Error, and what it costs, along a ladder, a panel each; dashed: what the scenario allows.
 
-    Slews have t_f, rms, interval, costs by metric and meets; units and limits by metric.
+    Args:
+        points: on the ladder, with rms, interval and meets.
+        ladder: where they stand.
+        panels: values of each point, NaN where it has none, and what is allowed of them, if anything; by their titles,
+            that of the error first.
     """
-    names, columns = ["window_error", *slews[0].costs], 3
-    rows, times = -(-len(names) // columns), [slew.t_f for slew in slews]
-    figure = Figure(figsize=(10.5, 3.0 * rows), layout="constrained")
-    figure.suptitle("What a faster slew costs, fresh trials")
-    for k, name in enumerate(names):
-        axes, error = figure.add_subplot(rows, columns, k + 1), name == "window_error"
-        values = [slew.rms if error else slew.costs[name] for slew in slews]
-        axes.plot(times, values, "-", color=STYLES[0][0], lw=1.2)
+    columns = 3
+    figure = Figure(figsize=(10.5, 3.0 * -(-len(panels) // columns)), layout="constrained")
+    figure.suptitle(ladder.title)
+    for k, (title, (values, limit)) in enumerate(panels.items()):
+        axes = figure.add_subplot(-(-len(panels) // columns), columns, k + 1)
+        axes.plot(ladder.values, values, "-", color=STYLES[0][0], lw=1.2)
         for met, fill, label in ((True, STYLES[0][0], "meets every requirement"), (False, "white", "does not")):
-            some = [k for k, slew in enumerate(slews) if slew.meets == met]
-            x, y = ([numbers[k] for k in some] for numbers in (times, values))
-            axes.plot(x, y, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
-        if error:
-            low, high = zip(*(slew.interval or (slew.rms, slew.rms) for slew in slews), strict=True)
-            axes.fill_between(times, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
+            some = [k for k, point in enumerate(points) if point.meets == met]
+            if some:
+                x, y = ([numbers[k] for k in some] for numbers in (ladder.values, values))
+                axes.plot(x, y, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
+        if not k:
+            low, high = zip(*(point.interval or (point.rms, point.rms) for point in points), strict=True)
+            axes.fill_between(ladder.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
             axes.legend(fontsize=8)
-        if np.all(np.asarray(values) > 0.0):
+        known = np.asarray(values)[np.isfinite(values)]
+        if known.size and np.all(known > 0.0):
             logarithmic(axes, "y")
-        if name in limits:
-            axes.axhline(limits[name], **LIMIT)
-        title = "RMS window error" if error else f"largest {name.replace('_', ' ')}"
-        axes.set_title(f"{title} [{units[name]}]", fontsize=10)
-        axes.set_xlabel("prescribed time t_f [s]", fontsize=10)
+        if limit is not None:
+            axes.axhline(limit, **LIMIT)
+        if ladder.ticks is not None:
+            axes.set_xticks(ladder.values, ladder.ticks)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(ladder.label, fontsize=10)
     return figure
 
 

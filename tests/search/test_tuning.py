@@ -520,7 +520,7 @@ def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not()
 
 
 class Narrow(Evaluator):
-    """F = (delta - 1.1)^2 up to delta = 2, where a limit is broken next to the samples, every 0.2 s; 1 + .. beyond it."""
+    """F = (delta - 1.1)^2 below delta = 2, where a limit is broken next to the samples, every 0.2 s; then 1 + .."""
 
     def slopes(self, problem, share):
         gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))

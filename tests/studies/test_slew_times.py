@@ -70,7 +70,7 @@ def test_each_time_is_searched_for_itself(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--against", "speed"), "--against is speed, but must be torque or t_f"),
+        (("--against", "speed"), "--against is speed, but must be torque, margins or t_f"),
         (("--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
         (("--against", "t_f", "--points", "4"), "--points is 4, but must be absent with --against t_f"),
         *(

@@ -29,10 +29,11 @@ from tuning.cli.options import (
     SampledFile,
     ScenarioFile,
     Seed,
+    SensitivityLimits,
     Times,
     Trust,
+    listed_against,
     prepare,
-    times_against,
     whole_number,
 )
 from tuning.errors import UsageError
@@ -223,6 +224,7 @@ def pareto(
     *,
     against: FrontAgainst = "torque",
     points: Points = None,
+    limits: SensitivityLimits = None,
     times: Times = None,
     out: Out = None,
     seed: Seed = 0,
@@ -232,19 +234,19 @@ def pareto(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Find the front of accuracy against peak torque, or what a faster slew costs, each point judged on fresh trials.
+    """Find the front of accuracy against peak torque, or what margins or a faster slew cost, judged on fresh trials.
 
     Interrupted or killed, the same command goes on from there.
 
     Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
     interrupted.
     """
-    chosen_times = times_against(against, times, points)
+    listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
     from tuning.studies import fronts
 
     loaded = searches.with_tune(loaded)
-    study, asked = fronts.study_of(against, loaded, points, chosen_times)
+    study, asked = fronts.study_of(against, loaded, points, listed)
     known_by = study.identity(loaded, seed, asked)
     search = searches.LongSearch(
         known_by,

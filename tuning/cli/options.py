@@ -83,13 +83,20 @@ Trust = Annotated[
     ),
 ]
 
-FrontAgainst = Annotated[str, Parameter(help="What the accuracy is set against: torque or t_f.")]
+FrontAgainst = Annotated[str, Parameter(help="What the accuracy is set against: torque, margins or t_f.")]
 Points = Annotated[
     int | None, whole_number("--points", "Limits on the torque to tune for, from 3 to 100; none: 20.", 3, 100)
 ]
 Times = Annotated[
     str | None,
     Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; none: half to twice t_f."),
+]
+SensitivityLimits = Annotated[
+    str | None,
+    Parameter(
+        help="Limits on the largest sensitivity |S| to tune for, with --against margins [dB], such as 4,6,9; none: "
+        "3 to 12. What no limit leaves is found too."
+    ),
 ]
 
 INTERRUPTED = 130  # exit status
@@ -102,22 +109,35 @@ def interrupted(force: bool) -> int:
     return INTERRUPTED
 
 
-def times_against(against: str, times: str | None, points: int | None) -> tuple[float, ...]:
-    """The times of --times, two or more between commas [s], none without it; raises UsageError where none fit."""
-    if against not in ("torque", "t_f"):
-        raise UsageError(f"--against is {against}, but must be torque or t_f")
-    if against == "t_f" and points is not None:
-        raise UsageError(f"--points is {points}, but must be absent with --against t_f, which takes --times")
-    if times is None:
-        return ()
-    if against != "t_f":
-        raise UsageError(f"--times is {times}, but must be absent without --against t_f")
+LISTED = {"t_f": "--times", "margins": "--limits"}  # what says where a front's points lie, by what it is against
+
+
+def listed_against(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
+    """The times of --times [s], or the limits of --limits [dB]; none without. Raises UsageError where none fit."""
+    if against not in ("torque", *LISTED):
+        raise UsageError(f"--against is {against}, but must be torque, margins or t_f")
+    if against in LISTED and points is not None:
+        raise UsageError(
+            f"--points is {points}, but must be absent with --against {against}, which takes {LISTED[against]}"
+        )
+    for kind, text in (("t_f", times), ("margins", limits)):
+        if text is not None and against != kind:
+            raise UsageError(f"{LISTED[kind]} is {text}, but must be absent without --against {kind}")
+    if times is not None:
+        return _numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
+    if limits is not None:
+        return _numbers("--limits", limits, 1, "limits in dB, all different, such as 4,6,9")
+    return ()
+
+
+def _numbers(option: str, text: str, least: int, allowed: str) -> tuple[float, ...]:
+    """Positive numbers between commas, in order, at least so many."""
     try:
-        listed = tuple(sorted(float(part) for part in times.split(",")))
+        listed = tuple(sorted(float(part) for part in text.split(",")))
     except ValueError:
         listed = ()
-    if len(listed) < 2 or len(set(listed)) < len(listed) or not all(0.0 < t_f < float("inf") for t_f in listed):
-        raise UsageError(f"--times is {times}, but must be two times or more in s, all different, such as 20,30,45")
+    if len(listed) < least or len(set(listed)) < len(listed) or not all(0.0 < value < float("inf") for value in listed):
+        raise UsageError(f"{option} is {text}, but must be {allowed}")
     return listed
 
 

@@ -1,10 +1,15 @@
-"""What the fronts of `ptsmc pareto` say: accuracy against torque, and against the prescribed time."""
+"""What the fronts of `ptsmc pareto` say: accuracy against torque, against margins, and against the prescribed time."""
 
 from collections.abc import Iterator
 
-from ptsmc_jax.simulation.catalogues import CATALOGUES
-from tuning.output import sentences
+from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
+from tuning.output import margin_sentences, sentences
 from tuning.output.cells import Summary, Table, digits, valued
+
+HEADS = {
+    "gain_margin": "gain margin", "phase_margin": "phase margin", "delay_margin": "delay margin",
+    "modulus_margin": "largest |S|",
+}  # fmt: skip
 
 
 def front(summary: Summary) -> Table:
@@ -103,3 +108,65 @@ def slew_times_heading(summary: Summary) -> str:
     many = len(summary["slews"]) != 1
     times = f"{len(summary['slews'])} prescribed time{'s' if many else ''}"
     return f"gains tuned for {times}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
+
+
+def robust(summary: Summary) -> Table:
+    """Each limit on the largest sensitivity: the error, the torque, the margins that are left."""
+    units, floor = CATALOGUES[summary["plant"]], summary["floor"]
+    rows: list[tuple[str, ...]] = []
+    for one in summary["robust"]:
+        over = [sentences.ratio(sentences.over_floor(one["rms"], floor))] if floor else []
+        margins = [digits(one["margins"][name], ".3g", "none") for name in MARGINS]
+        rows.append((_limit(one), digits(one["rms"], ".3e"), _spread(one), *over, *margins, digits(one["peak"], ".4g"),
+                     _marks(one)))  # fmt: skip
+    beside = ("times the floor",) if floor else ()
+    head = "|S| at most [dB]", f"RMS error [{units['window_error'].unit}]", "+-", *beside
+    left = (f"{HEADS[name]} [{margin.unit}]" for name, margin in MARGINS.items())
+    return Table((*head, *left, f"largest peak [{units['peak_torque'].unit}]", ""), rows)
+
+
+def robust_gains(summary: Summary) -> Table:
+    """The gains of each of them."""
+    names = list(summary["robust"][0]["gains"]) if summary["robust"] else []
+    rows = [(_limit(one), *(f"{one['gains'][name]:.4g}" for name in names)) for one in summary["robust"]]
+    return Table(("|S| at most [dB]", *names), rows)
+
+
+def _limit(one: Summary) -> str:
+    """A limit on the largest sensitivity, null for none."""
+    return digits(one["limit"], "g", "none")
+
+
+def robust_lines(summary: Summary) -> Iterator[str]:
+    """What margins cost beside none, and which limits have no gains of their own."""
+    found = summary["robust"]
+    loose = next((one for one in found if one["limit"] is None), None)
+    if loose is not None and loose["margins"]["gain_margin"] is not None and loose["margins"]["gain_margin"] <= 0.0:
+        yield "without a limit on |S| not every loop is stable: the best error lies beyond the border of stability"
+    limited = [one for one in found if one["limit"] is not None and one["rms"]]
+    if limited and loose is not None and loose["rms"]:
+        usual = min(limited, key=lambda one: abs(one["limit"] - margin_sentences.ENOUGH["gain_margin"]))
+        error = valued(usual["rms"], "window_error", summary["plant"])
+        yield (
+            f"with |S| at most {usual['limit']:g} dB the RMS window error is {error}, "
+            f"{sentences.ratio(usual['rms'] / loose['rms'])} times that without a limit"
+        )
+    if summary["idle"]:
+        yield f"the gains found for a looser limit keep {_listed(summary['idle'])} dB too"
+    if summary["without"]:
+        yield f"no gains found keep |S| at most {_listed(summary['without'])} dB on the training trials"
+    if summary["requirements"] and not any(one["meets"] for one in found):
+        yield "for none of these limits do gains meet every requirement on the fresh trials"
+
+
+def _listed(limits: list[float | None]) -> str:
+    *first, last = (digits(limit, "g", "any") for limit in limits)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def robust_heading(summary: Summary) -> str:
+    """How many limits, and on what they were judged."""
+    found = summary["robust"]
+    many = len(found) != 1
+    limits = f"{len(found)} limit{'s' if many else ''} on |S|"
+    return f"gains tuned for {limits}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"

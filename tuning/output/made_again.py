@@ -7,7 +7,9 @@ from typing import Any
 from ptsmc_jax.scenario import own
 
 # kept in `versions.json`
-OPTIONS = ("x", "y", "trials", "trial", "plan", "points", "against", "times", "metrics", "seed", "global_check")
+OPTIONS = (
+    "x", "y", "trials", "trial", "plan", "points", "against", "limits", "times", "metrics", "seed", "global_check",
+)  # fmt: skip
 
 
 def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:

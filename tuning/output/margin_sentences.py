@@ -90,7 +90,7 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
             yield f"the loop has less than {few} {place}: what the model leaves out may cost the stability"
     if short and not asked:
         more = " and ".join(f"requirements.{name} = {enough:g}" for name, enough in ENOUGH.items())
-        yield f"gains that keep more, at the price of accuracy, are found with {more}"
+        yield f"gains that keep more are found with {more}; what they cost, ptsmc pareto --against margins shows"
 
 
 def _swings(swing: Mapping[str, Any]) -> str:

@@ -207,6 +207,8 @@ def _distance(verdict: dict[str, Any]) -> str:
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
     if "slews" in result.summary:
         return _slew_times(result)
+    if "robust" in result.summary:
+        return _robust(result)
     summary, units = result.summary, catalogues.units(result.kind)
     requirement = result.scenario.get("requirements", {}).get("peak_torque")
     limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
@@ -227,6 +229,16 @@ def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
     headline = f"At {met} of {times} prescribed times gains meet every requirement"
     lines = [*search_sentences.fastest(summary), front_sentences.slew_times_heading(summary)]
     return _with_headline(summary, lines, headline), [Section("What a faster slew costs", blocks)]
+
+
+def _robust(result: Result) -> tuple[Heading, list[Section]]:
+    summary = result.summary
+    blocks = [_table(front_sentences.robust(summary)), _text(front_sentences.robust_lines(summary)),
+              _table(front_sentences.robust_gains(summary))]  # fmt: skip
+    met, found = sum(one["meets"] for one in summary["robust"]), len(summary["robust"])
+    headline = f"Under {met} of {found} limits on |S| gains meet every requirement"
+    lines = [front_sentences.robust_heading(summary)]
+    return _with_headline(summary, lines, headline), [Section("What margins cost", blocks)]
 
 
 def _with_headline(summary: dict[str, Any], lines: list[str], headline: str) -> Heading:

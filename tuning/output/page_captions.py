@@ -19,6 +19,8 @@ CAPTIONS = {
     "profiles": "The goal along each gain between its bounds, the other gains as found; what breaks a limit is marked.",
     "front": "The front of accuracy against peak torque.",
     "slew_times": "The error, and what the slew costs, over the prescribed time; open points break a requirement.",
+    "robustness": "The error, the torque and the margins left, over the limit on the largest sensitivity; open points "
+    "break a requirement.",
     "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
     "nichols": "The loop opened at each axis of the plant's input, the others closed.",
     "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",

@@ -94,8 +94,13 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """A front of accuracy against torque, or against t_f, as its `summary.json` says."""
-    if "slews" in summary:
+    """A front of accuracy against torque, against margins, or against t_f, as its `summary.json` says."""
+    if "robust" in summary:
+        say(f"{how}: {front_sentences.robust_heading(summary)}")
+        table(front_sentences.robust(summary))
+        table(front_sentences.robust_gains(summary))
+        say(*front_sentences.robust_lines(summary))
+    elif "slews" in summary:
         say(f"{how}: {front_sentences.slew_times_heading(summary)}")
         table(front_sentences.slew_times(summary))
         say(*front_sentences.slew_times_lines(summary))

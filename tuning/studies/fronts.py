@@ -3,27 +3,30 @@
 from typing import Any
 
 from ptsmc_jax.scenario.tables import Scenario
-from tuning.studies import pareto, slew_times
+from tuning.studies import pareto, robustness, slew_times
 
 POINTS = 20  # limits on the torque, where nobody says how many
 
 
-def study_of(against: str, scenario: Scenario, points: int | None, times: tuple[float, ...]) -> tuple[Any, Any]:
+def study_of(against: str, scenario: Scenario, points: int | None, listed: tuple[float, ...]) -> tuple[Any, Any]:
     """The module that looks for a front, and what is asked of it.
 
     Such a module has `identity`, `trace`, `summary` and `write`.
 
     Args:
-        against: what accuracy is set against, "torque" or "t_f".
+        against: what accuracy is set against, "torque", "margins" or "t_f".
         scenario: of which.
         points: limits on the torque to tune for; None: `POINTS`.
-        times: prescribed times to tune for [s]; empty: the usual ones.
+        listed: prescribed times [s], or limits on the largest sensitivity [dB], to tune for; empty: the usual ones.
 
     Raises ScenarioError where there is no front to look for, or a time cannot be flown.
     """
     if against == "torque":
         pareto.check(scenario)
         return pareto, points or POINTS
-    times = times or slew_times.usual_times(scenario)
+    if against == "margins":
+        robustness.check(scenario)
+        return robustness, listed or robustness.LIMITS
+    times = listed or slew_times.usual_times(scenario)
     slew_times.check(scenario, times)
     return slew_times, times

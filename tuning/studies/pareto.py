@@ -113,7 +113,7 @@ def trace(
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
-    best = _apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
+    best = apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
@@ -176,13 +176,13 @@ def climbed(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Po
     return best
 
 
-def _apart(best: dict[int, Best]) -> dict[int, Best]:
+def apart(best: dict[int, Best]) -> dict[int, Best]:
     """One rung of those that a limit does not hold back, and whose gains are the same."""
-    apart: dict[int, Best] = {}
+    kept: dict[int, Best] = {}
     for k in sorted(best):
-        if all(np.abs(best[k].share - other.share).max() >= APART for other in apart.values()):
-            apart[k] = best[k]
-    return apart
+        if all(np.abs(best[k].share - other.share).max() >= APART for other in kept.values()):
+            kept[k] = best[k]
+    return kept
 
 
 def _step(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:

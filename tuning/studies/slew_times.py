@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import montecarlo, store
@@ -178,8 +179,19 @@ def write(folder: Path, scenario: Scenario, traced: Slews, figures: bool, known_
     ]  # fmt: skip
     store.write_csv(folder / "slew_times.csv", header, rows)
     if figures and traced.slews:
-        shown = ("window_error", *costs)
-        units = {name: catalogues.CATALOGUES[scenario.plant.kind][name].unit for name in shown}
-        limits = {name: judging.limit_of(name, scenario) for name in shown}
-        limits = {name: limit for name, limit in limits.items() if limit is not None}
-        style.save({"slew_times": study_plots.slew_times(traced.slews, units, limits)}, folder / "figures")
+        style.save({"slew_times": _figure(scenario, traced.slews, costs)}, folder / "figures")
+
+
+def _figure(scenario: Scenario, slews: Sequence[Slew], costs: Sequence[str]) -> Figure:
+    units = catalogues.units(scenario.plant.kind)
+    error = f"RMS window error [{units['window_error']}]"
+    panels = {error: ([slew.rms for slew in slews], judging.limit_of("window_error", scenario))} | {
+        f"largest {name.replace('_', ' ')} [{units[name]}]": (
+            [slew.costs[name] for slew in slews], judging.limit_of(name, scenario)
+        )
+        for name in costs
+    }  # fmt: skip
+    along = study_plots.Ladder(
+        "What a faster slew costs, fresh trials", "prescribed time t_f [s]", [slew.t_f for slew in slews]
+    )
+    return study_plots.costs(slews, along, panels)
