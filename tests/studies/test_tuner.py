@@ -136,3 +136,24 @@ def test_a_default_is_what_it_stands_for():
     assert list(judging.beside(own)[0]) == ["paper"]
     other = scenario.replace(own, controller__eta=4.0)
     assert list(judging.beside(other)[0]) == ["paper", "before"]
+
+
+def test_what_more_accurate_gains_break_is_known(monkeypatch):
+    """Their errors are compared over the trials that both end; a trial lost by one of them counts for neither."""
+
+    def flown(errors, finished=(True, True)):
+        return SimpleNamespace(metrics=SimpleNamespace(window_error=np.array(errors)), finished=np.array(finished))
+
+    verdicts = {"paper": [("gain_margin", False), ("effort", True)], "before": [("effort", True)]}
+    monkeypatch.setattr(
+        judging, "verdicts_of", lambda name, *_: [SimpleNamespace(metric=m, met=met) for m, met in verdicts[name]]
+    )
+    names = {name: name for name in ("tuned", "paper", "before")}
+    tuned = flown([2.0, 2.0])
+    assert tuner._broken_by(names, {"tuned": tuned, "paper": flown([1.0, 2.0]), "before": flown([1.0, 1.0])}, 0) == {
+        "paper": ["gain_margin"],
+        "before": [],
+    }
+    assert tuner._broken_by(names, {"tuned": tuned, "paper": flown([3.0, 2.0]), "before": flown([2.0, 2.0])}, 0) == {}
+    lost = flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False))
+    assert [*tuner._broken_by(names, {"tuned": tuned, "paper": lost[0], "before": lost[1]}, 0)] == ["paper"]

@@ -147,7 +147,9 @@ def accuracy(summary: Summary) -> Iterator[str]:
         else:
             within = None if within is None else [1.0 / v for v in reversed(within)]
             worse = f"the tuned gains are less accurate than {paper}: they leave {ratio(1.0 / times)} times the error"
-            yield f"{worse}{_between(within, ratio)}{but}"
+            theirs = summary.get("broken_by", {}).get("paper")
+            by_paper = f"; broken by {paper}: {' and '.join(theirs)}" if theirs else ""
+            yield f"{worse}{_between(within, ratio)}{but}{by_paper}"
     yield from paper_refused(summary)
     cut = fresh.get("saturated")
     if cut and cut["max"]:
@@ -156,7 +158,9 @@ def accuracy(summary: Summary) -> Iterator[str]:
     trained, fresh = summary["training"]["window_error"], fresh["window_error"]
     before = summary.get("before")
     if fresh and before and before["window_error"] and before["window_error"]["rms"] < fresh["rms"]:
-        yield "the scenario's own gains are more accurate than the tuned ones: see tune.bounds and the requirements"
+        theirs = summary.get("broken_by", {}).get("before")
+        why = f", but break {' and '.join(theirs)}" if theirs else ": see tune.bounds and the requirements"
+        yield f"the scenario's own gains are more accurate than the tuned ones{why}"
     if trained and fresh:
         errors = ", ".join(
             f"{error['rms']:.3e} on the {where} trials" + _between(error.get("rms_interval"), "{:.3e}".format)

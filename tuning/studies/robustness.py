@@ -2,8 +2,8 @@
 
 The largest sensitivity, max |S|, bounds the other margins: where it is M, the gain may be at least M / (M - 1) or
 M / (M + 1) times as large, and the phase 2 arcsin(1 / (2 M)) off (Skogestad and Postlethwaite, Multivariable Feedback
-Control, 2005, 2.4.3); 6 dB keep 6 dB upwards, 3.5 dB downwards and 29 deg. One program flies every limit: each is searched from scratch, and then starts from
-what its neighbours found, as the front against the torque does.
+Control, 2005, 2.4.3); 6 dB keep 6 dB upwards, 3.5 dB downwards and 29 deg. One program flies every limit: each is
+searched from scratch, and then starts from what its neighbours found, as the front against the torque does.
 """
 
 from collections.abc import Sequence

@@ -80,6 +80,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "paper_refused": tuning.paper_refused,
         "paper_is": gain_names.paper_is(tuning.tuned),
         "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
+        "broken_by": tuning.broken_by,
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
         "judged_on": judging.judged_on(tuning.tuned),
         "cautions": cautions.of(tuning.tuned),

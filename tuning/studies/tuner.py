@@ -83,6 +83,7 @@ class Tuning:
     judged_gains: dict[str, dict[str, float]]  # the gains of each of them
     floors: dict[str, float | None]  # RMS window error that no controller can beat, for each of them
     verdicts: list[Verdict]  # of the tuned gains on the fresh trials
+    broken_by: dict[str, list[str]]  # of those more accurate than the tuned ones: whose requirements are not met
     shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
     trust: Trust | None  # None: interrupted before
     beyond: dict[str, Beyond]  # gains on a bound beyond which nothing is known, and what is there
@@ -176,6 +177,7 @@ def tune(
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
         floors={name: judging.floor_of(one, judged.seed) for name, one in candidates.items()},
         verdicts=judged.verdicts,
+        broken_by=_broken_by(candidates, fresh, judged.seed),
         shortest=shortest,
         trust=trust_in_it,
         beyond=beyond,
@@ -222,6 +224,21 @@ def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
     if asked is None or T_F in posed.problem.names or not judged.scenario.controller.prescribed:
         return None
     return shortest_time(judged.scenario, asked, judged.seed, judged.trials.trial)
+
+
+def _broken_by(candidates: dict[str, Scenario], fresh: dict[str, Trials], seed: int) -> dict[str, list[str]]:
+    """The metrics whose requirements are not met by gains more accurate than the tuned ones, by whose they are."""
+
+    def more_accurate(trials: Trials) -> bool:
+        both = trials.finished & fresh["tuned"].finished
+        there, here = (np.sum(np.asarray(t.metrics.window_error)[both] ** 2) for t in (trials, fresh["tuned"]))
+        return bool(there < here)
+
+    return {
+        name: [one.metric for one in judging.verdicts_of(candidates[name], trials, seed) if not one.met]
+        for name, trials in fresh.items()
+        if more_accurate(trials)
+    }
 
 
 def _trust(posed: Posed, judged: _Judged) -> Trust:
