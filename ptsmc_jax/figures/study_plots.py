@@ -243,7 +243,7 @@ def front(
 
 
 @styled
-def costs(points: Sequence[Any], ladder: Ladder, panels: Mapping[str, tuple[Sequence[float], float | None]]) -> Figure:
+def costs(points: Sequence[Any], ladder: Ladder, panels: Mapping[str, tuple[np.ndarray, float | None]]) -> Figure:
     """Error, and what it costs, along a ladder, a panel each; dashed: what the scenario allows.
 
     Args:
@@ -267,7 +267,7 @@ def costs(points: Sequence[Any], ladder: Ladder, panels: Mapping[str, tuple[Sequ
             low, high = zip(*(point.interval or (point.rms, point.rms) for point in points), strict=True)
             axes.fill_between(ladder.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
             axes.legend(fontsize=8)
-        known = np.asarray(values)[np.isfinite(values)]
+        known = values[np.isfinite(values)]
         if known.size and np.all(known > 0.0):
             logarithmic(axes, "y")
         if limit is not None:

@@ -44,7 +44,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
         errors = trials.metrics.window_error[:60]
         np.testing.assert_allclose(row["rms_window_error"], np.sqrt(np.mean(errors**2)), rtol=1e-9)
         np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)
-        by_place = stability.worst(scenario.study(judging.as_flown(flown)))
+        by_place = stability.worst(scenario.study(judging.as_flown(flown))) or {}
         for name in MARGINS:
             worst = max if name == "modulus_margin" else min
             limited = [place[name] for place in by_place.values() if place[name] is not None]

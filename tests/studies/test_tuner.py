@@ -148,12 +148,12 @@ def test_what_more_accurate_gains_break_is_known(monkeypatch):
     monkeypatch.setattr(
         judging, "verdicts_of", lambda name, *_: [SimpleNamespace(metric=m, met=met) for m, met in verdicts[name]]
     )
-    names = {name: name for name in ("tuned", "paper", "before")}
-    tuned = flown([2.0, 2.0])
-    assert tuner._broken_by(names, {"tuned": tuned, "paper": flown([1.0, 2.0]), "before": flown([1.0, 1.0])}, 0) == {
-        "paper": ["gain_margin"],
-        "before": [],
-    }
-    assert tuner._broken_by(names, {"tuned": tuned, "paper": flown([3.0, 2.0]), "before": flown([2.0, 2.0])}, 0) == {}
-    lost = flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False))
-    assert [*tuner._broken_by(names, {"tuned": tuned, "paper": lost[0], "before": lost[1]}, 0)] == ["paper"]
+    tuned, names = flown([2.0, 2.0]), {name: name for name in ("tuned", "paper", "before")}
+
+    def broken_by(paper, before):
+        fresh: Any = {"tuned": tuned, "paper": paper, "before": before}
+        return tuner._broken_by(cast(Any, names), fresh, 0)
+
+    assert broken_by(flown([1.0, 2.0]), flown([1.0, 1.0])) == {"paper": ["gain_margin"], "before": []}
+    assert broken_by(flown([3.0, 2.0]), flown([2.0, 2.0])) == {}
+    assert [*broken_by(flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False)))] == ["paper"]

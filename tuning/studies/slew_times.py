@@ -185,9 +185,9 @@ def write(folder: Path, scenario: Scenario, traced: Slews, figures: bool, known_
 def _figure(scenario: Scenario, slews: Sequence[Slew], costs: Sequence[str]) -> Figure:
     units = catalogues.units(scenario.plant.kind)
     error = f"RMS window error [{units['window_error']}]"
-    panels = {error: ([slew.rms for slew in slews], judging.limit_of("window_error", scenario))} | {
+    panels = {error: (np.asarray([slew.rms for slew in slews]), judging.limit_of("window_error", scenario))} | {
         f"largest {name.replace('_', ' ')} [{units[name]}]": (
-            [slew.costs[name] for slew in slews], judging.limit_of(name, scenario)
+            np.asarray([slew.costs[name] for slew in slews]), judging.limit_of(name, scenario)
         )
         for name in costs
     }  # fmt: skip
