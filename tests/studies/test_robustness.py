@@ -111,14 +111,17 @@ def test_a_limit_stands_for_the_margins_that_it_bounds():
 
 def robust(limit, rms, **margins):
     kept = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": None, "modulus_margin": 5.8}
-    return {"limit": limit, "gains": {"eta": 3.0}, "rms": rms, "interval": [0.95 * rms, 1.05 * rms], "peak": 0.2,
-            "margins": {**kept, **margins}, "failures": 0, "meets": True}  # fmt: skip
+    return {
+        "limit": limit, "gains": {"eta": 3.0, "observer_gain_2": 25.0}, "rms": rms,
+        "interval": [0.95 * rms, 1.05 * rms], "peak": 0.2, "margins": {**kept, **margins}, "failures": 0, "meets": True,
+    }  # fmt: skip
 
 
 def test_limits_without_gains_and_loops_without_margins_are_told():
     loose = robust(None, 1e-5, gain_margin=-0.3, modulus_margin=100.0)
     told = {"plant": "spacecraft", "robust": [loose, robust(6.0, 2e-5)], "idle": [60.0, 20.0], "without": [3.0],
-            "requirements": ["peak_torque"], "trials": 1000, "floor": 1e-6}  # fmt: skip
+            "requirements": ["peak_torque"], "trials": 1000, "floor": 1e-6,
+            "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}}  # fmt: skip
     assert list(front_sentences.robust_lines(told)) == [
         "without a limit on |S| not every loop is stable: the best error lies beyond the border of stability",
         "with |S| at most 6 dB the RMS window error is 2e-05, 2 times that without a limit",
@@ -129,7 +132,9 @@ def test_limits_without_gains_and_loops_without_margins_are_told():
         ("none", "1.000e-05", "5.0 %", "10", "-0.3", "40", "none", "100", "0.2", "meets"),
         ("6", "2.000e-05", "5.0 %", "20", "6.1", "40", "none", "5.8", "0.2", "meets"),
     ]
-    assert front_sentences.robust_gains(told).rows == [("none", "3"), ("6", "3")]
+    gains = front_sentences.robust_gains(told)
+    assert gains.head == ("|S| at most [dB]", "eta", "observer_gain_2 [kg m^2/s]")
+    assert gains.rows == [("none", "3", "25"), ("6", "3", "25")]
     nothing = {**told, "robust": [], "idle": [], "without": [None, 6.0], "floor": None}
     assert list(front_sentences.robust_lines(nothing)) == [
         "no gains found keep |S| at most any and 6 dB on the training trials",

@@ -19,7 +19,8 @@ def front(summary: Summary) -> Table:
     units = CATALOGUES[summary["plant"]]
     points = [("", point) for point in summary["points"] if not point["dominated"]]
     names = list(points[0][1]["gains"]) if points else []
-    points += [(name, summary[name]) for name in ("paper", "before") if name in summary]
+    others = {"paper": summary.get("paper_is", "paper"), "before": "before"}
+    points += [(label, summary[name]) for name, label in others.items() if name in summary]
     rows: list[tuple[str, ...]] = []
     for name, point in points:
         gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
@@ -30,7 +31,16 @@ def front(summary: Summary) -> Table:
         rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
     torque, beside = units["peak_torque"].unit, ("times the floor",) if summary.get("floor") else ()
     head = f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{units['window_error'].unit}]", "+-"
-    return Table(("", *head, *beside, *names, ""), rows)
+    return Table(("", *head, *beside, *_in_units(summary, names), ""), rows)
+
+
+def _in_units(summary: Summary, names: list[str]) -> list[str]:
+    """Headings of columns of gains."""
+    from tuning.search.gains import base
+
+    known = summary.get("gain_units", {})  # not yet said in earlier results
+    unit_of = {name: known.get(base(name), "-") for name in names}
+    return [name if unit == "-" else f"{name} [{unit}]" for name, unit in unit_of.items()]
 
 
 def _spread(point: Summary) -> str:
@@ -79,8 +89,8 @@ def slew_times(summary: Summary) -> Table:
         numbers = (f"{slew['t_f']:g}", digits(slew["rms"], ".3e"), _spread(slew))
         cells = [digits(slew["costs"][name], ".4g") for name in costs] + [f"{slew['gains'][n]:.4g}" for n in names]
         rows.append((*numbers, *cells, _marks(slew)))
-    head = (f"{name.replace('_', ' ')} [{units[name].unit}]" for name in costs)
-    return Table(("t_f [s]", f"RMS error [{units['window_error'].unit}]", "+-", *head, *names, ""), rows)
+    head = [f"{name.replace('_', ' ')} [{units[name].unit}]" for name in costs] + _in_units(summary, names)
+    return Table(("t_f [s]", f"RMS error [{units['window_error'].unit}]", "+-", *head, ""), rows)
 
 
 def slew_times_lines(summary: Summary) -> Iterator[str]:
@@ -129,7 +139,7 @@ def robust_gains(summary: Summary) -> Table:
     """The gains of each of them."""
     names = list(summary["robust"][0]["gains"]) if summary["robust"] else []
     rows = [(_limit(one), *(f"{one['gains'][name]:.4g}" for name in names)) for one in summary["robust"]]
-    return Table(("|S| at most [dB]", *names), rows)
+    return Table(("|S| at most [dB]", *_in_units(summary, names)), rows)
 
 
 def _limit(one: Summary) -> str:

@@ -128,8 +128,8 @@ def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None
         ("front", on_front, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
         ("knee", [p for p in on_front if p["knee"]], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
         ("beaten by others", [p for p in points if p["dominated"]], {"mode": "markers", "marker": {"symbol": "x"}}),
-        *((name, [summary[name]], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
-          for name in ("paper", "before") if name in summary),
+        *((label, [summary[name]], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
+          for name, label in (("paper", summary.get("paper_is", "paper")), ("before", "before")) if name in summary),
     ]  # fmt: skip
     data = []
     for k, (name, group, style) in enumerate(groups):

@@ -279,6 +279,8 @@ def summary(front: Front, scenario: Scenario) -> dict[str, Any]:
         "steps": front.steps,
         **{name: asdict(point) for name, point in front.others.items()},
         "paper_refused": front.paper_refused,
+        "paper_is": gains.paper_is(scenario),
+        "gain_units": gains.units_of(scenario),
         "cautions": cautions.of(scenario),
     }
 
@@ -298,5 +300,6 @@ def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_b
     if figures:
         limit = judging.limit_of(TORQUE, scenario)
         units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name].unit for name in ("window_error", TORQUE))
-        figure = study_plots.front(front.points, front.others, limit, units, floor=front.floor)
+        others = {gains.paper_is(scenario) if name == "paper" else name: one for name, one in front.others.items()}
+        figure = study_plots.front(front.points, others, limit, units, floor=front.floor)
         style.save({"front": figure}, folder / "figures")

@@ -165,6 +165,7 @@ def summary(ladder: Ladder, scenario: Scenario) -> dict[str, Any]:
         "floor": ladder.floor,
         "rollouts": ladder.rollouts,
         "gradients": ladder.gradients,
+        "gain_units": gains.units_of(scenario),
         "robust": [_stated(one) for one in ladder.robust],
         "idle": ladder.idle,
         "without": ladder.without,

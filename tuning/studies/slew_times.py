@@ -161,6 +161,7 @@ def summary(traced: Slews, scenario: Scenario) -> dict[str, Any]:
         "interval_confidence": trust.CONFIDENCE,
         "rollouts": traced.rollouts,
         "gradients": traced.gradients,
+        "gain_units": gains.units_of(scenario),
         "slews": [asdict(slew) for slew in traced.slews],
         "without": traced.without,
         "cautions": cautions.of(scenario),

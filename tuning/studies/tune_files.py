@@ -214,10 +214,12 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         ),
     }
     ended = {
-        name: (trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished])
+        gain_names.paper_is(scenario) if name == "paper" else name: (
+            trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
+        )
         for name, trials in tuning.fresh.items()
         if trials.finished.any()
-    }
+    }  # fmt: skip
     if ended:
         limit, floor = judging.limit_of("peak_torque", scenario), tuning.floors["tuned"]
         figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, floor)
