@@ -218,10 +218,14 @@ def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
     return _means(loops, several.shape)
 
 
+def averaged(parts: Parts) -> int:
+    """How many control periods a loop is the mean of: those of an interval between star tracker samples."""
+    return getattr(parts.sensors, "every", 1)
+
+
 def _interval(parts: Parts, indices: Any) -> Any:
     """(periods, every): those since the star tracker's sample before."""
-    every = getattr(parts.sensors, "every", 1)
-    return (indices[:, None] - np.arange(every)[None]).clip(0)
+    return (indices[:, None] - np.arange(averaged(parts))[None]).clip(0)
 
 
 def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:

@@ -61,7 +61,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """Numbers of the whole control periods nearest to so long before t_f [s], and then of one in hold.
 
     Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
-    it is no farther off than at the hand-over.
+    it is no farther off than at the hand-over, but one whose mean over a star tracker's interval is all of the hold.
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
@@ -69,7 +69,8 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     size, hold = jnp.linalg.norm(off, axis=1), full & ticks.hold
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])
-    last = jnp.maximum(jnp.max(jnp.where(near, jnp.arange(hold.size), -1)), first)
+    last_near, end = (jnp.max(jnp.where(some, jnp.arange(hold.size), first)) for some in (near, hold))
+    last = jnp.maximum(last_near, jnp.minimum(first + linear.averaged(parts) - 1, end))
     before = full & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
     left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
     nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)

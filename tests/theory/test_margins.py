@@ -11,7 +11,7 @@ from scipy import optimize, signal
 
 from ptsmc_jax import scenario
 from ptsmc_jax.plants import second_order
-from ptsmc_jax.theory import borders, crossings, linear, margins
+from ptsmc_jax.theory import borders, crossings, linear, margins, run_margins
 from tests.helpers import fly, short
 from tuning.search.gains import with_gains
 
@@ -326,6 +326,20 @@ def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
     for mean, several in zip(jax.tree.leaves(means), jax.tree.leaves(each), strict=True):
         np.testing.assert_allclose(mean[0], np.mean(several, axis=0), rtol=1e-12, atol=1e-15)
     assert np.ptp(each.a, axis=0).max() > 1e-6
+
+
+def test_the_mean_over_a_slow_star_trackers_interval_in_hold_has_no_loop_from_before_it():
+    """Also where the nominal run is nearer to its reference at the hand-over than after it, as may be by chance."""
+    slow = KINDS["slow star tracker, filter, delay and lag"]
+    parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
+    run = linear.nominal_jit(parts)
+    first = int(np.argmax(run.period.now.hold))
+    x = run.carry.x
+    there = run._replace(
+        carry=run.carry._replace(x=x._replace(q=x.q.at[first].set(parts.reference(run.period.now.t[first]).q)))
+    )
+    index = int(run_margins._moments(parts, there, jnp.asarray([1.0]))[-1])
+    assert index == first + linear.averaged(parts) - 1
 
 
 def test_rounding_next_to_a_pole_at_one_is_no_crossing():
