@@ -12,20 +12,25 @@ MODULUS = 6.0  # dB, of the contour that is drawn
 DEEPEST = 40.0  # dB of |L| that are shown, either way
 
 
+def _decibels(seen: np.ndarray) -> np.ndarray:
+    """Sizes [dB], far below what is shown where there is nothing, as of a command that a limit cuts."""
+    return 20.0 * np.log10(np.maximum(np.abs(seen), 1e-9))
+
+
 @styled
 def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     """|L| over its phase, (points, axes), around the point -1 and what keeps `MODULUS` from it."""
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
     for k, name in enumerate(names):
-        size, phase = 20.0 * np.log10(np.abs(L[:, k])), np.rad2deg(np.unwrap(np.angle(L[:, k])))
+        size, phase = _decibels(L[:, k]), np.rad2deg(np.unwrap(np.angle(L[:, k])))
         near = np.argmin(np.abs(size))  # the branch on which it crosses 0 dB nearest to -180 degrees
         phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
         colour, style = STYLES[k % len(STYLES)]
         axes.plot(phase, size, color=colour, ls=style, label=name)
     around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-MODULUS / 20.0) - 1.0
     angle = np.rad2deg(np.angle(around)) % 360.0 - 360.0
-    axes.plot(angle, 20.0 * np.log10(np.abs(around)), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
+    axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
     axes.set_title("Loop opened at the plant's input, in hold", loc="left")
@@ -42,7 +47,7 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
     for k, name in enumerate(names):
         colour, _ = STYLES[k % len(STYLES)]
         for letter, seen, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
-            size = 20.0 * np.log10(np.abs(seen))
+            size = _decibels(seen)
             axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
     axes.axhline(MODULUS, color="0.35", lw=1.0, ls=":")
     axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))

@@ -22,3 +22,14 @@ def test_the_time_to_go_is_in_plain_numbers():
     labels = [label.get_text() for label in figure.axes[-1].get_xticklabels(which="both") if label.get_text()]
     assert {"5", "10", "20"} <= set(labels)
     assert not [label for label in labels if "$" in label]
+
+
+def test_a_loop_that_answers_nothing_is_drawn_without_a_warning():
+    """As of a command that a limit cuts: L is zero about an axis, whose size has no decibels."""
+    w = np.geomspace(1e-3, 1.0, 50)
+    L = np.stack([np.zeros(50), 0.1 / (1j * w)], axis=1)
+    for figure in (margin_plots.nichols(L, ["x", "y"]), margin_plots.sensitivity(w, L, ["x", "y"])):
+        figure.draw_without_rendering()
+        low, high = figure.axes[0].get_ylim()
+        assert low == -40.0
+        assert high <= 40.0
