@@ -62,9 +62,9 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
         run = linear.nominal_jit(parts)
         seen = history(parts, run)
     u, in_hold = map(np.asarray, seen)
-    last = np.flatnonzero(in_hold)
-    last = last[last.size // 2 :]
-    if 2 * last.size < FEWEST or not np.isfinite(u[last]).all():
+    whole = np.flatnonzero(in_hold)
+    last = whole[whole.size // 2 :]
+    if whole.size < FEWEST or not np.isfinite(u[last]).all():
         return None
     turns = _turns(np.diff(u[last], axis=0), ROUNDING * np.abs(u).max())
     suspect = turns & _stays(u[last])

@@ -187,6 +187,7 @@ def test_metrics_of_ones_own_stand_in_the_rows():
         (lambda result, parts: jnp.zeros(()), "named numbers"),
         (lambda result, parts: {"x": result.log.t}, "its x is no single number"),
         (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
+        (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),  # with a plan
         (lambda result, parts: {}, "named numbers"),
     ],
 )

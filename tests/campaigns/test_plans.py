@@ -328,6 +328,15 @@ def test_an_angle_that_does_not_follow_is_refused(everything):
         of_plan(made, plan.with_columns(wrong.alias("initial_angle")))
 
 
+@pytest.mark.parametrize(("angle", "least"), [(0.5, 1e-5), (20.0, 2e-4)])
+def test_an_angle_may_be_off_by_the_digits_that_a_table_leaves_out(angle, least):
+    """1e-5 rad, and of an |x_1| above 1 this share of it."""
+    said, off = np.array([1.0, angle]), np.array([0.0, least])
+    plans.check_angle(said, said + 0.9 * off, "the plan")
+    with pytest.raises(RefusedError, match="in row 1, but must have"):
+        plans.check_angle(said, said + 1.1 * off, "the plan")
+
+
 def test_files_that_are_no_plan_are_refused(tmp_path):
     for name, content, said in (
         ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),

@@ -63,6 +63,14 @@ def test_what_a_killed_process_left_is_swept_up_and_never_read(kept):
     assert [path.name[0] for path in kept.folder.iterdir()] == ["0"]
 
 
+def test_a_file_of_the_users_own_among_the_parts_is_left_alone(kept):
+    kept.write(0, frame(0, 20))
+    mine = kept.folder / "mine.parquet"
+    frame(0, 5).write_parquet(mine)
+    kept.tidy(kept.parts()[0])
+    assert mine.exists()
+
+
 def test_a_part_that_does_not_fit_leaves_nothing(kept, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -152,6 +152,15 @@ def test_a_broken_requirement_is_named_with_its_limit():
     )
 
 
+def test_beyond_a_bound_gains_may_arrive_where_no_trial_does_with_the_tuned_ones():
+    """Trained on the anchored clock and lost on that which flies, they have no error to tell another one by."""
+    seen = tuner.Beyond(4.3, None, None)
+    assert not seen.better
+    assert tune_files._beyond(seen, 4.0) == (
+        "on its bound 4: every requirement kept at 4.3, with no error to set that beside"
+    )
+
+
 def test_a_column_is_called_after_whose_gains_it_holds():
     paper = scenario.from_tables({"loop": {"mode": "sampled"}})
     assert gains.paper_is(paper) == "paper"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.theory import rest
+from ptsmc_jax.theory import linear, margins, rest
 from tests.helpers import short
 
 K, C, H = 0.02, 1.0, 0.05  # bound on the disturbance [1/s^2], slope of the surface [1/s], period [s]
@@ -32,7 +32,7 @@ def test_a_sign_that_is_too_narrow_swings_as_its_closed_form_says(k1):
     assert found is not None
     a = H * K / (2.0 - H * k1)
     np.testing.assert_allclose(found.size, 2.0 * (K + k1 * a), rtol=C * H)
-    np.testing.assert_allclose(found.periods, 2.0, rtol=0.02)  # as many turns, but for one, as there are periods
+    assert found.periods == 2.0  # it turns at every sample between the first and the last
 
 
 @pytest.mark.parametrize(("share", "swings"), [(0.5, True), (0.9, True), (1.2, False), (50.0, False)])
@@ -50,6 +50,25 @@ def test_what_rings_as_slopes_say_is_none():
 def test_an_exact_sign_is_judged_without_it_and_a_short_hold_is_not_judged():
     assert swing(controller__sign_width=0.0) is None
     assert swing(controller__sign_width=1e-7, loop__t_end=4.2, loop__window=0.1) is None
+
+
+@pytest.mark.parametrize(("whole", "judged"), [(15, False), (16, True)])
+def test_a_hold_is_judged_from_sixteen_whole_periods_on(whole, judged):
+    """Of a run that swings all along: its history told as if only so many of its last periods were in hold."""
+    parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), controller__sign_width=1e-7)).parts
+    seen = rest.history(parts, linear.nominal_jit(parts))
+    in_hold = np.flatnonzero(seen.in_hold)
+    told = np.isin(np.arange(len(seen.in_hold)), in_hold[-whole:])
+    assert (rest.swing(parts, seen._replace(in_hold=told)) is not None) == judged
+
+
+def test_where_a_run_swings_none_is_left_but_of_loops_that_are_unstable_anyway():
+    stable = np.array([[True], [True], [False]])
+    values = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
+    left = rest.none_left(margins.Margins(**values), [False, True, True])
+    for name, of in left._asdict().items():
+        none = {"modulus": 100.0, "stable": False, "crossover": np.nan}.get(name, 0.0)  # as of an unstable loop's peak
+        np.testing.assert_array_equal(of, [values[name][0], [none], values[name][2]], err_msg=name)
 
 
 REFERENCES = {

@@ -155,6 +155,8 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
         return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
     if seen.broken is not None:
         return f"no better beyond its bound: at {seen.value:g} {seen.broken}"
+    if seen.times is None:  # no trial is flown to the end by the tuned gains, or their error is zero
+        return f"on its bound {bound:g}: every requirement kept at {seen.value:g}, with no error to set that beside"
     return f"no better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}"
 
 
