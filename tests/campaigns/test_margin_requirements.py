@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -285,6 +287,33 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
                 beyond = way * np.stack([found[name], each[name]]) > way * limits[name]
                 np.testing.assert_array_equal(*beyond)
     assert sum(judged) < 6 * every["phase_margin"].size / 2
+
+
+class _Told(NamedTuple):
+    """Loops by their numbers."""
+
+    number: Any
+    period: Any
+
+
+@pytest.mark.parametrize(("period", "judged"), [(0.1, {0}), (1.9, {0, 1, 2, 3, 4, 5, 6, 7})])
+def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatch, period, judged):
+    """Delay margins of 1, 1.1, .. s: 0.2 periods to either side, 0.02 or 0.38 s, so many may be the least."""
+    delays, seen = 1.0 + 0.1 * np.arange(32), set[int]()
+
+    def looked(*_):
+        return _Told(np.arange(32)[:, None], np.full((32, 1), period)), {"delay_margin": delays[:, None]}
+
+    def of_each(loops, **_):
+        seen.update(loops.number.tolist())
+        return SimpleNamespace(each=lambda: {"delay_margin": delays[loops.number][:, None]})
+
+    monkeypatch.setattr(margin_verdicts, "_look", looked)
+    monkeypatch.setattr(margin_verdicts.margins, "of_each", of_each)
+    nothing: Any = None
+    found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": 0.25})
+    np.testing.assert_array_equal(found["delay_margin"], delays)
+    assert seen == judged
 
 
 @pytest.mark.parametrize("left", [None, '{"window_error": 1e-6, "marg', '{"window_error": 1e-6}'])

@@ -72,3 +72,19 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     campaign_terminal.why(told, "spacecraft", 401)  # of one that failed: what is unusual in it
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
+
+
+def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):
+    """By how many percent of the trials they are from the middle, or half of the share that has another number."""
+    alike: dict[str, Any] = {"metric": "effort", "trial": 3, "value": float("nan"), "drawn": 2.0, "unit": "",
+                             "rank_correlation": None, "first_order": None}  # fmt: skip
+    ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # 20, 2 and 49 from the middle
+    shared = {"wheel_failure_wheel": 0.25, "own_1": 0.9}  # 37.5 and 5
+    told = [
+        *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
+        *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
+    ]
+    campaign_terminal.why(told, "spacecraft", 401)
+    (said,) = capsys.readouterr().out.splitlines()
+    named = [part.split()[0] for part in said.split(": ")[1].split(", ")]
+    assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "own_1"]

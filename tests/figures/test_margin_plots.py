@@ -33,3 +33,13 @@ def test_a_loop_that_answers_nothing_is_drawn_without_a_warning():
         low, high = figure.axes[0].get_ylim()
         assert low == -40.0
         assert high <= 40.0
+
+
+def test_the_contour_of_a_nichols_chart_is_where_the_sensitivity_is_six_decibels():
+    """Read back as L, each point of it lies at 1 / |1 + L| = 6 dB, and goes once around -1."""
+    figure = margin_plots.nichols(np.exp(-1j * np.linspace(0.1, 3.0, 50))[:, None], ["x"])
+    (contour,) = [line for line in figure.axes[0].lines if line.get_label() == "sensitivity 6 dB"]
+    phase, size = np.asarray(contour.get_xydata()).T
+    away = 1.0 + 10.0 ** (size / 20.0) * np.exp(1j * np.deg2rad(phase))
+    np.testing.assert_allclose(-20.0 * np.log10(np.abs(away)), 6.0, rtol=1e-9)
+    assert phase.min() < -180.0 < phase.max()

@@ -36,6 +36,18 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
         np.testing.assert_array_equal(drawn[2 * start + 1], np.where(met[:, start], values[:, start], np.nan))
 
 
+def test_a_tradeoff_has_each_trial_and_their_rms_beside_their_mean_peak():
+    """Errors of 3e-6 and 4e-6, an RMS of (25e-12 / 2)^(1/2)."""
+    errors, peaks = np.array([3e-6, 4e-6]), np.array([0.2, 0.4])
+    figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, floor=1e-6)
+    (axes,) = figure.axes
+    trials, (whole,) = (np.asarray(line.get_xydata()) for line in axes.lines[:2])
+    np.testing.assert_array_equal(trials, np.stack([errors, peaks], axis=1))
+    np.testing.assert_allclose(whole, [5e-6 / np.sqrt(2.0), 0.3], rtol=1e-12)
+    said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert said == ["tuned: RMS 3.54e-06, mean peak 0.3 N m", "limit 0.5 N m", "floor 1e-06"]
+
+
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # the other: long numbers
 def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap(low, high, least):
     at = np.geomspace(low, high, 4)

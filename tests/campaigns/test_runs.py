@@ -1,0 +1,30 @@
+"""Which runs say what is told of a scenario."""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ptsmc_jax.campaigns import runs
+from ptsmc_jax.theory import error_floor
+
+
+@pytest.mark.parametrize(("varies", "rows", "flown"), [
+    (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
+])  # fmt: skip
+def test_a_scenarios_floor_is_pooled_over_the_first_trials_or_those_of_a_plan(monkeypatch, varies, rows, flown):
+    """Trial k has the floor k + 1, but for the second that is flown, which does not end."""
+    seen: list[Any] = []
+
+    def fly(ready, seed, trial):
+        seen.append((seed, trial))
+        at = np.zeros(1)
+        return SimpleNamespace(floor=None if len(seen) == 2 else error_floor.Floor(1.0 + (trial or 0), at, at))
+
+    monkeypatch.setattr(runs, "_fly", fly)
+    ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
+    squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(flown) if j != 1]
+    assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
+    assert seen == [(5, k) for k in flown]
