@@ -113,13 +113,15 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     )
 
 
-@pytest.mark.parametrize(("ok", "said"), [
-    (2000, "1109 runs without a failure show a value"), (1990, "10 runs that are not ok are beyond every angle"),
+@pytest.mark.parametrize(("flown", "ok", "said"), [
+    (2000, 2000, "1109 runs without a failure show a value, and 852 with 90 % confidence"),
+    (1108, 1098, "1109 runs without a failure show a value"),  # too few for 95 %, whether or not some fail
+    (1109, 1099, "10 runs that are not ok are beyond every angle"),
 ])  # fmt: skip
-def test_why_a_budget_has_no_value_is_said(ok, said):
+def test_why_a_budget_has_no_value_is_said(flown, ok, said):
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95,
             "budget": {"ape": {"x": None}}}  # fmt: skip
-    *_, last = pointing_sentences.heading({"pointing": told, "flown": 2000, "counts": {"ok": ok}})
+    *_, last = pointing_sentences.heading({"pointing": told, "flown": flown, "counts": {"ok": ok}})
     assert last.startswith(f"where the budget has -, {said}")
 
 

@@ -453,3 +453,16 @@ def test_what_trials_fly_with_has_the_units_of_each_column():
         assert named[column] == unit, column
     chain = quantities.units(chain_parts([1.0, 0.0]))
     assert (chain["initial_angle"], chain["initial_x2"], chain["disturbance_bias_1"]) == ("x1", "", "")
+
+
+def test_quaternions_of_a_table_are_made_unit_ones_and_those_that_are_stay_to_the_last_digit():
+    """As far as digits that a table leaves out may put their norm off; a norm of 1 but for rounding is 1."""
+    q = REFERENCE.as_quat()
+    rounded = np.nextafter(q, 1.0)
+    rows = np.stack([rounded, (1.0 + 5e-8) * q, (1.0 - 9e-7) * q])
+    made = quantities._unit(rows)
+    np.testing.assert_array_equal(made[0], rounded)
+    np.testing.assert_allclose(made[1:], [q, q], rtol=0, atol=4 * EPS)
+    with pytest.raises(base.UnfitError, match="a unit quaternion") as refused:
+        quantities._unit(np.stack([q, (1.0 + 1.1e-6) * q]))
+    assert refused.value.row == 1

@@ -82,6 +82,21 @@ def test_shortest_time_of_a_chain():
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
 
 
+def test_the_observer_keeps_its_time_however_much_torque_there_is():
+    """Its error is gone 4 s after the start: t_f is looked for from a twentieth later on, and closed in on by 1e-3."""
+    tables = {
+        "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+        "controller": {"t_f": 5.0, "delta": 0.5},
+        "observer": {"kind": "prescribed_time", "t_o": 4.0},
+        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.0},
+    }
+    found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 1e4), 0, np.arange(1))
+    assert found.theory is not None
+    assert found.simulated is not None
+    assert 4.2 < found.theory <= 4.2 * (1.0 + 2e-3)
+    assert 4.2 < found.simulated <= 4.2 * (1.0 + 2e-3)
+
+
 @pytest.mark.parametrize(("confidence", "least"), [(None, 6), (0.5, 7)])
 def test_a_limit_on_a_share_of_the_trials_is_kept_by_that_share(confidence, least):
     """It was the shortest t_f at which every trial keeps it."""

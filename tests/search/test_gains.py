@@ -225,6 +225,21 @@ def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
     assert low < value < high
 
 
+@pytest.mark.parametrize(("eta", "expected"), [(12.0, (2.05, 22.0)), (2.03, (2.015, 8.0))])
+def test_bounds_that_are_moved_go_by_the_distance_from_what_is_not_allowed(eta, expected):
+    """Eta exceeds 2: to twice as far from it as the scenario's own is, or to half as far."""
+    made = from_tables({"controller": {"eta": eta}, "tune": {"free": ["eta"]}})
+    np.testing.assert_allclose(made.search.bounds["eta"], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("t_o", "shortest"), [(1.0, 15.0), (20.0, 21.0)])
+def test_default_bounds_of_t_f_leave_the_observer_its_time(t_o, shortest):
+    """From half of t_f on, or a twentieth after the observer's error is gone, before which t_f must not lie."""
+    observer = {"kind": "prescribed_time", "t_o": t_o}
+    made = from_tables({"controller": {"t_f": 30.0}, "observer": observer, "tune": {"free": ["t_f"]}})
+    np.testing.assert_allclose(made.search.bounds["t_f"], (shortest, 60.0), rtol=1e-12)
+
+
 @pytest.mark.parametrize("delta", [0.02, 0.05])
 def test_delta_is_looked_for_from_one_period_on_and_that_is_said_where_it_ends_there(delta):
     made = from_tables({"controller": {"delta": delta}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})

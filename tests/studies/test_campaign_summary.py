@@ -35,6 +35,22 @@ def test_a_limit_that_may_be_left_at_times_is_told_apart(interpretation, outcome
     assert campaign_summary._of_time(verdict) == said
 
 
+def test_the_share_of_the_time_of_all_runs_is_their_mean_and_a_run_without_one_keeps_the_limit_at_no_time():
+    frame = pl.concat([FRAME, FRAME.head(1).with_columns(within_ape_z=pl.lit(None, pl.Float64))])
+    ended = np.array([True, True, True, False, True])
+    asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation="mixed")
+    beyond = campaign_summary._beyond(frame, asked, ended)
+    np.testing.assert_allclose(beyond, [0.0, 0.1, 0.5, 1.0, 1.0], rtol=1e-12)
+    verdict = asked.verdict(frame["ape_z"].to_numpy(), ended, frame["within_ape_z"].fill_null(np.nan).to_numpy())
+    told = campaign_summary._in_summary(verdict, asked, beyond)
+    assert told["share"] == pytest.approx(told["share_of_time"], rel=1e-12)
+    assert told["share"] == pytest.approx((1.0 + 0.9 + 0.5) / 5.0, rel=1e-12)
+    low, high = told["share_interval"]
+    assert low < told["share_bound"] < told["share"] < high  # 97.5 % to either side, and 95 % from below
+    of_trials = Requirement("ape_z", 1.0, "rad", quantile=0.8)
+    assert campaign_summary._beyond(frame, of_trials, ended).size == 0
+
+
 def test_a_failed_trial_has_no_share_of_time():
     told = campaign_summary._of_share(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
     assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)

@@ -146,6 +146,11 @@ def test_times_without_gains_are_told():
         ("8", "1.000e-05", "10.0 %", "0.2", "3", "2 failed or missed"),
     ]
     assert front_sentences.slew_times_heading(told) == "gains tuned for 1 prescribed time, judged on 1000 fresh trials"
+    slow = {**slew, "t_f": 16.0, "rms": 4e-6, "costs": {"peak_torque": 0.05}, "meets": True}
+    assert list(front_sentences.slew_times_lines({**told, "slews": [slew, slow], "without": []})) == [
+        "peak torque: 0.2 N m at t_f = 8 s, 4 times that at 16 s",
+        "RMS window error: 1e-05 at t_f = 8 s, 2.5 times that at 16 s",
+    ]
     nothing = {**told, "slews": [], "requirements": []}
     assert front_sentences.slew_times(nothing).rows == []
     assert np.isfinite(len(list(front_sentences.slew_times_lines(nothing))))
