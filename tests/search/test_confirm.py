@@ -1,5 +1,6 @@
 """Limits for a share of the trials: what training calls met must be met on trials that it never saw."""
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -101,6 +102,35 @@ def test_a_band_stands_for_the_training_trials():
     np.testing.assert_allclose(np.sort(after[0])[-5:], np.sort(np.minimum(band, np.sort(band)[-3])), rtol=1e-10)
     assert np.sort(after[0])[-6] == -1.0
     np.testing.assert_allclose(after[1, :8], effort[:8], rtol=1e-10)
+
+
+def test_trials_that_are_counted_are_none_that_the_search_has_seen(monkeypatch):
+    """Neither those averaged nor those screened, and others each time."""
+    some, wanted, seen = problem(peak_torque=0.7), [replace(SHOWN, metric="peak_torque", limit=0.7)], list[range]()
+    posed = objective.problem(some.parts, SPREAD, 3, np.arange(8), some.names, wanted, may_break=(2,), banded=(True,))
+    limits, at = shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0)), np.array([3.0, 0.7])
+    many = confirm.counted_on(wanted)
+
+    def count(posed, asked, gains, first, turn):
+        seen.append(range(first + turn * many, first + (turn + 1) * many))  # see the test of a band
+        return [SimpleNamespace(trials=many)]
+
+    def trials(numbers, gains):
+        seen.append(range(int(numbers[0]), int(numbers[-1]) + 1))
+        return SimpleNamespace(finished=np.ones(numbers.size, bool), metrics=SimpleNamespace(peak_torque=0.0 * numbers))
+
+    monkeypatch.setattr(rounds.confirm, "count", count)
+    monkeypatch.setattr(rounds.worst_case.flights, "trials", trials)
+    evaluate = Evaluator(limits)
+    search = rounds.Rounds(evaluate, posed, wanted, robust=False)
+    told: Any = SimpleNamespace(averaged=search.problem.averaged, others=lambda numbers: numbers)
+    rounds.worst_case.screen(told, wanted, at)
+    for _ in range(2):
+        search._count(at)
+    seen.append(range(search.problem.averaged))
+    ordered = sorted(seen, key=lambda one: one.start)
+    assert all(one.stop <= other.start for one, other in itertools.pairwise(ordered))
+    assert evaluate.rollouts == 2 * many
 
 
 def test_too_few_trials_are_never_sure():

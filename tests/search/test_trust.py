@@ -16,7 +16,7 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts, vector
 from tests.search.test_tuning import problem
 from tuning.search import global_check, objective, optimise, trust
-from tuning.search.evaluate import Evaluator
+from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.shares import Bounds
 
 SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -182,3 +182,37 @@ def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, 
     found = optimise.search(evaluate, asked(limit), (), np.array([3.0, 0.5]), settings)
     assert bool(found.worst[0] <= 1.0) is kept
     assert global_check.check(evaluate, found, 0).kept is kept
+
+
+def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
+    """F = 3 + share, as of a t_f, and a metric of 1.05, from 0.3 on 0.95, from 0.6 on 0.8: 10 % from a limit of 1.
+
+    What breaks the limit by a little is not looked at for its F, which is less there, nor what has none, beyond 0.9.
+    """
+    monkeypatch.setattr(global_check, "POPULATION", 10)
+
+    class Told:
+        names, rows, limit = ("eta",), ("peak_torque",), 1.0
+
+        def tightened(self, factor):
+            told = Told()
+            told.limit = self.limit * factor
+            return told
+
+    class Evaluate:
+        rollouts = 0
+
+        def fly(self, problem, share):
+            self.rollouts += len(share)
+            f = np.where(share[:, 0] > 0.9, np.inf, 3.0 + share[:, 0])
+            c = np.select([share < 0.3, share < 0.6], [1.05, 0.95], 0.8)[:, :, None] / problem.limit - 1.0
+            return Measured(2.0 + share, f, c, f)
+
+    evaluate: Any = Evaluate()
+    searched: Any = SimpleNamespace(problem=Told(), margin=0.1, share=np.array([0.8]))
+    found = global_check.check(evaluate, searched, 1, sloped=False)
+    assert found.kept
+    assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # at which the population's F ends to differ
+    np.testing.assert_allclose(np.log(found.value), found.gains["eta"] + 1.0, rtol=1e-12)
+    np.testing.assert_allclose(found.distance, 2.8 - found.gains["eta"], rtol=1e-12)
+    assert found.rollouts == evaluate.rollouts

@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import run_margins
+from ptsmc_jax.theory import margins, run_margins
 from tests.helpers import ROOT
 from tuning.errors import UsageError
 from tuning.studies import mapping
@@ -101,6 +101,26 @@ def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped)
             assert (cell.trials, cell.failures) == (6, 0)
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
     assert any(cell.radius < 1.0 for cell in cells)
+
+
+def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
+    """A factor up to which all axes are stable: 20 dB are ten times, and below 0 dB the loop is unstable already."""
+
+    def left(gain_up, delay):
+        values: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.zeros(3))
+        return margins.Margins(**values | {"gain_up": np.array(gain_up), "delay": np.array(delay)})
+
+    ends = {
+        "hand_over": (left([20.0, -20.0, 40.0], [0.3, 0.0, 0.4]), 1.2),
+        "hold": (left([40, 60, 20], [3, 1, 2]), 0.9),
+    }
+    monkeypatch.setattr(mapping.run_margins, "at_ends", lambda parts: ends)
+    loaded, x, y, _ = mapped
+    cell = mapping.fly(loaded, x, y, 3, 6, lambda done, total: None).cells[0]
+    assert (cell.gain_margin, cell.hold_gain_margin) == (pytest.approx(0.1), pytest.approx(10.0))
+    assert (cell.delay_margin, cell.hold_delay_margin) == (0.0, 1.0)
+    assert (cell.radius, cell.hold_radius) == (1.2, 0.9)
+    assert np.isnan(cell.linear_window_error)  # of an unstable loop nothing is predicted
 
 
 def test_margins_of_every_law_stand_in_the_map():

@@ -38,6 +38,13 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
         said = found["hold"][row["axis"]]
         for column, name in (("gain_up_dB", "gain_up"), ("phase_deg", "phase"), ("delay_s", "delay")):
             np.testing.assert_allclose(float(row[column]), said[name], rtol=1e-12)
+    assert len(found["before"]) == len(rows) / 3 - 1
+    for one in found["before"]:  # of the worst axis
+        axes = [row for row in rows if float(row["time_to_go"]) == one["time_to_go"]]
+        assert len({row["modulus_dB"] for row in axes}) == 3
+        assert one["modulus"] == max(float(row["modulus_dB"]) for row in axes)
+        assert one["phase"] == min(float(row["phase_deg"]) for row in axes)
+        assert one["delay"] == min(float(row["delay_s"]) for row in axes)
     judged = [one["phase"] for one in found["before"] if one["judged"]]
     in_hold = [one["phase"] for one in found["hold"].values()]
     np.testing.assert_allclose(found["worst"]["phase_margin"], min([*in_hold, *judged]))

@@ -1,0 +1,37 @@
+"""What is measured of a problem: rows of flown trials and rows of margins side by side."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tuning.search import evaluate
+from tuning.search.evaluate import Evaluator, Sloped
+from tuning.search.shares import Bounds
+
+
+@pytest.mark.parametrize(("trials", "loops"), [(2, 5), (5, 2)])
+def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monkeypatch, trials, loops):
+    """Two limits on as many trials, one margin of as many loops: what neither has is as far within its limit as can be.
+
+    So the largest c is one that was measured, and no gain moves what was not.
+    """
+    rng = np.random.default_rng(0)
+    flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_slope": rng.normal(size=(2, 2, trials, 2))}
+    of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_slope": rng.normal(size=(2, 1, loops, 2))}
+    share = np.array([[0.0, 0.0], [1.0, 1.0]])
+    told = [{name: v[k] for name, v in of_loop.items()} for k in range(2)]
+    monkeypatch.setattr(evaluate.margin_rows, "sloped", lambda margins, bounds, one: told[int(one[0])])
+    some: Any = SimpleNamespace(margins=object())
+    evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
+    rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}
+    found = Sloped(**evaluator._measured(lambda problem, share: {**rest, **flown}, some, share))
+    assert found.c.shape == (2, 3, 5)
+    for name, filled in (("c", -1.0), ("c_slope", 0.0)):
+        seen = getattr(found, name)
+        for rows, own, size in ((seen[:, :2], flown[name], trials), (seen[:, 2:], of_loop[name], loops)):
+            np.testing.assert_array_equal(rows[:, :, :size], own)
+            assert np.all(rows[:, :, size:] == filled)
+    largest = np.maximum(flown["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
+    np.testing.assert_array_equal(found.beyond, largest)
