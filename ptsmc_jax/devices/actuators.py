@@ -75,7 +75,7 @@ class Actuators:
     # misfits: how the true actuators differ from those that the flight software knows
     scale: Leaf | None = None  # (channels,) true torque over the nominal one [-]
     directions: Leaf | None = None  # (m, channels) unit vectors along which they act
-    failure_times: Leaf | None = None  # (channels,) from the first sample after it on a channel has no torque [s]
+    failure_times: Leaf | None = None  # (channels,) from the first sample not before it on a channel has no torque [s]
     spare_allocations: Leaf | None = None  # (wheels, wheels, 3) without each wheel, where failures are known
 
     @property

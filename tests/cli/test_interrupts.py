@@ -51,3 +51,24 @@ def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, ca
     assert searches.run(search, loaded, tmp_path / "out", force=force, quiet=True) == 130
     assert capsys.readouterr().err == f"ptsmc: interrupted; {same} goes on from here\n"
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
+
+
+@pytest.mark.parametrize(
+    ("force", "told"), [(False, ""), (True, "ptsmc: interrupted; the same command without --force")]
+)
+def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_force(tmp_path, capsys, force, told):
+    """What is shown says that the same command goes on, which with --force would begin anew."""
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    shown = []
+    search = searches.LongSearch(
+        {"command": "tune", "seed": 0},
+        "window error",
+        work=lambda report, journal: SimpleNamespace(status="interrupted"),
+        write=lambda making, outcome: (making / "summary.json").write_text(outcome.status),
+        summary=lambda outcome: {"status": outcome.status},
+        show=lambda summary, folder, how: shown.append((summary["status"], how)),
+    )
+    assert searches.run(search, scenario.read(tmp_path / "s.toml"), tmp_path / "out", force=force, quiet=False) == 130
+    assert shown == [("interrupted", "interrupted")]
+    assert capsys.readouterr().err == (f"{told} goes on from here\n" if told else "")
+    assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))

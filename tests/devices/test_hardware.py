@@ -283,6 +283,23 @@ def test_wheels_keep_their_limits():
     assert all(np.isfinite(v) for v in (result.metrics.window_error, result.metrics.peak_torque))
 
 
+@pytest.mark.parametrize("early", [True, False])
+def test_a_wheel_fails_at_its_time_for_the_wheels_and_for_their_allocation_alike(early):
+    """At a sample at that very time the others do all of it, and nothing is lost nor done twice."""
+    device = reaction_wheels.wheels(PYRAMID)
+    failing = actuators.Actuators(
+        wheels=device,
+        failure_times=vector([3.0, np.inf, np.inf, np.inf]),
+        spare_allocations=reaction_wheels.spare_allocations(device),
+    )
+    at, u, one = vector(np.nextafter(3.0, 0.0) if early else 3.0), vector([0.1, -0.2, 0.3]), vector(1.0)
+    drive, _ = failing.command(failing.begin(3), u, vector(np.zeros(3)), at, one, one)
+    assert drive.works is not None
+    assert drive.works.tolist() == [early, True, True, True]
+    np.testing.assert_allclose(failing.torque(drive, vector(0.5)), u, atol=1e-15)
+    assert (abs(float(drive.c[0])) > 1e-3) is early
+
+
 def test_allocation_gives_the_wanted_torque_for_any_geometry():
     rng = np.random.default_rng(0)
     for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):

@@ -225,3 +225,17 @@ def test_a_run_does_not_jump_where_the_partial_first_period_vanishes():
         found.append([float(v) for v in (result.metrics.window_error, result.metrics.peak_torque)])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
     np.testing.assert_allclose(found[2], found[1], rtol=1e-4)
+
+
+def test_linear_theory_has_a_star_tracker_at_every_sample_that_tells_as_much():
+    """Its corrections add up to the same share in an interval, and so do the squares of what noise makes of them."""
+    own = of(star_tracker_period=0.25).parts.sensors
+    often, share = own.in_step(), 0.1 / 0.25
+    assert often.own_times is None
+    for name in ("attitude_gain", "bias_gain"):
+        gain, each = (float(getattr(one.filter, name)) for one in (own, often))
+        np.testing.assert_allclose(each / share, gain, rtol=1e-12)
+        noise, noises = float(gain * own.attitude_noise) ** 2, float(each * often.attitude_noise) ** 2
+        np.testing.assert_allclose(noises / share, noise, rtol=1e-12)
+    whole = of(star_tracker_every=2).parts.sensors
+    assert whole.in_step() is whole

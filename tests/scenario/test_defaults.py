@@ -86,6 +86,18 @@ def test_several_disturbances_add_up_component_by_component():
     assert bounds(disturbance={"kind": "sum", "terms": terms}) == (4e-3, 4e-3)
 
 
+def test_independent_random_walks_add_up_by_their_squares():
+    """Densities of 3 and 4 are one of 5, where both push the same axis."""
+
+    def walking(*densities):
+        terms = [{"kind": "random_walk", "density": density} for density in densities]
+        tables = {"loop": {"mode": "sampled"}, "disturbance": {"kind": "sum", "terms": [*terms, {"kind": "constant"}]}}
+        return np.asarray(scenario.study(scenario.from_tables(tables)).parts.walk_rate)
+
+    one, other, both = [3e-4, 1e-4, 0.0], [4e-4, 0.0, 2e-4], [5e-4, 1e-4, 2e-4]
+    np.testing.assert_allclose(walking(one, other), walking(both), rtol=1e-12)
+
+
 def test_the_gravity_gradient_reaches_what_its_moments_allow():
     """The largest c x J c over all c is half the difference of the moments; it changes by at most that times |c'|."""
     n, inertia = 1.1e-3, np.asarray(FULL_INERTIA)

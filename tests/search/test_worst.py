@@ -104,6 +104,18 @@ def test_normal_numbers_are_searched_where_nearly_all_of_them_lie():
     np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-8)  # it only slows down from there
 
 
+def test_normal_numbers_stay_a_hair_inside_their_ball_whose_edge_cuts_slopes_off():
+    """Two of them at 1 and 2, in a ball of 2, beside a uniform one that is left alone; then turned to their slopes."""
+    y, normal = np.array([[9.0, 0.6, 0.8], [9.0, 3.0, 4.0]]), [(slice(1, 3), 2.0)]
+    inside = worst._within(y, normal)
+    np.testing.assert_allclose(inside, [y[0], [9.0, 1.2, 1.6]], rtol=1e-8)
+    assert np.linalg.norm(inside[1, 1:]) < 2.0
+    turned = worst._within(y, normal, np.array([[5.0, 3.0, -4.0], [5.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(turned, [[9.0, 1.2, -1.6], [9.0, 1.2, 1.6]], rtol=1e-8)  # none: where it is
+    assert np.all(np.linalg.norm(turned[:, 1:], axis=1) < 2.0)
+    assert y[1, 1] == 3.0
+
+
 def test_the_worst_misfits_are_found_by_their_slopes():
     """A star tracker turned by a leaves sin(a / 2) of error; as far as a box goes: to a corner, 3^(1/2) of its edge.
 

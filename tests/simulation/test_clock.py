@@ -27,6 +27,16 @@ def test_anchored_periods_fill_the_time_and_meet_the_hand_over(t_f, share, coast
     np.testing.assert_allclose(np.asarray(ticks.noise_weight)[t > 0], 1.0)
 
 
+@pytest.mark.parametrize(("period", "t_f", "delta", "after"), [(0.3, 7.3, 1.1, 10.0), (0.01, 12.1, 0.05, 2.0)])
+def test_the_last_period_of_an_anchored_clock_ends_with_the_run_whatever_rounding_does(period, t_f, delta, after):
+    """As many periods as there are from the hand-over on end 4e-15 s before it."""
+    t_end = t_f + after
+    whole = round((t_end - t_f + delta) / period)
+    assert 0.0 < t_end - (t_f - delta + whole * period) < 1e-14
+    ticks = ticks_of(clock.anchored(period, t_end, t_f, t_end - t_f + delta), vector(t_f), vector(delta))
+    assert float(ticks.t_next[-1]) == t_end
+
+
 @pytest.mark.parametrize("periods", [10, 20])
 def test_anchored_ticks_are_continuous_where_delta_is_a_multiple_of_the_period(periods):
     anchored = clock.anchored(0.1, 15.0, 10.0, 8.0)

@@ -238,6 +238,19 @@ def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
     assert all(np.isnan(float(getattr(lost.metrics, name))) for name in ("window_error", "hold_error", "settling_time"))
 
 
+@pytest.mark.parametrize(("disturbance", "status"), [(0.5, rollout.OK), (50.0, rollout.MISSED)])
+def test_a_run_that_starts_where_it_is_to_be_has_missed_t_f_by_ten_settling_angles(disturbance, status):
+    """5 % of an initial error of zero is none: what no observer takes off leaves a tau^2 / (eta - 2)^2 at tau = delta.
+
+    Here 1.25e-3 and 0.125, beside settling angles of 1e-3 that the run may be off by ten of.
+    """
+    pushed = disturbances.Constant(vector([disturbance]))
+    result = fly(chain_parts([0.0, 0.0], disturbance=pushed))
+    assert int(result.status) == status
+    assert (float(result.metrics.terminal_angle) > 1e-2) == (status == rollout.MISSED)
+    np.testing.assert_equal(float(result.bad_time), 5.0 if status == rollout.MISSED else np.nan)
+
+
 def flown(plant, mode, **tables):
     return runs.fly(scenario.study(scenario.from_tables({"plant": plant, "loop": {"mode": mode}, **tables})))
 

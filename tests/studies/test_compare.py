@@ -226,6 +226,7 @@ def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path)
 def test_settling_is_summed_up_by_where_trials_start():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
     assert compare._near_far(angle, settling) == (30.0, 33.0)
+    assert compare._near_far(-angle, angle) == (angle[89], angle[9])  # medians of the last and the first twenty
     assert compare._near_far(angle, np.where(angle > 2.2, np.inf, settling)) == (30.0, 33.0)
     assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
 

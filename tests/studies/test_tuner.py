@@ -92,6 +92,31 @@ def test_a_hand_over_that_moves_has_its_sample_whatever_clock_flies(free, anchor
     assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else flown)
 
 
+def test_steps_and_samples_are_chosen_for_the_farthest_that_each_gain_may_go():
+    """To the end of its bounds at which more of them are needed, or its own value where that lies beyond."""
+    wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
+            "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
+    made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})
+    reach = posing.reach(made, made.search)
+    assert (reach.smallest_t_f, reach.t_f) == (20.0, 60.0)
+    assert (reach.smallest_delta, reach.delta) == (0.05, 4.0)  # the scenario's own is shorter
+    assert (reach.gain, reach.largest_gain) == (2.0, 50.0)
+    assert (reach.k1, reach.sign_width, reach.surface_rate) == (7.0, 1e-4, 3.0)
+    assert posing.reach(made, made.search, t_f=99.0).t_f == 99.0
+
+
+def test_one_trial_of_which_nothing_is_drawn_is_judged_by_the_limit_alone():
+    """It shows nothing of 99 % of the trials, all of which are that one."""
+    asked = {"peak_torque": {"limit": 3.0, "quantile": 0.99, "confidence": 0.95}}
+    tables = tomllib.loads(SHORT_CHAIN) | {"requirements": asked}
+    del tables["tune"], tables["dispersion"], tables["hardware"]
+    trials: Any = SimpleNamespace(status=np.zeros(1), finished=np.ones(1, bool), ok=np.ones(1, bool))
+    for torque, met in ((2.9, True), (3.1, False)):
+        trials.metrics = SimpleNamespace(peak_torque=np.array([torque]))
+        (verdict,) = judging.verdicts_of(scenario.from_tables(tables), trials, 1)
+        assert (verdict.met, verdict.quantile, verdict.worst) == (met, None, torque)
+
+
 def test_every_column_of_a_history_has_a_name_of_its_own():
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
     columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])

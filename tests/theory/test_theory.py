@@ -94,6 +94,12 @@ def test_the_narrowest_sign_is_reached_through_in_one_period():
     # its layer's rate times the period, from the law's own rate at its own width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
     np.testing.assert_allclose(envelopes.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
+    # of K2 when the observer has settled: of what it starts with e^(-26) is left at t_end, and 600 times as much counts
+    unknown = dataclasses.replace(run.observer, initial_error=vector(1.0))
+    assert float(unknown.error_bound().largest) < 600.0 * float(run.observer.error_bound().largest)
+    np.testing.assert_allclose(
+        envelopes.narrowest_sign(dataclasses.replace(run, observer=unknown), 0.05), width, rtol=600.0 * np.exp(-26.0)
+    )
 
 
 def test_exact_path_is_the_path_of_the_run():
