@@ -1,5 +1,6 @@
 import re
 import tomllib
+from typing import Any
 
 import jax
 import numpy as np
@@ -132,6 +133,17 @@ def test_verdicts_are_on_rows_of_what_trials_take(flight, tmp_path):
                         (rows.drop("status"), "have no status")):  # fmt: skip
         with pytest.raises(ValueError, match=said):
             ptsmc_jax.verdicts(flight.scenario, other)
+
+
+def test_margins_are_those_of_the_trials_whose_rows_are_judged(monkeypatch):
+    asked: list[Any] = []
+    monkeypatch.setattr(explore.margin_verdicts, "over_trials", lambda ready, seed: asked.append((ready, seed)) or [])
+    tables = tomllib.loads(SHORT_CHAIN) | {"requirements": {"gain_margin": 3.0, "peak_torque": 3.0}}
+    ready = scenario.study(scenario.from_tables(tables))
+    rows = pl.DataFrame({"status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})
+    (verdict,) = ptsmc_jax.verdicts(ready, rows, seed=7)
+    assert (verdict.metric, verdict.worst) == ("peak_torque", 2.0)
+    assert asked == [(ready, 7)]
 
 
 def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import shutil
 import subprocess
 
@@ -135,6 +136,19 @@ def test_vectors_are_the_run_that_the_simulator_flies(exported):
         at = header.index(f"{name}[0]")
         found = np.array([[float(v) for v in row[at : at + 3]] for row in mine])
         np.testing.assert_allclose(found, column[: len(found)], rtol=1e-11, atol=1e-13)
+
+
+def test_what_rounding_may_leave_is_reckoned_to_the_last_sample_before_the_hand_over(exported):
+    """A period before it, delta + h before t_f, where gains are (t_f / (delta + h))^2 times those at the start.
+
+    From rest an error is |v| r^3 (1 + 3 ln(1/r)), r = (t_f - t) / t_f, and over r^2 at most 3 e^(-2/3) |v|.
+    """
+    with (exported / "vectors.csv").open() as file:
+        starts = [row for row in csv.DictReader(file) if row["sample"] == "0"]
+    farthest = max(np.linalg.norm([float(row[f"in.attitude[{k}]"]) for k in range(3)]) for row in starts)
+    (told,) = re.findall(r"8\.9e-16\) \* ([\d.e+-]+);", (exported / "check.c").read_text())
+    expected = 4.0 * (5.0 / (0.5 + 0.1)) ** 2 / (3.0 * np.exp(-2.0 / 3.0) * farthest)
+    np.testing.assert_allclose(float(told), expected, rtol=0.05)  # sampled every 0.02 t_f
 
 
 def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
