@@ -61,7 +61,8 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """Numbers of the whole control periods nearest to so long before t_f [s], and then of one in hold.
 
     Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
-    it is no farther off than at the hand-over, but one whose mean over a star tracker's interval is all of the hold.
+    it is at most twice as far off as at the hand-over, but one whose mean over a star tracker's interval is all of the
+    hold.
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)

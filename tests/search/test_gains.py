@@ -266,7 +266,12 @@ def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
 
 
 @pytest.mark.parametrize(
-    ("other", "where", "needed"), [({"delta": 1.0}, "after", "11 s"), ({"t_f": 40.0}, "before", "39.95 s")]
+    ("other", "where", "needed"),
+    [
+        ({"delta": 1.0}, "after", "11 s"),
+        ({"t_f": 40.0}, "before", "39.95 s"),
+        ({"t_f": 35.1}, "before", "35.05 s"),  # by a single sample
+    ],
 )
 def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, needed):
     """Its number of samples is fixed; without them the run would end before t_end, and nobody would know."""

@@ -24,4 +24,5 @@ def test_steps_that_end_early_and_further_rounds_move_one_scale():
     assert told("judging", 60, 4) == round(100 * 80 / 130)  # not planned: what is left stays
     assert told("harder trials, round 1", 60, 4) == round(100 * 80 / 155)
     assert told("b", 70, 4) == round(100 * 90 / 140)
+    assert told("b", 130, 4) == 100  # 80 where 50 were planned: nothing is left, and no more than all is done
     assert set(work.seconds) == {"compiling", "a", "b", "judging", "harder trials, round 1"}

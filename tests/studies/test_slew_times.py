@@ -54,17 +54,22 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
 
 
 def test_each_time_is_searched_for_itself(monkeypatch):
-    """Not from the gains of others alone, which may lie in another valley."""
+    """Not from the gains of others alone, which may lie in another valley; hard trials of the first two join all."""
     small_search(monkeypatch, 8)
-    searched, search = [], posing.Posed.search
+    searched, flown, joined, search = [], [], [], posing.Posed.search
 
     def note(posed, problem, own, starts, *asked, **told):
         searched.append((float(problem.parts.controller.t_f), starts > 1))
-        return search(posed, problem, own, starts, *asked, **told)
+        flown.append(np.asarray(problem.trials).tolist())
+        outcome = search(posed, problem, own, starts, *asked, **told)
+        joined.append(np.asarray(outcome.problem.trials).tolist())
+        return outcome
 
     monkeypatch.setattr(posing.Posed, "search", note)
     slew_times.trace(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 0, (4.0, 6.0, 8.0))
     assert searched == [(8.0, True), (4.0, True), (6.0, True)]
+    assert set(joined[0]) > set(flown[0])
+    assert flown[1:] == joined[:2]
 
 
 @pytest.mark.parametrize(

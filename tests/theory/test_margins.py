@@ -376,3 +376,20 @@ def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
             sizes = [linear.radius(loop, np.diag(np.where(np.arange(3) == axis, gain, 1.0))) for gain in gains]
             assert max(sizes[:-1]) < 1.0 + 1e-9
             assert sizes[-1] > 1.0 + 1e-5
+
+
+@pytest.mark.parametrize(("growth", "last"), [(1.1, 7), (0.9, 20), (3.0, 0)])
+def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
+    """In hold from period to period by 1.1, up to twice as far off as at the hand-over: 7 periods later, not 8."""
+    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "controller": {"t_f": 5.0, "delta": 0.5},
+              "loop": {"mode": "sampled", "period": 0.1, "t_end": 6.65, "window": 1.0}}  # fmt: skip
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    run = linear.nominal_jit(parts)
+    hold = np.flatnonzero(linear.is_full(run.period.now, parts.period) & run.period.now.hold)
+    assert hold.size == 21
+    off = np.asarray(run.carry.x).copy()
+    off[hold, 0] = 1e-3 * growth ** np.arange(hold.size)
+    grown = run._replace(carry=run.carry._replace(x=jnp.asarray(off)))
+    found = run_margins.moments(parts, grown, jnp.array([1.0]))
+    assert int(found[-1]) - hold[0] == last
+    assert abs(float(run.period.now.t[found[0]]) - 4.0) < 0.05 + 1e-9
