@@ -71,6 +71,15 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     told = why(Rows(), ["peak_torque"], 1)
     campaign_terminal.why(told, "spacecraft", 401)  # of one that failed: what is unusual in it
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
+    # a run that failed has metrics until then, which say nothing of what drives those of a whole run
+    cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
+    table = table.with_columns(
+        peak_torque=cut, status=pl.Series(["diverged", "ok", "missed"] * 133 + ["diverged", "ok"])
+    )
+    ended = table.filter(pl.col("status") != "diverged")
+    driven = statistics.drivers({"initial_w1": ended["initial_w1"].to_numpy()}, ended["peak_torque"].to_numpy())
+    (one,) = [row for row in why(Rows(), ["peak_torque"], 1) if row["input"] == "initial_w1"]
+    assert one["rank_correlation"] == pytest.approx(driven["initial_w1"]["rank_correlation"], rel=1e-12)
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
 
 

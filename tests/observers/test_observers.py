@@ -112,6 +112,20 @@ def test_error_stays_inside_the_bound_and_can_come_near_it(inertia, gain):
         assert gone <= float(initial(vector(t))) * (1 + 1e-12)
 
 
+def test_the_bound_of_gains_that_differ_carries_the_root_of_their_condition():
+    """Where J is not diagonal the smallest eigenvalue alone, with the sqrt(3), is less than what a ramp leaves."""
+    inertia, gain = np.array([[0.5, 1.0, 0.0], [1.0, 6.5, 0.0], [0.0, 0.0, 6.9]]), np.array([10.0, 5e3, 1e4])
+    found = observer(inertia, gain)
+    left = np.linalg.norm(worst_error(np.asarray(found.decay_matrix(NOW, NOW)), np.ones(3), 1e-3, 100.0))
+    slowest = np.linalg.eigvalsh(np.linalg.inv(inertia) * np.sqrt(np.outer(gain, gain))).min()
+    alone = np.sqrt(3.0) * 1e-3 / slowest
+    assert left > 1.25 * alone
+    bound = found.error_bound()
+    np.testing.assert_allclose(bound.floor, np.sqrt(1e3) * alone, rtol=1e-12)
+    np.testing.assert_allclose(observer(inertia, gain, start=0.2).error_bound().start, np.sqrt(1e3) * 0.2, rtol=1e-12)
+    assert left < float(bound(vector(100.0)))
+
+
 def test_paper_bound_is_violated_in_its_own_case():
     """c/l_m, without the sqrt(3), is below the error that d' = (c, c, c) leaves with a diagonal J."""
     a = np.diag(10.0 / np.array(PAPER_INERTIA))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import MARGINS, NO_SIGN
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.cli import campaign_commands
@@ -110,6 +111,37 @@ def test_shares_are_told_in_digits_that_say_something():
     wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")
     seen = wide.verdict(np.ones(3), np.ones(3, bool), np.array([1.0, 0.95, 1.0]))
     assert str(seen).endswith("98.33 %: met")
+
+
+@pytest.mark.parametrize(("failures", "advice"), [
+    (0, "; with no failure 299 trials would do"), (9, "; with so many failures 1568 trials would do"), (10, ""),
+])  # fmt: skip
+def test_how_many_trials_would_do_is_said_where_more_of_them_keep_the_limit_than_are_asked_for(failures, advice):
+    """Of 1 000 trials 10 are the very share that is asked for: more trials would have as many more of them."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.99, confidence=0.95)
+    verdict = asked.verdict(np.r_[np.zeros(1000 - failures), np.ones(failures)], np.ones(1000, bool)).in_summary()
+    more = {"share": 1.0 - failures / 1000, "share_interval": [0.9, 1.0], "share_bound": 0.985,
+            "fewest_trials": statistics.fewest_for(failures, 0.99, 0.95)}  # fmt: skip
+    assert sentences.verdict({**verdict, **more}).endswith(f"at least 98.5 % at 95 % one-sided confidence{advice}")
+
+
+def test_the_best_of_a_map_is_a_pair_of_which_no_trial_fails():
+    pair = {"status": "flown", "failures": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+    pairs = [
+        {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
+        {**pair, "x": 1.0, "y": 2.0},
+        {**pair, "x": 2.0, "y": 1.0, "window_error": 3e-6},
+        {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": float("nan")},
+    ]
+    keys = "loop.period", "controller.delta"
+    best, flown = sentences.grid(pairs, keys, "spacecraft")
+    assert best == (
+        "the smallest RMS window error is 2e-06, at loop.period = 1 and controller.delta = 2, "
+        "where the mean peak of the input is 0.3 N m"
+    )
+    assert flown == "3 of 4 pairs flown, 1 with failed trials"
+    best, _ = sentences.grid(pairs[:1], keys, "spacecraft")
+    assert best.endswith("is 0.3 N m, where 3 trials failed")
 
 
 def test_less_accurate_gains_are_not_praised():

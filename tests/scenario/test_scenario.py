@@ -84,6 +84,7 @@ def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
         "dispersion.attitude = { min_deg = 9, max_deg = 9 }",
         "requirements.effort = { limit = 9.0 }",
         "controller.sign_width = 0",
+        SAMPLED + "wheels = { momentum_limit = 1, momentum = [1, 0, -1, 0] }",
         "hardware = {}\nrequirements = {}\ndispersion = {}\ntune.bounds = {}",
     ],
 )

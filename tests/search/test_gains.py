@@ -111,6 +111,15 @@ def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
         assert np.all(np.isfinite(spread(at)))
 
 
+@pytest.mark.parametrize(("interval", "highest"), [(0.1, 5.0), (0.4, 2.5), (8.0, 1.0)])
+def test_default_bounds_of_a_filters_bandwidth_end_where_its_star_tracker_is_too_slow(interval, highest):
+    """From a tenth of 0.5 rad/s to ten times as much, but to once in a sample of the star tracker, or to the double."""
+    hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
+    tables = {"loop": {"mode": "sampled", "period": 0.1}, "filter": {"kind": "steady_state", "bandwidth": 0.5}}
+    made = from_tables({**tables, "hardware": hardware, "tune": {"free": ["filter_bandwidth"]}})
+    np.testing.assert_allclose(made.search.bounds["filter_bandwidth"], (0.05, highest), rtol=1e-12)
+
+
 @pytest.mark.parametrize("tables", [{}, {"plant": {"kind": "chain", "order": 2}}], ids=["spacecraft", "chain"])
 @pytest.mark.parametrize("name", ["filter_bandwidth", "command_corner"])
 def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):

@@ -185,6 +185,13 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
 
 
+@pytest.mark.parametrize(("tail", "mean"), [(None, 10.0), (1, 16.0), (2, 10.0), (3, 10.0)])
+def test_a_tail_of_more_trials_than_end_is_of_those_that_end(tail, mean):
+    """Two of four, with squares of 4 and 16."""
+    squares = jnp.array([4.0, objective.FAILED**2, 16.0, objective.FAILED**2])
+    np.testing.assert_allclose(np.exp(2.0 * objective._log_rms(squares, tail)), mean, rtol=1e-12)
+
+
 @pytest.mark.parametrize("least", helpers.short([1, 5, 8], [5]))
 def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
     """The largest c is that order statistic of the averaged trials; of added trials those count that are said to."""

@@ -117,6 +117,21 @@ def test_one_trial_of_which_nothing_is_drawn_is_judged_by_the_limit_alone():
         assert (verdict.met, verdict.quantile, verdict.worst) == (met, None, torque)
 
 
+def test_accuracy_beside_the_papers_gains_is_over_the_trials_that_both_fly_to_the_end():
+    """Ten that both do, whose RMS is five times as large; of one that is lost the other counts for nothing."""
+
+    def flown(errors: Any, lost: int) -> Any:
+        finished = np.arange(12) != lost
+        return SimpleNamespace(finished=finished, metrics=SimpleNamespace(window_error=np.where(finished, errors, 1e3)))
+
+    errors = np.linspace(1.0, 2.0, 12)
+    told = tune_files._accuracy_gain({"tuned": flown(errors, 3), "paper": flown(5.0 * errors, 7)})
+    assert told["accuracy_gain_over_paper"] == pytest.approx(5.0, rel=1e-12)
+    assert told["accuracy_gain_interval"] == pytest.approx((5.0, 5.0), rel=1e-9)
+    nothing = {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
+    assert tune_files._accuracy_gain({"tuned": flown(errors, 3)}) == nothing
+
+
 def test_every_column_of_a_history_has_a_name_of_its_own():
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
     columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])

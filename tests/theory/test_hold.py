@@ -130,3 +130,13 @@ def test_envelopes_after_the_hand_over_are_not_empty():
     ):
         ratio = size / bound
         assert 0.1 < ratio[-1] <= ratio.max() <= 1.0
+
+
+def test_the_envelope_of_s_goes_over_into_what_the_smooth_sign_leaves():
+    """At the rate 2 k in squares: from s at the hand-over to 0.2785 K width / k, half of each after ln 2 / (2 k)."""
+    bound, width, k = 0.02, 0.1, 0.7
+    run = chain_parts([1.0, -0.5], 10.0, 3.0, 2.0, k1=k, bound=bound, sign_width=width)
+    first, half, last = hold.sliding_bound(run, 8.0 + np.array([0.0, np.log(2.0) / (2.0 * k), 1e3])) ** 2
+    assert first > 2.0 * last
+    np.testing.assert_allclose(last, 0.2785 * bound * width / k, rtol=1e-9)
+    np.testing.assert_allclose(half, (first + last) / 2.0, rtol=1e-9)

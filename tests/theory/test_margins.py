@@ -393,3 +393,14 @@ def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
     found = run_margins.moments(parts, grown, jnp.array([1.0]))
     assert int(found[-1]) - hold[0] == last
     assert abs(float(run.period.now.t[found[0]]) - 4.0) < 0.05 + 1e-9
+
+
+@pytest.mark.parametrize(("t_f", "delta", "period", "ends"), [
+    (40.0, 2.0, 0.05, (2.0, 10.0)),  # from the hand-over to a quarter of t_f
+    (40.0, 0.2, 0.1, (1.0, 10.0)),  # ten periods: from one to the next gains change by a tenth
+    (40.0, 12.0, 0.1, (12.0, 12.0)),  # a hand-over before that quarter
+])  # fmt: skip
+def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, ends):
+    tables = {"plant": {"kind": "chain"}, "controller": {"t_f": t_f, "delta": delta}}
+    made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
+    np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), np.geomspace(*ends, 4), rtol=1e-12)

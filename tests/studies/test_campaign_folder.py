@@ -1,0 +1,37 @@
+"""What a campaign's folder keeps of theory."""
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ptsmc_jax.campaigns import margin_verdicts, runs
+from tuning.studies import campaign_folder
+
+
+@pytest.mark.parametrize(("count", "rows", "looked"), [(None, [], None), (3, [0, 1, 2], 3), (900, [0, 1, 2, 3], 256)])
+def test_theory_is_of_the_first_trials_or_rows_and_found_once(tmp_path, monkeypatch, count, rows, looked):
+    """Of a plan the floor is that of its first four rows, or fewer, and margins are those of its first 256."""
+    asked: list[Any] = []
+
+    def floor(ready, seed, first):
+        asked.append((ready, seed, first))
+        return 1e-6
+
+    def over_trials(ready, seed, some):
+        asked.append((ready, seed, None if some is None else len(some)))
+        return []
+
+    monkeypatch.setattr(runs, "floor", floor)
+    monkeypatch.setattr(margin_verdicts, "over_trials", over_trials)
+    plan = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
+    flown = SimpleNamespace(ready="ready", plan=None if count is None else plan)
+    folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=flown, scenario=SimpleNamespace(requirements={}))
+    campaign_folder.find_floor(folder)
+    assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
+    assert json.loads((tmp_path / "floor.json").read_text()) == {"window_error": 1e-6, "margins": []}
+    campaign_folder.find_floor(folder)
+    assert len(asked) == 2
+    assert campaign_folder.floor_of(folder) == 1e-6
