@@ -54,12 +54,10 @@ def _mean_width(width: float, sigma: float) -> float:
     """Width of the smooth sign whose slope at 0 is the mean slope under Gaussian noise of this size."""
     if sigma == 0.0:
         return width
-    at, weight = np.polynomial.hermite_e.hermegauss(101)
-    if width < 0.05 * sigma:  # as good as the exact sign
-        return float(np.sqrt(np.pi / 2) * np.hypot(sigma, width))
-    shares = np.minimum(np.abs(at) * sigma / width, 300.0)  # beyond that sech^2 is no number
-    mean = np.sum(weight / np.cosh(shares) ** 2) / np.sum(weight)
-    return width / float(mean)
+    share = width / sigma
+    at = np.linspace(-20.0, 20.0, 401) / max(1.0, share)  # in widths: steps of a tenth of what falls off sooner
+    mean = np.trapezoid(np.exp(-((share * at) ** 2) / 2.0) / np.cosh(at) ** 2, at) / np.sqrt(2.0 * np.pi)
+    return sigma / float(mean)
 
 
 class _Rows(NamedTuple):
