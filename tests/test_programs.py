@@ -7,6 +7,7 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -224,6 +225,21 @@ def test_only_so_many_are_kept(folder, monkeypatch):
         program, _ = spied(f"number_{k}")
         program(X)
     assert len(list(folder.iterdir())) == 2
+
+
+def test_those_not_used_for_longest_make_room(folder, monkeypatch):
+    monkeypatch.setattr(programs, "KEPT", 3)
+    made: list[Path] = []
+    for k in range(4):
+        before = set(folder.iterdir()) if folder.exists() else set()
+        program, _ = spied(f"number_{k}")
+        program(X)
+        (new,) = set(folder.iterdir()) - before
+        made.append(new)
+        used = (new, made[0])  # the first one is used again and again
+        for j, path in enumerate(used):
+            os.utime(path, (1e9 + 10 * k + j,) * 2)
+    assert set(folder.iterdir()) == {made[0], made[2], made[3]}
 
 
 _SCRIPT = """

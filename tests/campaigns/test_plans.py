@@ -337,6 +337,21 @@ def test_an_angle_may_be_off_by_the_digits_that_a_table_leaves_out(angle, least)
         plans.check_angle(said, said + 1.1 * off, "the plan")
 
 
+def test_plans_that_fly_other_trials_have_other_digests():
+    """Other numbers, other names, other draws and noise, more rows; not the angle that follows from the rest."""
+    numbers, three = np.arange(6.0).reshape(2, 3), np.array([3, 5], np.uint32)
+    some = plans.Plan({"initial_rate": numbers}, None, None, None, 2)
+    others = [
+        dataclasses.replace(some, given={"initial_rate": np.nextafter(numbers, 9.0)}),
+        dataclasses.replace(some, given={"disturbance_bias": numbers}),
+        dataclasses.replace(some, trial=three),
+        dataclasses.replace(some, seed=three),
+        dataclasses.replace(some, given={}, count=3),
+    ]
+    assert len({one.digest for one in (some, *others)}) == 6
+    assert dataclasses.replace(some, angle=np.ones(2)).digest == some.digest
+
+
 def test_files_that_are_no_plan_are_refused(tmp_path):
     for name, content, said in (
         ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),

@@ -169,6 +169,8 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
         (["--shard", "3/2"], "--shard is 3/2, but must be I/N with I from 1 to N"),
         (["--shard", "half"], "--shard is half, but must be I/N"),
         (["--until-confident", "2"], "--until-confident is 2, but must be a number between 0 and 1"),
+        (["--until-confident", "1"], "--until-confident is 1, but must be a number between 0 and 1"),
+        (["--until-confident", "0.0"], "--until-confident is 0.0, but must be a number between 0 and 1"),
         (["--until-confident", "0.1", "--dry-run"], "does not go with --shard or --dry-run"),
         (["--cluster", "local:2", "--shard", "1/2"], "--cluster does not go with --shard"),
         (["--cluster", "local:none"], "--cluster is local:none, but must be local:N"),

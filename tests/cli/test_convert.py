@@ -57,6 +57,8 @@ def test_every_form_is_the_same_attitude(sequence):
     (("--mrp", "[0, 0, 0.41421356237309503]"), "90 degrees about [0, 0, 1]"),  # tan(90 deg / 4)
     (("--dcm-body-to-inertial", "0,-1,0,1,0,0,0,0,1"), "90 degrees about [0, 0, 1]"),
     (("--euler-deg", "90,0,0"), "90 degrees about [0, 0, 1]"),
+    (("--rotvec-deg", "0,0,180"), "180 degrees about [0, 0, 1]"),
+    (("--rotvec-deg", "0,0,200"), "160 degrees about [0, 0, -1]"),
     (("--euler-deg", "90,0,0", "--sequence", "XYZ"), "90 degrees about [1, 0, 0]"),
     (("--rotvec-deg", "0,0,0"), "0 degrees"),
 ])  # fmt: skip

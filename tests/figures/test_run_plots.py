@@ -31,6 +31,27 @@ def test_the_time_to_go_has_plain_numbers():
     assert all(re.fullmatch(r"[\d.]+", label) for label in labels)
 
 
+@pytest.mark.parametrize("order", [2, 3])
+def test_slopes_of_theory_are_drawn_with_the_powers_that_they_are_said_to_have(order):
+    """The error falls like r^eta, and of a chain of order 3 s like r^(eta + 1)."""
+    tables = {"plant": {"kind": "chain", "order": order}, "controller": {"t_f": 5.0, "eta": 4.5, "delta": 0.5}}
+    chain = from_tables({**tables, "loop": {"mode": "sampled", "period": 0.1}})
+    (axes,) = ptsmc_jax.simulate(chain).plot("convergence")["convergence"].axes
+    guides = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_color() == "black"]
+    powers = [np.log(y[1] / y[0]) / np.log(x[1] / x[0]) for x, y in (guide.T for guide in guides)]
+    np.testing.assert_allclose(powers, [4.5, 5.5][: order - 1], rtol=1e-12)
+    said = [text.get_text() for text in axes.texts]
+    assert said == ["slope $\\eta$ = 4.5", "slope $\\eta+n-2$ = 5.5"][: order - 1]
+
+
+def test_the_window_that_a_run_is_judged_in_is_shaded():
+    short = ptsmc_jax.replace(from_tables(untuned(SHORT_CHAIN)), loop__window=0.75)
+    (axes,) = ptsmc_jax.simulate(short).plot("error")["error"].axes
+    (window,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("window")]
+    placed = window.get_window_extent().transformed(axes.transData.inverted())
+    np.testing.assert_allclose([placed.x0, placed.x1], [5.0, 5.75], rtol=1e-9)
+
+
 @pytest.mark.parametrize(("disturbance", "drawn"), [("none", set()), ("sinusoid", {"error", "sliding"})])
 def test_what_log_axes_cannot_show_is_not_drawn(disturbance, drawn):
     """A run that begins on its target: its errors are zero, or have no exact motion that theory knows."""

@@ -37,15 +37,15 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
 
 
 def test_a_tradeoff_has_each_trial_and_their_rms_beside_their_mean_peak():
-    """Errors of 3e-6 and 4e-6, an RMS of (25e-12 / 2)^(1/2)."""
-    errors, peaks = np.array([3e-6, 4e-6]), np.array([0.2, 0.4])
+    """Errors of 3e-6, 4e-6 and 12e-6, an RMS of 13e-6 / 3^(1/2)."""
+    errors, peaks = np.array([3e-6, 4e-6, 12e-6]), np.array([0.2, 0.4, 0.3])
     figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, floor=1e-6)
     (axes,) = figure.axes
     trials, (whole,) = (np.asarray(line.get_xydata()) for line in axes.lines[:2])
     np.testing.assert_array_equal(trials, np.stack([errors, peaks], axis=1))
-    np.testing.assert_allclose(whole, [5e-6 / np.sqrt(2.0), 0.3], rtol=1e-12)
+    np.testing.assert_allclose(whole, [13e-6 / np.sqrt(3.0), 0.3], rtol=1e-12)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert said == ["tuned: RMS 3.54e-06, mean peak 0.3 N m", "limit 0.5 N m", "floor 1e-06"]
+    assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "floor 1e-06"]
 
 
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # the other: long numbers
@@ -69,6 +69,12 @@ def test_a_limit_far_above_what_is_drawn_is_said_and_does_not_flatten_it(limit, 
     assert (max(axes.get_ylim()) > 2.0) == drawn
     (said,) = [line.get_label() for line in axes.lines if str(line.get_label()).startswith("limit")]
     assert said == f"limit {limit:g} N m" + ("" if drawn else ", beyond this axis")
+
+
+def test_cells_of_a_map_reach_half_way_to_the_next_ones_and_as_far_at_the_ends():
+    np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], False).edges, [0.5, 1.5, 3.0, 5.0])
+    powers = 2.0 ** np.array([-0.5, 0.5, 1.5, 2.5])  # as the axis is drawn
+    np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], True).edges, powers)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])

@@ -64,6 +64,9 @@ def test_a_run_becomes_a_page(command, flown):
     rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
     history = {line["name"]: line for line in read.charts["history"]["data"]}
     assert set(history) == set(rows.dtype.names or ()) - {"t"}
+    marked = {note["text"]: note["x"] for note in read.charts["history"]["layout"]["annotations"]}
+    assert {name: marked[name] for name in ("t_f", "t_f - delta")} == {"t_f": 5.0, "t_f - delta": 4.5}
+    assert [shape["x0"] for shape in read.charts["history"]["layout"]["shapes"]] == [5.0, 4.5]
     for name in ("q4", "w2", "u3"):
         np.testing.assert_allclose(history[name]["x"], rows["t"], rtol=1e-5, atol=1e-9)
         np.testing.assert_allclose(history[name]["y"], rows[name], rtol=1e-5, atol=1e-12)

@@ -1,6 +1,8 @@
 """The paper reproduced: its claims and slips as measured, and what `ptsmc reproduce` leaves of them."""
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,6 +91,33 @@ def test_slips_show_what_they_say(made):
     assert sign["aligned_angle_deg"] < 1e-3
     (singular,) = [v for k, v in values.items() if k.startswith("Theorem 2")]
     assert singular["179"] / singular["90"] == pytest.approx(np.tan(np.deg2rad(89.5)), rel=1e-9)
+
+
+def test_each_figure_of_the_paper_has_its_number_and_shows_what_it_shows_there(monkeypatch):
+    """Of a chain (a) its states and (b) its control; of a spacecraft the first its attitude, the last its torque."""
+    for name in ("attitude", "torque", "states"):
+        monkeypatch.setattr(reproduction.run_plots, name, lambda run, log, title, name=name: (name, log, title))
+    monkeypatch.setattr(reproduction.run_plots, "convergence", lambda run, log, title: ("convergence", log, title))
+    monkeypatch.setattr(reproduction.run_plots, "observers", lambda measured: "observers")
+
+    def run(name: str) -> Any:
+        plant = SimpleNamespace(attitude=name.startswith("case"))
+        return SimpleNamespace(parts=SimpleNamespace(plant=plant), log=name)
+
+    cases = {name: run(name) for name in claims.CASES}
+    drawn: Any = reproduction._figures(reproduction.Reproduction(cases, [], [], []))
+    paper = {
+        "fig_01a_states": "second_order", "fig_01b_control": "second_order", "fig_02a_states": "third_order",
+        "fig_02b_control": "third_order", "fig_03_attitude": "case_1_30", "fig_04_torque": "case_1_30",
+        "fig_05_attitude": "case_1_40", "fig_06_torque": "case_1_40", "fig_07_attitude": "case_2_eta_3",
+        "fig_08_torque": "case_2_eta_3", "fig_09_attitude": "case_2_eta_5", "fig_10_torque": "case_2_eta_5",
+    }  # fmt: skip
+    for name, case in paper.items():
+        what = name.partition("_")[2].partition("_")[2].replace("control", "torque")
+        assert drawn[name][:2] == (what, case)
+    assert drawn["fig_10_torque"][2] == "Fig. 10: Case II, eta = 5"
+    assert drawn["fig_01b_control"][2] == "Fig. 1 (b): second-order system, eta = 3"
+    assert set(drawn) == {*paper, *(f"convergence_{name}" for name in claims.CASES), "remark_2_observers"}
 
 
 def test_folder_holds_figures_claims_and_scenarios(made, tmp_path):

@@ -226,8 +226,8 @@ BAD = [
         "absent where star_tracker_every is given",
     ),
     (
-        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware.star_tracker_period = 0.04",
-        "hardware.star_tracker_period is 0.04",
+        SAMPLED + "filter = { bandwidth = 0.1 }\nhardware.star_tracker_period = 0.0499",
+        "hardware.star_tracker_period is 0.0499",
         "at least loop.period, 0.05",
     ),
     (

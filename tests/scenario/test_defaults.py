@@ -223,6 +223,15 @@ def test_what_is_odd_is_said(tables, said):
     assert all(words in found[0] for words in said)
 
 
+@pytest.mark.parametrize(("share", "said"), [(1.02, False), (0.98, True)])
+def test_an_estimate_is_noisy_where_its_noise_is_more_than_what_it_estimates(share, said):
+    noise = cautions.estimate_noise(scenario.from_tables({**NOISY, "disturbance": {"kind": "none"}}))
+    acting = {"kind": "constant", "amplitude": [share * noise, 0.0, 0.0]}
+    tables = {**NOISY, "disturbance": acting, "observer": {"gain": [0.07] * 3}}
+    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # the same observer as by default
+    assert any("look at a smaller gain" in one for one in cautions.of(scenario.from_tables(tables))) is said
+
+
 def test_the_noise_of_an_estimate_is_that_of_the_observer_itself():
     """The digital observer on 40000 samples of noise alone: 3 axes, one of them 1 % off at most by chance (3 sigma)."""
     gain, h, sigma = [0.05, 0.2, 1.0], 0.1, 1e-4

@@ -85,6 +85,8 @@ def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
         "requirements.effort = { limit = 9.0 }",
         "controller.sign_width = 0",
         SAMPLED + "wheels = { momentum_limit = 1, momentum = [1, 0, -1, 0] }",
+        SAMPLED + "filter.bandwidth = 0.1\nhardware.star_tracker_period = 0.05",
+        SAMPLED + "loop.period = 1\ncontroller.delta = 1\nfilter.bandwidth = 0.1\nhardware.star_tracker_every = 40",
         "hardware = {}\nrequirements = {}\ndispersion = {}\ntune.bounds = {}",
     ],
 )

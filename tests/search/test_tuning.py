@@ -273,6 +273,27 @@ def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
     np.testing.assert_array_equal(found.worst, found.ended)
 
 
+def test_what_is_out_of_reach_is_not_searched_on(monkeypatch):
+    """Harder trials would bring gains no nearer, and where none have joined the same starts lead to the same end."""
+    helpers.small_search(monkeypatch)
+    monkeypatch.setattr(worst, "SCREENED", 16)
+    for owner, name in ((rounds.Rounds, "harder"), (descents.Descents, "start_over")):
+        monkeypatch.setattr(owner, name, lambda *_, name=name: pytest.fail(name))
+    wanted = [Requirement("window_error", 1e-9)]
+    evaluate = Evaluator(shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
+    settings = optimise.Settings(2, 2, 1, judged=False)
+    found = optimise.search(evaluate, problem(window_error=1e-9), wanted, np.array([3.0, 0.5]), settings)
+    assert found.worst[0] > optimise.HOPELESS
+    assert found.rounds == 0
+
+
+@pytest.mark.parametrize(("joined", "averaged"), [(0, 32), (8, 24), (16, 16), (24, 16)])
+def test_starts_are_given_up_on_few_trials_those_that_joined_among_them(joined, averaged):
+    few = descents._few_trials(objective.with_trials(problem(40, peak_torque=0.7), np.arange(40, 40 + joined)))
+    assert np.asarray(few.trials).tolist() == [*range(averaged), *range(40, 40 + joined)]
+    assert few.averaged == averaged
+
+
 @pytest.mark.parametrize("far", [0.5, 1e7])
 def test_a_failed_trial_is_worse_than_any_that_ends_however_far_beyond_its_limit(far):
     """Two trials at two points: nearer the limit with one that fails, farther with none."""

@@ -183,6 +183,8 @@ def test_temporal_is_a_share_of_the_time_in_every_run():
     told = of_time("temporal", kept)
     assert (told.met, told.failures, told.shown) == (True, 0, pytest.approx(0.998))
     assert told.margin == pytest.approx(0.002 / 0.0027)
+    kept[7] = 0.9973
+    assert of_time("temporal", kept).met  # the very share that is asked for
     kept[8] = 0.99
     told = of_time("temporal", kept)
     assert (told.met, told.failures) == (False, 1)
