@@ -71,12 +71,13 @@ def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float
 
 def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
     """The angle from the boresight to a unit vector, and its direction: an arc on the sphere, laid flat [rad]."""
-    side = frame[1:] @ pointed
+    side, ahead = frame[1:] @ pointed, jnp.dot(frame[0], pointed)
     square = jnp.sum(side * side)
     small = square < 1e-12  # the angle is then its sine to a part in 1e12
     size = jnp.sqrt(jnp.where(small, 1.0, square))
-    angle = elementary.arctan2(size, jnp.where(small, 1.0, jnp.dot(frame[0], pointed)))
-    return side * jnp.where(small, 1.0 + square / 6.0, angle / size)
+    turned = elementary.arctan2(size, jnp.abs(ahead))
+    arc = side * jnp.where(small, 1.0 + square / 6.0, jnp.where(ahead < 0.0, np.pi - turned, turned) / size)
+    return jnp.where(small & (ahead < 0.0), np.pi * jnp.eye(2)[0], arc)  # straight back: by any direction
 
 
 class ErrorPath(NamedTuple):

@@ -193,6 +193,18 @@ def check_the_cone(seed):
 
 test_the_half_cone_is_the_angle_of_the_boresight = drawn(check_the_cone, 20, seed=st.integers(0, 2**32 - 1))
 
+
+@pytest.mark.parametrize("angle", [1.0, 2.0, 2.5, 3.0, 3.14, np.pi - 2e-6, np.pi])
+def test_a_boresight_that_points_back_is_off_by_more_than_a_right_angle(angle):
+    """Up to half a turn, all of it about an axis across the boresight; straight back by any direction."""
+    frame = pointing.across([1.0, -2.0, 0.5])
+    off = Rotation.from_rotvec(angle * (0.6 * frame[1] + 0.8 * frame[2]))
+    error = pointing.attitude_error(vector(off.as_quat()), vector([0.0, 0.0, 0.0, 1.0]), vector(frame))
+    assert float(jnp.linalg.norm(error[3:])) == pytest.approx(angle, rel=1e-9)
+    if angle < 3.1:
+        np.testing.assert_allclose(error[3:], angle * np.array([0.8, -0.6]), rtol=1e-9)
+
+
 KNOWN_WITHIN = 1e-5  # rad
 POINTED = (
     SHORT.replace("[requirements]\npeak_torque = 30.0\n", "")
