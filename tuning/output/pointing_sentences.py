@@ -21,7 +21,7 @@ def angle(value: float | None) -> str:
     if abs(degrees) >= 1.0:
         return f"{degrees:.3g} deg"
     seconds = 3600.0 * degrees
-    return f"{seconds:.0f} arcsec" if abs(seconds) >= 1000.0 else f"{seconds:.3g} arcsec"
+    return f"{seconds:.0f} arcsec" if abs(seconds) >= 999.5 else f"{seconds:.3g} arcsec"
 
 
 def tables(summary: Summary) -> list[Table]:

@@ -182,7 +182,7 @@ def floor(error: float | None, least: float | None) -> str:
 
 def ratio(times: float | None) -> str:
     """How many times, in three digits, without an exponent below a million; - where there is no number."""
-    return digits(times, ".0f" if times is not None and 1000.0 <= times < 1e6 else ".3g")
+    return digits(times, ".0f" if times is not None and 999.5 <= times < 1e6 else ".3g")
 
 
 def over_floor(error: float | None, least: float | None) -> float | None:
