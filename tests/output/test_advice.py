@@ -32,6 +32,20 @@ def test_what_to_change_is_said_with_the_numbers():
     assert not list(search_sentences.advice(summary(1.1, searched=1.2)))  # the search says that it found none
 
 
+@pytest.mark.parametrize("interpretation", ["temporal", "mixed"])
+def test_what_is_asked_for_a_share_of_the_time_is_told_by_its_limit(interpretation):
+    """3 % of the time beyond, 30 times what may be, by errors of 1.1 of the limit: a stricter limit is one by these."""
+    asked = Requirement("ape_x", 0.5, quantile=0.999, interpretation=interpretation)
+    within, unknown = np.full(4, 0.97), {"window_error": None}
+    verdict = asked.verdict(np.full(4, 0.55), np.ones(4, bool), within).in_summary()
+    found = {"search": {"largest_over_limit": {"ape_x": 0.99}}, "training": unknown, "fresh": unknown}
+    (said,) = search_sentences.advice({**found, "verdicts": [verdict]})
+    assert "fresh trials reach 1.1 times the limit" in said
+    assert "requirements.ape_x = 0.446" in said
+    (lost,) = search_sentences.advice({**found, "verdicts": [{**verdict, "worst": None}]})  # of a run that fails
+    assert "fail or lack it" in lost
+
+
 @pytest.mark.parametrize(
     ("metric", "limit", "worst", "said"),
     [

@@ -105,7 +105,7 @@ def advice(summary: Summary) -> Iterator[str]:
     record = summary["search"]
     larger = f"tune.trials = {4 * record.get('averaged', 256)}"
     for verdict in summary["verdicts"]:
-        searched, over = record["largest_over_limit"].get(verdict["metric"]), verdict["margin"]
+        searched, over = record["largest_over_limit"].get(verdict["metric"]), _reached(verdict)
         kept_in_search = searched is not None and searched <= 1.0
         if verdict["met"] or not kept_in_search or not verdict["limit"]:
             continue
@@ -113,7 +113,7 @@ def advice(summary: Summary) -> Iterator[str]:
             yield from _of_loops(verdict)
         elif over is None or not math.isfinite(over):
             yield f"{verdict['metric']}: kept in the search, but fresh trials fail or lack it: tune with {larger}"
-        else:
+        elif over > 1.0:
             limit = f"{verdict['limit'] / (1.02 * over):.3g}"
             yield (
                 f"{verdict['metric']}: kept in the search, but fresh trials reach {over:.3g} times the limit: tune "
@@ -125,6 +125,13 @@ def advice(summary: Summary) -> Iterator[str]:
             "fresh trials are less accurate than training ones by more than chance explains: the gains fit those too "
             f"closely; tune with {larger}"
         )
+
+
+def _reached(verdict: Summary) -> float | None:
+    """How many times its limit fresh trials reach: what is asked for a share of the time is searched for as a limit."""
+    if verdict.get("share_of_time") is None:
+        return verdict["margin"]
+    return None if verdict["worst"] is None else verdict["worst"] / verdict["limit"]
 
 
 def _of_loops(verdict: Summary) -> Iterator[str]:
