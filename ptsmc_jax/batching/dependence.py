@@ -1,13 +1,14 @@
 """What the values of a trace differ over, and which of them count, without evaluating it: for `lanes` and `kernel`."""
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 from jax.extend import core
 from jax.interpreters import partial_eval
 
+T = TypeVar("T")
 _CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
 
 
@@ -15,6 +16,23 @@ def called(eqn: Any) -> Any:
     """The trace that a call stands for; None where an equation is no call."""
     params = eqn.params
     return params.get("jaxpr", params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
+
+
+def opened(closed: Any) -> tuple[core.Jaxpr, Sequence]:
+    """A trace and its constants; a call's may stand without any."""
+    return (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+
+
+def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
+    """The operands of a `lax.scan`, or its body's inputs: constants, carries, and what it goes through."""
+    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
+    return operands[:first], operands[first:second], operands[second:]
+
+
+def of_while(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
+    """The operands of a `lax.while_loop`: constants of its test, constants of its body, and carries."""
+    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    return operands[:first], operands[first:second], operands[second:]
 
 
 def either(differs: Sequence[int]) -> int:
@@ -58,16 +76,13 @@ def _dependence_through(eqn: Any, depends: list[int]) -> list[int]:
         found = [dependence(branch.jaxpr, depends[1:]) for branch in params["branches"]]
         return [either(some) | depends[0] for some in zip(*found, strict=True)]
     if every and name == "scan":
-        first, carried = params["num_consts"], params["num_carry"]
-        fixed, begun, rowed = depends[:first], depends[first : first + carried], depends[first + carried :]
-        body = params["jaxpr"].jaxpr
+        body, (fixed, begun, rowed) = params["jaxpr"].jaxpr, of_scan(params, depends)
         settled = settle(body, fixed, begun, rowed)
-        return [*settled, *dependence(body, [*fixed, *settled, *rowed])[carried:]]
+        return [*settled, *dependence(body, [*fixed, *settled, *rowed])[len(begun) :]]
     if every and name == "while":
-        first = params["cond_nconsts"]
-        second = first + params["body_nconsts"]
-        settled = settle(params["body_jaxpr"].jaxpr, depends[first:second], depends[second:], [])
-        (each,) = dependence(params["cond_jaxpr"].jaxpr, [*depends[:first], *settled])
+        tested, fixed, begun = of_while(params, depends)
+        settled = settle(params["body_jaxpr"].jaxpr, fixed, begun, [])
+        (each,) = dependence(params["cond_jaxpr"].jaxpr, [*tested, *settled])
         return [own | each for own in settled]
     return [every] * len(eqn.outvars)
 

@@ -25,7 +25,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.batching import components, lanes
 from ptsmc_jax.batching.components import Lane, object_array
-from ptsmc_jax.batching.dependence import called, dependence, settle
+from ptsmc_jax.batching.dependence import called, dependence, of_scan, opened, settle
 
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
@@ -188,7 +188,7 @@ class _Inside:
 
     def evaluate(self, closed: Any, arguments: Sequence) -> list:
         """Values of the outputs of a trace."""
-        jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+        jaxpr, consts = opened(closed)
         known = dict(zip(jaxpr.constvars, map(_constant, consts), strict=True))
         known |= zip(jaxpr.invars, arguments, strict=True)
 
@@ -220,9 +220,9 @@ class _Inside:
 
     def scan(self, params: Any, values: list) -> list:
         """A loop, its steps written out if they are few."""
-        body, constants, carried, length = params["jaxpr"], params["num_consts"], params["num_carry"], params["length"]
-        consts, state = ([_lane(v) for v in part] for part in (values[:constants], values[constants:][:carried]))
-        xs = values[constants + carried :]
+        body, carried, length = params["jaxpr"], params["num_carry"], params["length"]
+        *inside, xs = of_scan(params, values)
+        consts, state = ([_lane(v) for v in part] for part in inside)
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= MAPPED):
@@ -235,7 +235,7 @@ class _Inside:
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
         differs = settle(body.jaxpr, _varies(consts), _varies(state), _varies(xs))
-        shapes = [v.aval.shape for v in body.jaxpr.invars[constants : constants + carried]]
+        shapes = [v.aval.shape for v in of_scan(params, body.jaxpr.invars)[1]]
 
         def step(k: Any, packed: tuple) -> tuple:
             rows = (_row(x, k) for x in xs)

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, parts_of, plain
-from ptsmc_jax.batching.dependence import called, dependence, either, settle, used
+from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, settle, used
 
 
 class LanesWarning(UserWarning):
@@ -171,7 +171,7 @@ class _Lanes:
 
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
-        jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+        jaxpr, consts = opened(closed)
         values_of: dict = {}
 
         def write(variables: Sequence, values: Sequence) -> None:
@@ -244,15 +244,14 @@ class _Lanes:
         warnings.warn(f"{told}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
 
     def scan(self, eqn: Any, values: list) -> list:
-        params = eqn.params
-        body, constants, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
-        consts = [_apart(value) for value in values[:constants]]
-        init, xs = values[constants : constants + carried], values[constants + carried :]
+        params, body = eqn.params, eqn.params["jaxpr"]
+        consts, init, xs = of_scan(params, values)
+        _, carried_in, gone_through = of_scan(params, body.jaxpr.invars)
+        consts, carried = [_apart(value) for value in consts], len(init)
         fixed, rowed = _which(consts), _which(xs)
         differs = settle(body.jaxpr, fixed, _which(init), rowed)
         outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
-        state = _Packed(body.jaxpr.invars[constants : constants + carried], differs, self.leads)
-        row = _Packed(body.jaxpr.invars[constants + carried :], rowed, self.leads)
+        state, row = _Packed(carried_in, differs, self.leads), _Packed(gone_through, rowed, self.leads)
         out = _Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
 
         def rows(value: Any, shape: tuple[int, ...], differs: int) -> Any:
@@ -294,11 +293,9 @@ class _Lanes:
 
     def loop(self, eqn: Any, values: list) -> list:
         """lax.while_loop; where the trials end at different times each stays as it is from its end on."""
-        params = eqn.params
-        test, body = params["cond_jaxpr"], params["body_jaxpr"]
-        first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-        values = [*(_apart(value) for value in values[:second]), *values[second:]]
-        test_consts, body_consts, init = values[:first], values[first:second], values[second:]
+        test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
+        *consts, init = of_while(eqn.params, values)
+        test_consts, body_consts = ([_apart(value) for value in some] for some in consts)
         differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
         (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])
         differs = [own | each for own in differs]

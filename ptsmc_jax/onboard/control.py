@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.batching.components import object_array
+from ptsmc_jax.batching.dependence import of_scan, of_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
 UNROLLED = 8  # passes of a loop that are written out, and
@@ -74,10 +75,8 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.while_loop."""
-    params = eqn.params
-    test, body = params["cond_jaxpr"], params["body_jaxpr"]
-    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    test_consts, body_consts, init = values[:first], values[first:second], values[second:]
+    test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
+    test_consts, body_consts, init = of_while(eqn.params, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
     _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))
@@ -95,8 +94,8 @@ def _carry(to: Any, region: Region, init: Sequence[np.ndarray], like: Sequence[A
 def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.scan and fori_loop of a fixed length: written out where it is short, else a loop in C."""
     params = eqn.params
-    body, constants, carried, length = (params[k] for k in ("jaxpr", "num_consts", "num_carry", "length"))
-    consts, init, xs = values[:constants], values[constants : constants + carried], values[constants + carried :]
+    body, carried, length = params["jaxpr"], params["num_carry"], params["length"]
+    consts, init, xs = of_scan(params, values)
     order = range(length)[:: -1 if params["reverse"] else 1]
     if length <= 1 or (length <= UNROLLED and length * len(body.jaxpr.eqns) <= WRITTEN):
         carry, rows = list(init), [[] for _ in body.jaxpr.outvars[carried:]]

@@ -14,7 +14,7 @@ from jax.extend import core
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.dependence import called
+from ptsmc_jax.batching.dependence import called, opened
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, Node, Pool, Title, kind_of
@@ -44,7 +44,7 @@ class Translator:
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Components of a trace's outputs."""
-        jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
+        jaxpr, consts = opened(closed)
         known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
         spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
