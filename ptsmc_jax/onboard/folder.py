@@ -22,8 +22,6 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.flyable import Study
 from ptsmc_jax.scenario.tables import Scenario
 
-MOST_TRIALS = 100  # in vectors.csv
-
 
 class Controller:
     """The flight computer of a scenario, in C."""
