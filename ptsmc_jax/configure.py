@@ -70,10 +70,11 @@ def configure(
     XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
     first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
     of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in
-    which no code is patched, see `ptsmc_jax.programs`. Called before JAX is imported, it also silences what XLA says to
-    stderr by itself ("Very slow compile?" after two minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before
-    anything runs on JAX; later it raises RuntimeError where the backend has already started with something else, and
-    ValueError at any time for other bits and devices.
+    which no code is patched, see `ptsmc_jax.programs`, or looked for faults in: JAX's checks for NaN, infinity,
+    promotion and transfers, which stop runs, are off there whatever the environment says. Called before JAX is
+    imported, it also silences what XLA says to stderr by itself ("Very slow compile?" after two minutes), unless
+    TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX; later it raises RuntimeError where the backend has
+    already started with something else, and ValueError at any time for other bits and devices.
     """
     if bits not in (32, 64):
         raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
@@ -90,6 +91,11 @@ def configure(
     import jax
 
     jax.config.update("jax_enable_x64", bits == 64)
+    if keep_programs:
+        jax.config.update("jax_debug_nans", False)
+        jax.config.update("jax_debug_infs", False)
+        jax.config.update("jax_numpy_dtype_promotion", "standard")
+        jax.config.update("jax_transfer_guard", "allow")
     if device is not None:
         jax.config.update("jax_platforms", device)
     try:
@@ -219,7 +225,8 @@ def _accepted(folder: Path | None) -> tuple[str, ...]:
 
 def _tried(options: tuple[str, ...]) -> bool:
     """Whether a loop compiled with these options gives the numbers that NumPy gives, in a process of its own."""
-    environment = dict(os.environ, JAX_PLATFORMS="cpu", XLA_FLAGS=_flags(options))
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment = plain | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": _flags(options)}
     call = [sys.executable, "-c", _TRIAL]
     try:
         return subprocess.run(call, env=environment, capture_output=True, timeout=120, check=False).returncode == 0

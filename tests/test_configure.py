@@ -10,7 +10,7 @@ import warnings
 import pytest
 
 from ptsmc_jax import configure as setup
-from tests.helpers import ROOT
+from tests.helpers import ROOT, SHORT_CHAIN
 
 GOOD = setup._OPTIONS
 
@@ -127,8 +127,9 @@ def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(tmp_path):
             entry.write_bytes(entry.read_bytes()[:-20])
 
 
-def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones():
+def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones(monkeypatch):
     """In processes of their own, as a user's first call: an unknown flag ends the process, wrong numbers too."""
+    monkeypatch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")  # of a user's own code: no word on the options
     assert setup._tried(GOOD)
     assert not setup._tried((*GOOD, "--xla_no_such_flag=true"))
 
@@ -147,6 +148,17 @@ def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "ptsmc: --device is gpu, but JAX finds no GPU here; allowed is cpu, or install jax[cuda12]\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_command_flies_where_the_environment_has_jax_look_for_faults(tmp_path):
+    """In code of a user's own: it stops at the NaN of a metric that a run lacks, at a number that a run begins with."""
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    asked = dict.fromkeys(("JAX_DEBUG_NANS", "JAX_DEBUG_INFS"), "1")
+    asked |= {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_TRANSFER_GUARD": "disallow"}
+    call = [sys.executable, "-c", "from tuning.cli import command; command()", "simulate", "s.toml", "--no-figures"]
+    environment = {**os.environ, **asked, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout.splitlines()[0], done.stderr) == ("status: ok", "")
 
 
 WATCHING = """

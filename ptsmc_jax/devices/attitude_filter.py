@@ -125,7 +125,7 @@ def attitude_filter(
     corrected = after(period) @ jnp.array([[1.0 - k1, zero], [k2, one]])
     star = after(period) @ jnp.stack([k1, -k2])
     drive = square(2.0 * gyro, rate_noise) + square(walk, bias_walk)
-    steps = jax.vmap(after)(period * jnp.arange(every))
+    steps = jax.vmap(after)(period * jnp.arange(every).astype(float))
     increments = jax.vmap(lambda step: step @ drive @ step.T)(steps)
     added = jnp.cumsum(increments, axis=0) - increments  # covariance since the star tracker's sample
     move = corrected @ steps[-1]

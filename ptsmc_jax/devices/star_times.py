@@ -34,15 +34,18 @@ class StarTimes:
 
     def age(self, sample: Any) -> Any:
         """How long before a control sample, given by its number, the star tracker's last sample was [s]."""
-        return jnp.maximum(sample * self.period - self._last(sample) * self.interval, 0.0)
+        return jnp.maximum(self._time(sample) - self._last(sample) * self.interval, 0.0)
 
     def due(self, sample: Any) -> Any:
         """Whether it has sampled since the control sample before this one, given by its number."""
         return self._last(sample) > self._last(sample - 1)  # none twice, none never, however times are rounded
 
+    def _time(self, sample: Any) -> Any:
+        return jnp.asarray(sample, float) * self.period
+
     def _last(self, sample: Any) -> Any:
         """Number of the star tracker's last sample."""
-        t = sample * self.period
+        t = self._time(sample)
         return jnp.floor((t + guards.rounding(self.period, t)) / self.interval)
 
 

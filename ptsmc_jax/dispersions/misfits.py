@@ -77,11 +77,12 @@ def _failure(parts: Parts) -> Numbers:
     fails = parts.effective_actuators.failure_times
     if fails is None:
         return jnp.array([jnp.inf, 0.0])
-    return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), jnp.argmin(fails) + 1.0, 0.0)])
+    wheel = jnp.argmin(fails).astype(float) + 1.0
+    return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), wheel, 0.0)])
 
 
 def _with_failure(parts: Parts, failure: Numbers) -> Parts:
-    wheel = jnp.arange(channels(parts).shape[1]) + 1.0
+    wheel = jnp.arange(channels(parts).shape[1]).astype(float) + 1.0
     return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 

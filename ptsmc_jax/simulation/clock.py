@@ -54,7 +54,7 @@ class Anchored:
         """Control periods for this prescribed time and delta [s]."""
         sample = jnp.arange(-self.before, self.after, dtype=jnp.int32)
         # one array of nodes, so that one interval ends where, to the last bit, the next begins
-        nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1) * self.period
+        nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
         # a sample that rounding alone puts after t = 0 is the one there: else two of them, and slopes between their two
         begun = nominal > guards.rounding(self.period, t_f)
         nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end)
@@ -80,7 +80,7 @@ class Flight:
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
-        nodes = _not_above(jnp.arange(self.count + 1) * self.period, self.t_end)
+        nodes = _not_above(jnp.arange(self.count + 1).astype(float) * self.period, self.t_end)
         t, t_next = nodes[:-1], nodes[1:]
         hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # which must not cost a period
         return Ticks(t, t_next, hold, jnp.arange(self.count, dtype=jnp.int32), jnp.ones_like(t))
@@ -118,7 +118,7 @@ class Graded:
         early = self._graded(t_f, delta)
         early = jnp.sort(jnp.concatenate([early, jnp.clip(self.saves, 0.0, t_s)]))
         extra = jnp.stack([t_f, _not_above(t_f + self.window, self.t_end)])
-        late = t_s + (self.t_end - t_s) * jnp.arange(self.after + 1) / self.after
+        late = t_s + (self.t_end - t_s) * jnp.arange(self.after + 1).astype(float) / self.after
         late = late.at[-1].set(self.t_end)
         late = jnp.sort(jnp.concatenate([late, extra, jnp.clip(self.saves, t_s, self.t_end)]))
         t, t_next = jnp.concatenate([early[:-1], late[:-1]]), jnp.concatenate([early[1:], late[1:]])
@@ -129,7 +129,7 @@ class Graded:
         """Nodes from 0 to the hand-over [s]."""
         a = (self.before - (t_f - delta) / self.max_step) / jnp.log(t_f / delta)
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
-        level = start + (end - start) * jnp.arange(self.before + 1) / self.before
+        level = start + (end - start) * jnp.arange(self.before + 1).astype(float) / self.before
 
         def newton(u: Array) -> Array:  # on a u + e^u / max_step = level, u = ln tau: convex, so from above it is safe
             slope = a + jnp.exp(u) / self.max_step
@@ -194,7 +194,7 @@ def graded_steps(
     hold_rate: float,
     frequency: float,
     layer: tuple[float, float],
-    order: int = 1,
+    order: int,
 ) -> tuple[float, float]:
     """How many steps `graded` takes before and after the hand-over, before rounding up; may be infinite."""
     before, after = _largest_steps(t_f, hold_rate, frequency, layer, order)

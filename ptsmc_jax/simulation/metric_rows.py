@@ -216,7 +216,9 @@ METRICS = {
     "peak_torque": _peak(lambda interval: _largest_of(interval.torques.commanded)),
     "peak_torque_delivered": _peak(lambda interval: _largest_of(interval.torques.delivered)),
     "saturated": Metric(
-        update=lambda limited_for, interval, criteria: limited_for + interval.length * interval.torques.limited,
+        update=lambda limited_for, interval, criteria: (
+            limited_for + jnp.where(interval.torques.limited, interval.length, 0.0)
+        ),
         value=lambda limited_for, run, criteria: jnp.where(
             jnp.isnan(run.memories["effort"]), jnp.nan, limited_for / criteria.t_end
         ),
