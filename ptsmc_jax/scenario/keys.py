@@ -1,7 +1,11 @@
 """What a scenario's tables and keys mean, read from the docstrings, types and defaults of their structs."""
 
+import ast
+import contextlib
 import inspect
 import re
+import sys
+import textwrap
 import types
 import typing
 from typing import Any, Literal, NamedTuple
@@ -33,7 +37,7 @@ def of(struct: type[Table]) -> list[Key]:
     """
     meanings: dict[str, str] = {}
     for base in reversed(struct.__mro__):
-        meanings |= _attributes(base.__dict__.get("__doc__") or "")
+        meanings |= _attributes(_docstring(base))
     hints = typing.get_type_hints(struct, include_extras=True)
     keys = []
     for field in msgspec.structs.fields(struct):
@@ -49,7 +53,7 @@ def of(struct: type[Table]) -> list[Key]:
 
 def about(struct: type[Table]) -> str:
     """What a table, or a kind of it, is: its docstring without the keys."""
-    return " ".join(inspect.cleandoc(struct.__doc__ or "").split("\n\nAttributes:")[0].split())
+    return " ".join(inspect.cleandoc(_docstring(struct)).split("\n\nAttributes:")[0].split())
 
 
 def allowed(kind: Any) -> str:
@@ -61,6 +65,16 @@ def allowed(kind: Any) -> str:
     if typing.get_origin(kind) is Literal:
         return " or ".join(f'"{v}"' for v in typing.get_args(kind))
     return next((m.description for m in getattr(kind, "__metadata__", ()) if m.description), "of another type")
+
+
+def _docstring(struct: type) -> str:
+    """The docstring of a class itself; python -OO leaves it out of what is run, not out of its source."""
+    text = struct.__dict__.get("__doc__")
+    if text is None and sys.flags.optimize > 1:
+        with contextlib.suppress(OSError, TypeError):  # without a source
+            (node,) = ast.parse(textwrap.dedent(inspect.getsource(struct))).body
+            text = ast.get_docstring(typing.cast(ast.ClassDef, node))
+    return text or ""
 
 
 def _attributes(docstring: str) -> dict[str, str]:

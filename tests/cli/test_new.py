@@ -64,6 +64,12 @@ def test_what_is_written_is_the_default_scenario(plant):
     assert len(written) > 4  # and says so key by key
 
 
+def test_it_is_written_without_docstrings_too():
+    call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.text('chain', {}), end='')"]
+    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.stdout, done.stderr) == (new.text("chain", {}), "")
+
+
 @pytest.mark.parametrize("name", ["first_flight", "hard_flight", "two_link_arm"])
 def test_a_scenario_like_another_is_that_one(name):
     raw = parsing.load(ROOT / "scenarios" / f"{name}.toml")
