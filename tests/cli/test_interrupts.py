@@ -32,6 +32,24 @@ def test_a_ctrl_c_that_comes_while_garbage_is_collected_ends_the_command():
     assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
 
 
+IMPORTING = """
+import sys
+
+class Interrupted:
+    def find_spec(self, name, *_):
+        if name == "cyclopts":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted())
+from tuning.cli import command
+command()
+"""
+
+
+def test_a_ctrl_c_while_a_command_imports_what_it_needs_ends_it_in_one_sentence():
+    done = subprocess.run([sys.executable, "-c", IMPORTING], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
+
+
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
 def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, capsys, force, same):
     def stopped(making, outcome):
