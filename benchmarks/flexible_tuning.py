@@ -36,7 +36,7 @@ def main() -> None:
         print(f"{name} ({time.monotonic() - started:.0f} s): {said}", flush=True)
     for name, chosen in found.items():
         made = gains.in_scenario(loaded, chosen) if chosen else loaded
-        flown = judging.judge(made, judging.seed_of_judge(0), ())
+        flown = judging.judge(made, judging.seed_of_judge(0))
         done, metrics = flown.finished, flown.metrics
         print(
             f"{name} on the flexible body: {done.sum()} of {done.size} flown, "

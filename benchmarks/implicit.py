@@ -27,7 +27,7 @@ def main() -> None:
     for name, one in sets.items():
         for sampling in ("explicit", "implicit"):
             flown = scenario.replace(one, controller__sampling=sampling)
-            trials = judging.judge(flown, judging.seed_of_judge(0), scenario.study(flown).requirements)
+            trials = judging.judge(flown, judging.seed_of_judge(0))
             errors, peaks, chattering = (
                 np.asarray(getattr(trials.metrics, key)) for key in ("window_error", "peak_torque", "chattering")
             )

@@ -15,7 +15,7 @@ import numpy as np
 from ptsmc_jax.configure import configure
 
 
-def fresh_trials(loaded, names, values, requirements) -> str:
+def fresh_trials(loaded, names, values) -> str:
     """Tuned gains on fresh trials of three seeds: RMS, what it is beside the floor, and the largest peak torque."""
     from tuning.search import gains
     from tuning.studies import judging
@@ -23,7 +23,7 @@ def fresh_trials(loaded, names, values, requirements) -> str:
     made = gains.in_scenario(loaded, dict(zip(names, values.tolist(), strict=True)))
     rms, above, off, peaks = [], [], [], []
     for seed in range(3):
-        flown = judging.judge(made, judging.seed_of_judge(seed), requirements)
+        flown = judging.judge(made, judging.seed_of_judge(seed))
         squares = flown.metrics.window_error[flown.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
@@ -68,7 +68,7 @@ def main() -> None:
         print(f"seed {seed:2}: goal {one.value:.5e}, largest metric/limit {one.worst.max(initial=0.0):.5f}, "
               f"{one.rounds} rounds, {flown} rollouts, {slopes} gradients, {took:.0f} s, gains {gained}",
               flush=True)  # fmt: skip
-        print(f"         fresh: {fresh_trials(loaded, problem.names, one.gains, ready.requirements)}", flush=True)
+        print(f"         fresh: {fresh_trials(loaded, problem.names, one.gains)}", flush=True)
     best = min(found, key=lambda one: one.value if one.worst.max(initial=0.0) <= 1.0 else np.inf)
     started = time.monotonic()
     if len(sys.argv) > 3:
@@ -82,9 +82,9 @@ def main() -> None:
         print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
               f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
     fresh = judging.seed_of_judge(0)
-    paper = judging.judge(gains.papers(loaded), fresh, ready.requirements)
+    paper = judging.judge(gains.papers(loaded), fresh)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
-    tuned = judging.judge(gains.in_scenario(loaded, named), fresh, ready.requirements)
+    tuned = judging.judge(gains.in_scenario(loaded, named), fresh)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]
     peak = [float(np.mean(one.metrics.peak_torque[one.finished])) for one in (paper, tuned)]
     floor = judging.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan

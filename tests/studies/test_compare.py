@@ -319,7 +319,7 @@ def rivals(monkeypatch, eight, interrupt=None):
                                floors={"tuned": None},
                                search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
 
-    def judge(flown, seed, requirements):
+    def judge(flown, seed):
         asked.append(("judge", "paper", seed))
         return eight
 

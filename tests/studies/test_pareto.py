@@ -122,7 +122,7 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
         made = scenario.replace(
             scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
         )
-        flown = judging.judge(made, summary["seed"], ())
+        flown = judging.judge(made, summary["seed"])
         np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
         np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
     assert f"{len(kept)} points, each judged on 60 fresh trials" in told

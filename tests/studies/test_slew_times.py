@@ -36,7 +36,7 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
         errors = []
         for gains in (own, other):
             known = scenario.replace(flown, controller__eta=gains["eta"], controller__delta=gains["delta"])
-            trials = judging.judge(known, judging.seed_of_judge(0), [])
+            trials = judging.judge(known, judging.seed_of_judge(0))
             errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
         np.testing.assert_allclose(own["rms_window_error"], errors[0], rtol=1e-9)
         assert errors[0] < errors[1]

@@ -44,7 +44,7 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
 
     def peak(gains, seed):
         made = scenario.replace(loaded, **{f"controller__{name}": value for name, value in gains.items()})
-        return judging.judge(made, seed, []).metrics.peak_torque.max() / LIMIT
+        return judging.judge(made, seed).metrics.peak_torque.max() / LIMIT
 
     for one in (first, second):
         np.testing.assert_allclose(peak(one.gains, one.fresh_seed), one.over["peak_torque"], rtol=1e-12)

@@ -210,8 +210,7 @@ def perturbed(flown: Scenario) -> dict[str, Scenario]:
 
 def _with_more(one: Contender, fresh_seed: int) -> Contender:
     """With its margins, and flown once more with what its law is not told of."""
-    requirements = study(one.flown).requirements
-    changed = {name: judging.judge(other, fresh_seed, requirements) for name, other in perturbed(one.flown).items()}
+    changed = {name: judging.judge(other, fresh_seed) for name, other in perturbed(one.flown).items()}
     return dataclasses.replace(one, margins=stability.worst(study(one.flown)), changed=changed)
 
 
@@ -234,28 +233,27 @@ def compare(
     fresh_seed = judging.seed_of_judge(seed)
     rivals = that_fly(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
-    contenders, interrupted = {}, False
+    found, interrupted = {}, False
     if PAPER in others:
         tell("the paper's gains: judging on fresh trials", 0, 0, np.nan, 0.0)
-        contenders[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
+        found[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)  # all on the same fresh trials
         fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
-        contenders[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
+        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
         interrupted = tuned.search.interrupted
         if interrupted:
             break
         report("judging with another inertia and delay than it knows", 0, 0, np.nan, 0.0)
-        contenders[law] = _with_more(contenders[law], fresh_seed)
-    return Comparison(contenders, fresh_seed, interrupted, refused)
+        found[law] = _with_more(found[law], fresh_seed)
+    return Comparison(found, fresh_seed, interrupted, refused)
 
 
 def _papers(flown: Scenario, fresh_seed: int) -> Contender:
-    ready = study(flown)
-    trials = judging.judge(flown, fresh_seed, ready.requirements)
+    trials = judging.judge(flown, fresh_seed)
     verdicts, floor = judging.verdicts_of(flown, trials, fresh_seed), judging.floor_of(flown, fresh_seed)
-    return Contender(flown, gains.gains_of(ready.parts), {}, trials, verdicts, floor)
+    return Contender(flown, gains.gains_of(study(flown).parts), {}, trials, verdicts, floor)
 
 
 def figures_of(contender: Contender) -> dict[str, Any]:
@@ -322,8 +320,8 @@ def _near_far(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float
 
 def summary(comparison: Comparison) -> dict[str, Any]:
     """What `summary.json` says."""
-    contenders = comparison.contenders
-    first = next(iter(contenders.values()))
+    found = comparison.contenders
+    first = next(iter(found.values()))
     return {
         "status": comparison.status,
         "seed": comparison.fresh_seed,
@@ -331,8 +329,8 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "paper_refused": comparison.paper_refused,
         "judged_on": "flight clock",  # each with a sign of its own, or none
         "settling_angle": first.flown.loop.settling_angle,
-        "laws": {law: figures_of(contender) for law, contender in contenders.items()},
-        "cautions": list(dict.fromkeys(text for one in contenders.values() for text in cautions.of(one.flown))),
+        "laws": {law: figures_of(contender) for law, contender in found.items()},
+        "cautions": list(dict.fromkeys(text for one in found.values() for text in cautions.of(one.flown))),
     }
 
 
@@ -354,7 +352,7 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
             "settling_by_angle")  # fmt: skip
 
 
-def _rows(scenario: Scenario, summary: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """Head and rows of `compare.csv`, a law each."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in hold
@@ -371,7 +369,7 @@ def _rows(scenario: Scenario, summary: Mapping[str, Any]) -> tuple[list[str], li
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
 
-    return head, [row(law, figures) for law, figures in summary["laws"].items()]
+    return head, [row(law, figures) for law, figures in said["laws"].items()]
 
 
 def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:

@@ -12,7 +12,7 @@ from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.simulation import requirements
-from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, trust
 
 
@@ -46,10 +46,10 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     return {"paper": paper} | ({"before": scenario} if gains.differ(scenario, paper) else {}), None
 
 
-def judge(scenario: Scenario, fresh_seed: int, requirements: Sequence[Requirement]) -> Trials:
-    """A scenario's gains on fresh trials, as flown; as many as every quantile that is asked for takes."""
+def judge(scenario: Scenario, fresh_seed: int) -> Trials:
+    """A scenario's gains on fresh trials, as flown; as many as every quantile that it asks for takes."""
     flown = study(as_flown(scenario))
-    trials = np.arange(trials_of(flown, confirm.fresh_trials(requirements)))
+    trials = np.arange(trials_of(flown, confirm.fresh_trials(flown.requirements)))
     return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
 
 

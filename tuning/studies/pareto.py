@@ -119,7 +119,7 @@ def trace(
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
     others = {}
     for name, other in beside.items():
-        trials, values = judging.judge(other, fresh_seed, posed.ready.requirements), gains.gains_of(study(other).parts)
+        trials, values = judging.judge(other, fresh_seed), gains.gains_of(study(other).parts)
         others[name] = _point(np.nan, values, np.nan, trials, other, fresh_seed)
     return Front(
         points=_marked(judged),
@@ -205,7 +205,7 @@ def _judge(
         tell("judging on fresh trials", k, len(by_limit), np.nan, 0.0)
         named = posed.named(best.share)
         tuned = gains.in_scenario(scenario, named)
-        trials = judging.judge(tuned, fresh_seed, posed.ready.requirements)
+        trials = judging.judge(tuned, fresh_seed)
         judged[limit] = _point(limit, named, best.value, trials, tuned, fresh_seed), trials
     return judged
 

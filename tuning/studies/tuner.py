@@ -153,9 +153,7 @@ def tune(
     problem = posed.problem
     training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()]))
     candidates = {"tuned": judged.scenario} | {name: judging.as_flown(other) for name, other in others.items()}
-    fresh = {"tuned": judged.trials} | {
-        name: judging.judge(other, judged.seed, posed.ready.requirements) for name, other in others.items()
-    }
+    fresh = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
     shortest = _shortest(posed, judged)
     trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
     if trusted and not outcome.interrupted:
@@ -214,7 +212,7 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -
     begun = time.monotonic()
     rounded = posed.named(outcome.share)
     flown = judging.as_flown(gains.in_scenario(scenario, rounded))
-    trials = judging.judge(flown, fresh_seed, posed.ready.requirements)
+    trials = judging.judge(flown, fresh_seed)
     return _Judged(outcome, rounded, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
 
 
@@ -292,10 +290,9 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
             continue
         try:
             other = judging.as_flown(gains.in_scenario(tuned, {**judged.gains, name: value}))
-            ready = study(other)
+            trials = judging.judge(other, judged.seed)
         except ScenarioError:  # it may not
             continue
-        trials = judging.judge(other, judged.seed, ready.requirements)
         both = trials.finished & judged.trials.finished
         there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
         broken = _broken(judging.verdicts_of(other, trials, judged.seed), trials)
