@@ -48,9 +48,7 @@ class Column(NamedTuple):
         return f"{limit}: {percent(float(within))} % of the trials within at all times\n{self.of_time}"
 
 
-def fan(
-    t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str = "spacecraft"
-) -> Figure:
+def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str) -> Figure:
     """Error over time of many trials: central bands, the median, the worst run.
 
     Args:

@@ -22,7 +22,7 @@ EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact 
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
-def run_figures(parts: Parts, log: Log, limit: float | None = None, floor: Floor | None = None) -> dict[str, Figure]:
+def run_figures(parts: Parts, log: Log, limit: float | None, floor: Floor | None) -> dict[str, Figure]:
     """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
     log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
     figures = {"torque": torque(parts, log, limit)}

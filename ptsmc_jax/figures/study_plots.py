@@ -151,7 +151,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
 
 def tradeoff(
     sets: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    limit: float | None = None,
+    limit: float | None,
     kind: str = "spacecraft",
     floor: float | None = None,
 ) -> Figure:

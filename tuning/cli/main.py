@@ -283,6 +283,7 @@ def compare(
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from tuning.studies import compare as comparing
+    from tuning.studies import tuner
 
     rivals = comparing.Rivals(against, law)
     rivals.check()
@@ -292,7 +293,7 @@ def compare(
     known_by = comparing.identity(loaded, seed, rivals)
     search = searches.LongSearch(
         known_by,
-        comparing.tuner.GOALS[loaded.search.objective],
+        tuner.GOALS[loaded.search.objective],
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
         summary=comparing.summary,

@@ -88,8 +88,10 @@ class Folder:
     @cached_property
     def own_names(self) -> list[str]:
         """Names of the metrics of one's own."""
-        if self.made is None or self.own is None:
-            return [] if self.own is None else self._own.own_names()
+        if self.own is None:
+            return []
+        if self.made is None:
+            return self._own.own_names()
         if self.made.metrics_names is None:
             raise RefusedError(
                 f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"

@@ -25,16 +25,15 @@ JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # sta
 
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
-    summary: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
+    found: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
     for name, entry in catalogues.CATALOGUES[kind].items():
         values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
-        if known.size == 0 and entry.table is not None:
-            continue  # what the scenario has no table for
         if known.size == 0:
-            summary[name] = None
+            if entry.table is None:  # else the scenario has no table for it
+                found[name] = None
             continue
-        summary[name] = {
+        found[name] = {
             "mean": known.mean(),
             "rms": trust.rms(known),
             "median": np.median(known),
@@ -42,13 +41,13 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
             "max": known.max(),
         }
         if name in catalogues.LARGER_IS_BETTER:  # whose bad end is the other one
-            summary[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
+            found[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
         if known.size < values.size:
-            summary[name]["without_value"] = int(values.size - known.size)
+            found[name]["without_value"] = int(values.size - known.size)
         if name in JUDGED:
             statistic = JUDGED[name]
-            summary[name][f"{statistic}_interval"] = trust.interval(known, getattr(trust, statistic))
-    return summary
+            found[name][f"{statistic}_interval"] = trust.interval(known, getattr(trust, statistic))
+    return found
 
 
 def summary(tuning: Tuning) -> dict[str, Any]:
@@ -122,10 +121,11 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
     }
 
 
-def _trust(trust: Trust, tuning: Tuning) -> dict[str, Any]:
+def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
+    """What the gains found hang on, and whether they can be trusted, as `summary.json` says it."""
     ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
-    for name, profile in trust.profiles.items():
+    for name, profile in found.profiles.items():
         if profile.flat:
             influence[name] = "none"
         elif name not in tuning.at_bound:
@@ -137,13 +137,13 @@ def _trust(trust: Trust, tuning: Tuning) -> dict[str, Any]:
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
             border = free_gains.border(tuning.tuned, gain, side, bound)
             influence[name] = border or _beyond(tuning.beyond.get(name), bound)
-    slopes = trust.slope_error
+    slopes = found.slope_error
     return {
         "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
-        "sensitivities": trust.sensitivities,
-        "margins": trust.margins,
-        "profiles": {name: asdict(profile) for name, profile in trust.profiles.items()},
+        "sensitivities": found.sensitivities,
+        "margins": found.margins,
+        "profiles": {name: asdict(profile) for name, profile in found.profiles.items()},
     }
 
 
