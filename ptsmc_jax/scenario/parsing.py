@@ -77,29 +77,17 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
             raise wrong(name, table, "a table")
     kind = _plant_kind(raw.get("plant", {}))
     kind_of_scenario, layout = SCENARIOS[kind], TABLES[kind]
-    for name in raw:
-        if name in layout or name == "requirements":
-            continue
-        others = [other for other, theirs in TABLES.items() if name in theirs]
-        if others:
-            raise ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
-        if not isinstance(raw[name], Mapping):
-            place = _place(name, layout)
-            raise ScenarioError(f"{name} = {brief(raw[name])} stands outside a table; {place}")
-        raise ScenarioError(f"[{name}] is not a known table; {nearest(name, (*layout, 'requirements'), '[{}]')}")
-
+    for name, table in raw.items():
+        if name not in layout and name != "requirements":
+            raise _unknown(name, table, kind)
     plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
     law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
     fallback = kind_of_scenario.fallback(plant, raw.get("plant", {}).keys(), law)
-    tables: dict[str, Any] = {}
-    for name in layout:
-        if name not in raw and name in layouts.OPTIONAL:
-            continue
-        given = raw.get(name, {})
-        if name == "dispersion":
-            tables[name] = _dispersion(given, kind, run)
-        else:
-            tables[name] = _table(name, _with_defaults(given, fallback.get(name, {})), layout[name], run)
+    tables: dict[str, Any] = {
+        name: _table(name, _with_defaults(raw.get(name, {}), fallback.get(name, {})), kinds, run)
+        for name, kinds in layout.items()
+        if name in raw or name not in layouts.OPTIONAL
+    }
     for name in ("initial", "reference"):
         if name in tables:
             attitude_keys.at_most_one(name, tables[name])
@@ -133,6 +121,17 @@ def _plant_kind(plant: Mapping[str, Any]) -> str:
     if not isinstance(kind, str) or kind not in TABLES:
         raise wrong("plant.kind", kind, " or ".join(map(show, TABLES)))
     return kind
+
+
+def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
+    """The error for a table that this kind of plant does not have, or a key that stands outside a table."""
+    layout = TABLES[kind]
+    others = [other for other, theirs in TABLES.items() if name in theirs]
+    if others:
+        return ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
+    if isinstance(value, Mapping):
+        return ScenarioError(f"[{name}] is not a known table; {nearest(name, (*layout, 'requirements'), '[{}]')}")
+    return ScenarioError(f"{name} = {brief(value)} stands outside a table; {_place(name, layout)}")
 
 
 def _place(key: str, layout: Mapping[str, Any]) -> str:
@@ -223,6 +222,8 @@ def like(name: str, known: Iterable[str], all_of_them: str) -> str:
 
 
 def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: bool = False) -> Table:
+    if name == "dispersion":
+        return _dispersion(raw, typing.cast(type[Table], kinds), run)
     if not isinstance(kinds, Mapping):
         return _fields(name, raw, kinds)
     kind = raw.get("kind", next(iter(kinds)))
@@ -262,8 +263,8 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
     return disturbance_tables.SumDisturbance(terms=found)
 
 
-def _dispersion(raw: Mapping[str, Any], kind: str, run: bool) -> Table:
-    struct = typing.cast(type[Table], TABLES[kind]["dispersion"])
+def _dispersion(raw: Mapping[str, Any], struct: type[Table], run: bool) -> Table:
+    """The table whose keys are tables of one of several kinds each."""
     tables = {}
     for key, table in raw.items():
         _check_known("dispersion", key, struct)
