@@ -20,6 +20,8 @@ from tuning.search.rounds import MARGIN, Rounds
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 
+Tell = Callable[[str], None]  # says what is being done
+
 HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would bring them no nearer
 
 
@@ -80,10 +82,10 @@ def search(
         report: is called after every step.
         prepare: is called once the search's own programs are being compiled, for those of what comes after it.
     """
-    sloped, starts = settings.sloped, settings.starts
+    sloped = settings.sloped
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
     margin = max(settings.margin, rounds.margin)
-    report = Work(report, evaluate, *planned(rounds.problem, starts, settings.steps, sloped=sloped))
+    report = Work(report, evaluate, *planned(rounds.problem, settings.starts, settings.steps, sloped=sloped))
     descents = Descents(evaluate, margin, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted = False
 
@@ -94,19 +96,9 @@ def search(
         if sloped:
             evaluate.prepare(rounds.problem)
             prepare()
-            descents.set_out(rounds.problem, own)
+            _by_slopes(rounds, descents, own, settings, tell)
         else:
-            descents.sweep(rounds.problem, own)
-        rounds.begin(descents.gains)
-        if sloped:
-            shares = descents.explore(rounds.problem, starts, settings.seed) if starts > 1 else {0: descents.share}
-            descents.descend(rounds.problem, shares)
-        else:
-            descents.evolve(rounds.problem, descents.share)
-        _go_on(rounds, descents, tell, sloped=sloped)
-        if sloped and starts > 1 and rounds.count and descents.best.over > 0.0:
-            descents.start_over(rounds.problem, starts, settings.seed + 1)
-            _go_on(rounds, descents, tell, sloped=sloped)
+            _by_evolution(rounds, descents, own, tell)
         if settings.judged:
             rounds.judge(descents.gains, tell)
     except KeyboardInterrupt:
@@ -133,11 +125,27 @@ def search(
     )
 
 
-def _go_on(rounds: Rounds, descents: Descents, tell: Callable[[str], None], *, sloped: bool) -> None:
+def _by_slopes(rounds: Rounds, descents: Descents, own: np.ndarray, settings: Settings, tell: Tell) -> None:
+    starts, seed = settings.starts, settings.seed
+    descents.set_out(rounds.problem, own)
+    rounds.begin(descents.gains)
+    shares = descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
+    descents.descend(rounds.problem, shares)
+    _go_on(rounds, descents, descents.again, tell)
+    if starts > 1 and rounds.count and descents.best.over > 0.0:
+        descents.start_over(rounds.problem, starts, seed + 1)
+        _go_on(rounds, descents, descents.again, tell)
+
+
+def _by_evolution(rounds: Rounds, descents: Descents, own: np.ndarray, tell: Tell) -> None:
+    descents.sweep(rounds.problem, own)
+    rounds.begin(descents.gains)
+    descents.evolve(rounds.problem, descents.share)
+    _go_on(rounds, descents, lambda problem: descents.evolve(problem, descents.share, NEARBY), tell)
+
+
+def _go_on(rounds: Rounds, descents: Descents, again: Callable[[Problem], None], tell: Tell) -> None:
     """Search on from what was found while harder trials join, or until these are out of reach."""
     while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
         tell(f"{ROUND}, round {rounds.count}")
-        if sloped:
-            descents.again(rounds.problem)
-        else:
-            descents.evolve(rounds.problem, descents.share, NEARBY)
+        again(rounds.problem)
