@@ -197,22 +197,8 @@ def begin(wanted: Folder, force: bool) -> None:
                 file.unlink()
         for name in (FLOOR, TABLE):
             (path / name).unlink(missing_ok=True)
-    else:
-        store.check(path, force=True)
-        there = path.is_dir() and any(path.iterdir())
-        other = store.difference(path, tables, {**wanted.identity, **store.packages()}) if there else None
-        if other is not None:
-            raise RefusedError(
-                f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew"
-            )
-        if there:
-            before = opened(path)
-            if before.trials > wanted.trials:
-                raise RefusedError(
-                    f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
-                )
-            if before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity:
-                return
+    elif _begun(wanted, tables):
+        return
 
     def fill(making: Path) -> None:
         store.write_toml(making / "scenario.toml", tables)
@@ -223,6 +209,23 @@ def begin(wanted: Folder, force: bool) -> None:
         store.forget(path)  # what was another campaign's, or that of fewer trials
 
     store.write(path, fill)
+
+
+def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
+    """Whether its folder holds this very campaign already; raises RefusedError where that may not become it."""
+    path = wanted.path
+    store.check(path, force=True)
+    if not path.is_dir() or not any(path.iterdir()):
+        return False
+    other = store.difference(path, tables, {**wanted.identity, **store.packages()})
+    if other is not None:
+        raise RefusedError(f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew")
+    before = opened(path)
+    if before.trials > wanted.trials:
+        raise RefusedError(
+            f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
+        )
+    return before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
 
 
 def opened(path: Path) -> Folder:
