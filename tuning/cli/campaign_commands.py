@@ -17,8 +17,8 @@ from tuning.cli.options import (
     ScenarioFile,
     Seed,
     Trust,
+    fraction,
     interrupted,
-    number_between,
     prepare,
     whole_number,
 )
@@ -56,11 +56,9 @@ def montecarlo(
     out: Out = None,
     until_confident: Annotated[
         float | None,
-        number_between(
+        fraction(
             "--until-confident",
             "Stop once every requirement's share is known to within this width, a number between 0 and 1.",
-            0.0,
-            1.0,
         ),
     ] = None,
     metrics: Annotated[

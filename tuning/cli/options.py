@@ -35,8 +35,8 @@ def whole_number(
     return Parameter(name=names or None, converter=read, help=text)
 
 
-def number_between(option: str, text: str, least: float, most: float) -> Parameter:
-    """An option that is a number between two others; see `whole_number`."""
+def fraction(option: str, text: str) -> Parameter:
+    """An option that is a number between 0 and 1; see `whole_number`."""
 
     def read(_: Any, tokens: Sequence[Token]) -> float:
         value = tokens[0].value
@@ -44,8 +44,8 @@ def number_between(option: str, text: str, least: float, most: float) -> Paramet
             number = float(value)
         except ValueError:
             number = float("nan")
-        if not least < number < most:
-            raise UsageError(f"{option} is {value}, but must be a number between {least:g} and {most:g}")
+        if not 0.0 < number < 1.0:
+            raise UsageError(f"{option} is {value}, but must be a number between 0 and 1")
         return number
 
     return Parameter(converter=read, help=text)
