@@ -275,21 +275,21 @@ class _Lanes:
             params["reverse"],
             params["unroll"],
         )
-        results = state.unpack(last)
-        for y, shape, laned in zip(ys, out.shapes, outputs, strict=True):
-            if laned:  # components of (time, *lead), or (time, *lead, *shape) -> (*lead, time, *shape)
-                whole, lead = (params["length"], *shape), self.leads[laned]
-                if 0 in whole:
-                    y = Lane(whole, np.empty(whole, dtype=object), differs=laned)
-                elif components.small(whole) and out.apart(shape, laned):
-                    steps = range(params["length"])
-                    rows_of = (lax.index_in_dim(part, k, 0, keepdims=False) for k in steps for part in y)
-                    y = Lane(whole, object_array(whole, rows_of), differs=laned)
-                else:
-                    stacked = jnp.stack(y, axis=-1) if out.apart(shape, laned) else y
-                    y = Lane(whole, dense=jnp.moveaxis(stacked, 0, len(lead)).reshape((*lead, *whole)), differs=laned)
-            results.append(y)
-        return results
+        stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
+        return [*state.unpack(last), *stacked]
+
+    def _stacked(self, y: Any, shape: tuple[int, ...], differs: int, length: int) -> Any:
+        """What a scan stacks, components of (time, *lead), or (time, *lead, *shape): a lane of (time, *shape)."""
+        if not differs:
+            return y
+        whole, lead, apart = (length, *shape), self.leads[differs], _Packed.apart(shape, differs)
+        if 0 in whole:
+            return Lane(whole, np.empty(whole, dtype=object), differs=differs)
+        if apart and components.small(whole):
+            rows = (lax.index_in_dim(part, k, 0, keepdims=False) for k in range(length) for part in y)
+            return Lane(whole, object_array(whole, rows), differs=differs)
+        dense = jnp.stack(y, axis=-1) if apart else y
+        return Lane(whole, dense=jnp.moveaxis(dense, 0, len(lead)).reshape((*lead, *whole)), differs=differs)
 
     def loop(self, eqn: Any, values: list) -> list:
         """lax.while_loop; where the trials end at different times each stays as it is from its end on."""
