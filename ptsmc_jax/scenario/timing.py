@@ -199,26 +199,29 @@ def _with_gain(observer: Any, gain: float) -> Any:
     return dataclasses.replace(observer, gain=jnp.full_like(observer.gain, gain))
 
 
+def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
+    """Fastest rates of the boundary layer, or of the observer, before and after the hand-over, within reach [1/s]."""
+    before = after = 0.0
+    if hasattr(observer, "gain"):  # K2 is largest with the smallest gain
+        before = after = _with_gain(observer, reach.largest_gain).fastest()
+        observer = _with_gain(observer, reach.gain)
+    if reach.sign_width > 0.0:
+        for t_f in (reach.smallest_t_f, reach.t_f):
+            own = _boundary_layer(dataclasses.replace(law, t_f=vector(t_f)), observer, visited)
+            before, after = max(before, float(own[0])), max(after, float(own[1]))
+    return before, after
+
+
 def _grid(
     scenario: Scenario, reach: Reach, setup: Setup, saves: object, frequencies: Mapping[str, float], visited: Any
 ) -> clock.Graded:
     """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
     loop = scenario.loop
     t_end = scenario.end + reach.t_f - scenario.controller.t_f
-    controller, observer, resolved = setup.controller, setup.observer, 0.0
-    saves = (*np.ravel(np.asarray(saves, dtype=float)), *observer.nodes())
-    if hasattr(observer, "gain"):  # K2 is largest with the smallest gain
-        resolved = _with_gain(observer, reach.largest_gain).fastest()
-        observer = _with_gain(observer, reach.gain)
+    saves = (*np.ravel(np.asarray(saves, dtype=float)), *setup.observer.nodes())
     names = ("t_f", "k1", "sign_width", "surface_rate")
-    widest = dataclasses.replace(controller, **{name: vector(getattr(reach, name)) for name in names})
-    layer = (0.0, 0.0)
-    if reach.sign_width > 0.0:
-        for t_f in (reach.smallest_t_f, reach.t_f):
-            law = dataclasses.replace(widest, t_f=vector(t_f))
-            before, after = (float(v) for v in _boundary_layer(law, observer, visited))
-            layer = (max(layer[0], before), max(layer[1], after))
-    layer = (max(layer[0], resolved), max(layer[1], resolved))
+    widest = dataclasses.replace(setup.controller, **{name: vector(getattr(reach, name)) for name in names})
+    layer = _fastest_layer(reach, widest, setup.observer, visited)
     rates, frequency, order = widest.hold_rates(), _fastest(frequencies), scenario.grid_order
 
     def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
