@@ -40,7 +40,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
     known = scenario.read(tmp_path / "c.toml")
     for row in rows:
         flown = scenario.replace(known, controller__k1=row["k1"], controller__sign_width=row["sign_width"])
-        trials = judging.judge(flown, told["seed"], [])
+        trials = judging.judge(flown, told["seed"])
         errors = trials.metrics.window_error[:60]
         np.testing.assert_allclose(row["rms_window_error"], np.sqrt(np.mean(errors**2)), rtol=1e-9)
         np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)

@@ -116,7 +116,7 @@ def trace(
         tell("judging on fresh trials", done, len(apart), np.nan, 0.0)
         named = posed.named(apart[k].share)
         tuned = gains.in_scenario(scenario, named)
-        trials = judging.judge(tuned, fresh_seed, posed.ready.requirements)
+        trials = judging.judge(tuned, fresh_seed)
         flown = trials.status.size
         robust.append(
             Robust(
