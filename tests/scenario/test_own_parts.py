@@ -99,14 +99,14 @@ def test_rows_are_read_where_the_program_is_not(command, flown, tmp_path):
 def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flown, tmp_path):
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures")
     assert (code, out) == (2, "")
-    for said in (f"{tmp_path}/my.py (plant.system)", f"{tmp_path}/my.py (--metrics)", "--trust"):
+    for said in (f"{tmp_path}/my.py (plant.system, --metrics)", "--trust"):
         assert said in error
     assert error.count("\n") == 1
     assert not ran(tmp_path)
     assert not (flown / "replay").exists()
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures", "--trust")
     assert (code, "equal to its row" in out) == (0, True)
-    assert f"ptsmc: runs {tmp_path}/my.py, which plant.system of {FOLDER} names\n" in error
+    assert f"ptsmc: runs {tmp_path}/my.py, which plant.system and --metrics of {FOLDER} name\n" in error
     assert ran(tmp_path)
 
 

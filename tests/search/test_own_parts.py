@@ -2,6 +2,7 @@
 
 import pytest
 
+from ptsmc_jax.campaigns.store import RefusedError
 from tuning.search import own_parts
 
 
@@ -30,3 +31,14 @@ def test_a_link_among_results_to_a_file_elsewhere_counts_as_one_of_theirs(tmp_pa
     (results / "tuned.toml").symlink_to(mine)
     assert own_parts.results_of(results / "tuned.toml") == results
     assert own_parts.results_of(mine) is None
+
+
+def test_a_file_that_several_keys_name_is_told_of_once(tmp_path, capsys):
+    law = tmp_path / "mine.py"
+    law.write_text("")
+    programs = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
+    with pytest.raises(RefusedError, match=rf"own, {law} \(controller.code, observer.code, reference.code\), which"):
+        own_parts.allow(programs, tmp_path, {}, trusted=False)
+    own_parts.allow(programs, tmp_path, {}, trusted=True)
+    keys = "controller.code, observer.code and reference.code"
+    assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"

@@ -42,7 +42,7 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
     Raises RefusedError without --trust, or where it is not what they were made with.
     """
     if programs and not trusted:
-        listed = " and ".join(f"{systems.location(where)} ({key})" for key, where in programs.items())
+        listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
         raise RefusedError(
             f"{results} names code of its own, {listed}, which this command would run; "
             "allowed is --trust, for one who has read it"
@@ -102,8 +102,18 @@ def alone(file: Path) -> bool:
 
 
 def _say(programs: Mapping[str, str], where_named: Path) -> None:
+    for file, keys in _by_file(programs).items():
+        *first, last = keys
+        name = f"{', '.join(first)} and {last} of {where_named} name" if first else f"{last} of {where_named} names"
+        print(f"ptsmc: runs {file}, which {name}", file=sys.stderr)
+
+
+def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
+    """The keys that name each file."""
+    files: dict[str, list[str]] = {}
     for key, where in programs.items():
-        print(f"ptsmc: runs {systems.location(where)}, which {key} of {where_named} names", file=sys.stderr)
+        files.setdefault(systems.location(where), []).append(key)
+    return files
 
 
 def results_of(scenario: Path) -> Path | None:
