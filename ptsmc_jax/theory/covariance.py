@@ -10,6 +10,9 @@ import numpy as np
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import error_floor, linear
 
+ROUNDS = 24  # at most, in which the mean slope of a sign and the noise that it leaves of s are found
+BEYOND = 1e60  # stands for a size of s that is no number any more
+
 
 class Noise(NamedTuple):
     """What noise alone does, 1 sigma."""
@@ -40,11 +43,17 @@ def noise(parts: Parts) -> Noise:
     flown = getattr(parts.controller, "sign_width", None)
     if flown is None:
         return sizes
-    width = float(flown)
-    for _ in range(4):
-        before, width = width, _mean_width(float(flown), sizes.s)
-        if np.isclose(width, before, rtol=0.01):
+    width, apart, low, high = float(flown), np.inf, 0.0, np.inf  # low, high: between which it lies
+    for _ in range(ROUNDS):
+        left = sizes.s if np.isfinite(sizes.s) else BEYOND
+        before, wanted = apart, _mean_width(float(flown), left)
+        if abs(wanted - width) <= 0.01 * wanted or high < 1.001 * low:
             break
+        low, high = (width, high) if wanted > width else (low, width)
+        apart = abs(np.log(wanted / width)) if width > 0.0 else np.inf
+        # a slope that much noise leaves may let the loop come to rest, and the one that little leaves may not
+        halved = low > 0.0 and high < np.inf and (apart > 0.1 * before or not low < wanted < high)
+        width = float(np.sqrt(low * high)) if halved else wanted
         law = replace(parts.controller, sign_width=jnp.full_like(parts.controller.sign_width, width))
         sizes = _covariance(replace(parts, controller=law), run)
     return sizes

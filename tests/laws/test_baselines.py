@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.laws import fixed_time, pd, terminal
@@ -16,6 +17,7 @@ from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.error_motions import ErrorQuaternion
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.scenario import baseline_tables
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock
 from tests import helpers
@@ -177,3 +179,22 @@ def test_the_sign_is_as_wide_as_it_is_told_and_exact_at_zero(name):
     np.testing.assert_array_equal(replace(LAWS[name], sign_width=vector(0.0)).sign(s), [1.0, -1.0, 0.0])
     np.testing.assert_allclose(replace(LAWS[name], sign_width=vector(0.5)).sign(vector([0.1, -1.0, 0.0])),
                                np.tanh([0.2, -2.0, 0.0]), rtol=1e-14)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SLIDING)
+def test_how_fast_a_law_turns_the_body_is_what_its_surface_asks_for_at_half_a_turn(name):
+    """Of |v| = 1, where the body turns by twice |v'|."""
+    law = LAWS[name]
+    tables = {"terminal": baseline_tables.TerminalController, "fixed_time": baseline_tables.FixedTimeController}
+    gains = {gain: float(getattr(law, gain)) for gain in law.tunable if gain != "t_f"}
+    rate = brentq(lambda v_dot: float(law.surface(vector([1.0]), vector([v_dot]))[0][0]), -10.0, -1e-3, xtol=1e-12)
+    assert tables[name](**gains).turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
+
+
+def test_how_fast_pd_and_a_profile_turn_the_body_from_half_a_turn():
+    """By the spring's energy, theta'^2 / 2 = k_p (integral of sin(theta / 2)); and the quintic at its steepest."""
+    energy = 0.4 * quad(lambda angle: np.sin(angle / 2.0), 0.0, np.pi)[0]
+    assert baseline_tables.PDController(k_p=0.4).turning(7.0)[1] == pytest.approx(np.sqrt(2.0 * energy), rel=1e-12)
+    slope = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv()(np.linspace(0.0, 1.0, 1001)).max()
+    for table in (baseline_tables.TimeBasePDController(), baseline_tables.TimeBaseSlidingController()):
+        assert table.turning(7.0) == ("controller.t_f", pytest.approx(slope * np.pi / 7.0, rel=1e-12))

@@ -180,6 +180,15 @@ def test_a_drawn_inertia_moves_what_is_left_and_one_that_leaves_nothing_is_marke
     assert rollout.STATUS[int(result.status)][0] == "diverged"
 
 
+@pytest.mark.parametrize("too_far", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
+def test_a_body_whose_modes_weigh_more_than_it_does_about_some_axes_is_none(too_far):
+    """About two of them J - D'D has a positive determinant again."""
+    coupling = np.diag([1.5 if axis in too_far else 0.5 for axis in range(3)])
+    plain = flexible_body.flexible(4.0 * np.eye(3), [1.0] * 3, [0.01] * 3, coupling)
+    one = vector(np.eye(3))
+    assert np.all(np.isnan(plain.with_inertia(one, one).rest_inverse))
+
+
 def test_moved_and_apart_are_inverse():
     plant, x = body(), state(2)
     by = vector(1e-7 * np.random.default_rng(0).normal(size=14))

@@ -231,8 +231,9 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         second_order.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match="n is 0"):
         second_order.system(0, F, F, G)
-    with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
-        second_order.system(2, F, F, G, inertia=np.array([[1.0, 5.0], [0.0, 1.0]]))
+    for size in (1.0, 1e-9):  # of small systems too
+        with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
+            second_order.system(2, F, F, G, inertia=size * np.array([[1.0, 5.0], [0.0, 1.0]]))
     with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
         second_order.system(2, F, F, G, inertia=-np.eye(2))
     with pytest.raises(ValueError, match=r"^F\(t, x_1, x_2\) fails .*TracerBoolConversionError: [^\n]*$"):

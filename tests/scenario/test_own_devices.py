@@ -12,6 +12,7 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.devices.own_sensors import OWN_NOISE
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import own, parsing, reading, systems
@@ -19,7 +20,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
 from scenarios.own_parts import LateStarTracker
-from tests.helpers import FIRST_FLIGHT, SHORT, ticks_of
+from tests.helpers import FIRST_FLIGHT, SHORT, ticks_of, vector
 from tuning.search import gains
 from tuning.studies import stability
 
@@ -110,6 +111,18 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     assert float(other.metrics.window_error) != float(rollout.simulate_jit(parts, 3, 7).metrics.window_error)
     assert linear.quiet(parts).sensors.noise_scale == 0.0
     assert t.size > 60
+
+
+def test_a_period_without_a_length_leaves_their_memory():
+    """Clocks have such periods; what is seen in them is not flown with."""
+    own = parts_of(sensors=NOISY, disturbance={"kind": "none"}).sensors
+    now = Ticks(*(jnp.asarray(v) for v in (0.5, 0.5, False, 3, 1.0)))
+    _, (_, _, kept) = own.measure(own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now, vector(0.1))
+    assert kept.tolist() == [1.0]
+    _, (_, _, new) = own.measure(
+        own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now._replace(t_next=vector(0.6)), vector(0.1)
+    )
+    assert abs(float(new[0]) - 5.0) < 0.1
 
 
 def test_a_sensor_that_sees_the_state_flies_as_none_does():
