@@ -132,8 +132,6 @@ def read(table: Any, name: str, code: object) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _with_keys(table: Any, found: Any) -> Any:
-    from ptsmc_jax.simulation.gains import of_law
-
     base = table.base()
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
@@ -156,15 +154,8 @@ def _with_keys(table: Any, found: Any) -> Any:
         meaning = "" if gain is None else " ".join(gain.meaning.split())
         unit = f" [{gain.unit}]" if gain is not None and gain.unit else ""
         meanings.append(f"    {field.name}: {meaning or 'of one of its own'}{unit}")
-        if gain is not None and not table.tuned:
-            raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
         if gain is not None:
-            if not table.prefix and not of_law({field.name: gain}):
-                raise ValueError(f"the name of its gain {field.name} stands for one of another part")
-            if table.prefix + field.name == "observer_gain":
-                raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
-            gains[table.prefix + field.name] = _bounds(gain, f"gain {field.name} of the class {found.__name__}")
-            _inside(field, gain.usual)
+            gains[table.prefix + field.name] = _gain(table, found, field, gain)
     summary = inspect.cleandoc(found.__doc__ or "").split("\n\n")[0]
     return msgspec.defstruct(
         found.__name__, key_types, bases=(table,), frozen=True, kw_only=True,
@@ -216,6 +207,21 @@ def _key(field: dataclasses.Field, about: Any) -> tuple[Any, Any]:
 
 def _plain(value: object) -> typing.TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _gain(table: Any, found: Any, field: dataclasses.Field, gain: Any) -> GainBounds:
+    """The bounds of a field that is a gain. Raises ValueError where it cannot be one of such a table."""
+    from ptsmc_jax.simulation.gains import of_law
+
+    if not table.tuned:
+        raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
+    if not table.prefix and not of_law({field.name: gain}):
+        raise ValueError(f"the name of its gain {field.name} stands for one of another part")
+    if table.prefix + field.name == "observer_gain":
+        raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
+    bounds = _bounds(gain, f"gain {field.name} of the class {found.__name__}")
+    _inside(field, gain.usual)
+    return bounds
 
 
 def _inside(field: dataclasses.Field, usual: Any) -> None:

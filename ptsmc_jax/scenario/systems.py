@@ -21,11 +21,8 @@ if TYPE_CHECKING:
     from ptsmc_jax.plants.second_order import System
 
 WHERE = '"FILE.py:NAME" or "package.module:NAME"'
-
 ALLOWED = f"{WHERE}, a system made with plants.system"
-
 LONGEST = 4096  # characters of a path, on Linux
-
 OURS = ("ptsmc_jax", "tuning")  # packages that no folder of one's own has helpers of the name of
 
 
@@ -37,9 +34,8 @@ class _Ran(NamedTuple):
 
 
 _ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
-_helpers: dict[
-    str, tuple[str, str | None]
-] = {}  # modules that the last ones imported from beside them: path and SHA-256
+# modules that the last ones imported from beside them: path and SHA-256
+_helpers: dict[str, tuple[str, str | None]] = {}
 
 
 def named(where: str, allowed: str) -> tuple[str, str]:
