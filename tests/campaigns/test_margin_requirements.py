@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -16,7 +18,7 @@ from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins, run_margins
-from tests.helpers import short
+from tests.helpers import FIRST_FLIGHT, ROOT, short
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
 from tuning.studies import posing
@@ -166,6 +168,24 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # of the loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
     np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
+
+
+@pytest.mark.long
+def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
+    """XLA once aborted the process, so another one looks: delta is free by default, and no filter saved it."""
+    changes = {"dispersion__inertia": {"kind": "relative_normal", "std": 0.03}, "requirements": {"gain_margin": 6.0}}
+    code = (
+        "from ptsmc_jax.configure import configure; configure(1)\n"
+        "import numpy as np; from ptsmc_jax import scenario\n"
+        "from tuning.search import margin_rows; from tuning.search.shares import of_scenario\n"
+        f"known = scenario.replace(scenario.read({str(FIRST_FLIGHT)!r}), **{changes!r})\n"
+        "margin_rows.hardest = lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0)\n"
+        "ready = scenario.study(known); bounds = of_scenario(known, ready.parts)\n"
+        "asked = margin_rows.ask(ready, bounds, 0)\n"
+        "print(margin_rows.sloped(asked, bounds, np.full(len(bounds.names), 0.5))['c_slope'].shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "(1, 30, 5)\n"), done.stderr[-2000:]
 
 
 def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn):

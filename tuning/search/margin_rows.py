@@ -98,7 +98,8 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
 
     if asked.coordinates:
-        each = jax.vmap(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c))[0])(asked.coordinates)
+        # one after the other: XLA aborts the process on products with an inertia of each case, with some sets of gains
+        each = jax.lax.map(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c))[0], asked.coordinates)
         loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     else:
         loops, _ = run_margins.judged_loops(parts)
