@@ -1,4 +1,7 @@
-"""What is odd about a scenario though it flies: bounds far off its disturbance, a mostly noisy estimate, no gyro."""
+"""What is odd about a scenario though it flies: bounds far off its disturbance, a mostly noisy estimate, no gyro.
+
+Or a surface that is too fast for the control period.
+"""
 
 from typing import Any
 
@@ -6,6 +9,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.theory import borders
 
 FAR = 10.0  # times off, from which on a stated bound is said to be
 LATE = 0.1  # of t_f, from which on a delay is likely the number of another unit
@@ -16,7 +20,7 @@ def of(scenario: Scenario) -> list[str]:
     """Sentences, none where nothing is odd or code of one's own was not run yet."""
     bounds = disturbance_bounds.of(scenario)
     bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
-    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario)]
+    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario), *_fast_surface(scenario)]
 
 
 def _late(scenario: Scenario) -> list[str]:
@@ -27,6 +31,29 @@ def _late(scenario: Scenario) -> list[str]:
     return [
         f"hardware.delay is {delay}, which are {delay * period:g} s: it counts control periods, of {period:g} s each, "
         "and no time"
+    ]
+
+
+def _fast_surface(scenario: Scenario) -> list[str]:
+    """A surface on which no K1 keeps the sampled loop after the hand-over: the paper's 1 1/s is one of slow loops."""
+    law: Any = scenario.controller
+    if not scenario.sampled or law.kind != "prescribed_time" or scenario.order != 2:
+        return []
+    period, delay = scenario.loop.period, float(scenario.devices.delay_periods)
+    share = getattr(law, "a", (1.0,))[0] * period  # of the rate: c h, of a chain c a_1 h
+
+    def held(rate: float) -> bool:
+        return borders.largest_reaching(share * rate, delay, implicit=law.implicit) > 0.0
+
+    if held(law.surface_rate):
+        return []
+    slower = law.surface_rate
+    while not held(slower):
+        slower /= 1.1
+    late = f" and a delay of {delay:g}" if delay else ""
+    return [
+        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 makes the loop "
+        f"after the hand-over stable; from {slower:.2g} 1/s down some do: give a smaller one, or name it in tune.free"
     ]
 
 
