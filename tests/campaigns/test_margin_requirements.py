@@ -170,6 +170,26 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
+def equations(jaxpr):
+    """Those of a trace, and of all traces in it."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda v: hasattr(v, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from equations(inner)
+
+
+def test_no_product_has_an_inertia_for_each_case(drawn):
+    """With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith.."."""
+    asked, bounds = drawn.problem.margins, drawn.evaluate.bounds
+    trace = jax.make_jaxpr(lambda share: jax.jacfwd(lambda at: margin_rows.rows(asked, bounds.gains(at)))(share))
+    products = [e for e in equations(trace(np.full(len(bounds.names), 0.5)).jaxpr) if e.primitive.name == "dot_general"]
+    assert products
+    each = (margin_rows.CASES, 3, 3)
+    assert not [e for e in products if e.params["dimension_numbers"][1][0] and each in [v.aval.shape for v in e.invars]]
+
+
 @pytest.mark.long
 def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
     """XLA once aborted the process, so another one looks: delta is free by default, and no filter saved it."""
