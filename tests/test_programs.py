@@ -238,7 +238,8 @@ def test_those_not_used_for_longest_make_room(folder, monkeypatch):
         made.append(new)
         used = (new, made[0])  # the first one is used again and again
         for j, path in enumerate(used):
-            os.utime(path, (1e9 + 10 * k + j,) * 2)
+            at = 1e9 + 10 * k + j
+            os.utime(path, (at, at))
     assert set(folder.iterdir()) == {made[0], made[2], made[3]}
 
 

@@ -78,11 +78,15 @@ def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_f
     """What is shown says that the same command goes on, which with --force would begin anew."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     shown = []
+
+    def write(making, outcome):
+        (making / "summary.json").write_text(outcome.status)
+
     search = searches.LongSearch(
         {"command": "tune", "seed": 0},
         "window error",
         work=lambda report, journal: SimpleNamespace(status="interrupted"),
-        write=lambda making, outcome: (making / "summary.json").write_text(outcome.status),
+        write=write,
         summary=lambda outcome: {"status": outcome.status},
         show=lambda summary, folder, how: shown.append((summary["status"], how)),
     )

@@ -21,7 +21,7 @@ def test_a_value_stands_at_the_share_of_the_trials_up_to_the_middle_of_its_own()
     """Of four trials, one without a value, each is a quarter, and the last quarter lies beyond all values."""
     column = campaign_plots.Column("rad", np.array([3.0, 1.0, np.nan, 2.0]))
     (axes,) = campaign_plots.distributions({"ape_z": column}).axes
-    np.testing.assert_allclose(axes.lines[0].get_xydata(), [[1.0, 1 / 8], [2.0, 3 / 8], [3.0, 5 / 8]])
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), [[1.0, 1 / 8], [2.0, 3 / 8], [3.0, 5 / 8]])
 
 
 @pytest.mark.parametrize("limit", [0.2, 1.5, 50.0, 1e4])

@@ -187,7 +187,7 @@ def test_how_fast_a_law_turns_the_body_is_what_its_surface_asks_for_at_half_a_tu
     law = LAWS[name]
     tables = {"terminal": baseline_tables.TerminalController, "fixed_time": baseline_tables.FixedTimeController}
     gains = {gain: float(getattr(law, gain)) for gain in law.tunable if gain != "t_f"}
-    rate = brentq(lambda v_dot: float(law.surface(vector([1.0]), vector([v_dot]))[0][0]), -10.0, -1e-3, xtol=1e-12)
+    rate: Any = brentq(lambda v_dot: float(law.surface(vector([1.0]), vector([v_dot]))[0][0]), -10.0, -1e-3, xtol=1e-12)
     assert tables[name](**gains).turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
 
 

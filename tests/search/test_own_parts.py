@@ -1,5 +1,7 @@
 """Which results a scenario file lies in, whose programs are run with trust only."""
 
+from typing import Any
+
 import pytest
 
 from ptsmc_jax.campaigns.store import RefusedError
@@ -36,7 +38,7 @@ def test_a_link_among_results_to_a_file_elsewhere_counts_as_one_of_theirs(tmp_pa
 def test_a_file_that_several_keys_name_is_told_of_once(tmp_path, capsys):
     law = tmp_path / "mine.py"
     law.write_text("")
-    programs = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
+    programs: Any = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
     with pytest.raises(RefusedError, match=rf"own, {law} \(controller.code, observer.code, reference.code\), which"):
         own_parts.allow(programs, tmp_path, {}, trusted=False)
     own_parts.allow(programs, tmp_path, {}, trusted=True)

@@ -108,7 +108,8 @@ def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
 
     def left(gain_up, delay):
         values: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.zeros(3))
-        return margins.Margins(**values | {"gain_up": np.array(gain_up), "delay": np.array(delay)})
+        values |= {"gain_up": np.array(gain_up), "delay": np.array(delay)}
+        return margins.Margins(**values)
 
     ends = {
         "hand_over": (left([20.0, -20.0, 40.0], [0.3, 0.0, 0.4]), 1.2),

@@ -403,4 +403,5 @@ def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
 def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, ends):
     tables = {"plant": {"kind": "chain"}, "controller": {"t_f": t_f, "delta": delta}}
     made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
-    np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), np.geomspace(*ends, 4), rtol=1e-12)
+    spread = np.geomspace(ends[0], ends[1], 4)
+    np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), spread, rtol=1e-12)

@@ -1,6 +1,7 @@
 """Nominal runs that do not come to rest in hold: their closed form, and what must not be taken for them."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,7 +65,7 @@ def test_a_hold_is_judged_from_sixteen_whole_periods_on(whole, judged):
 
 def test_where_a_run_swings_none_is_left_but_of_loops_that_are_unstable_anyway():
     stable = np.array([[True], [True], [False]])
-    values = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
+    values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
     left = rest.none_left(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
         none = {"modulus": 100.0, "stable": False, "crossover": np.nan}.get(name, 0.0)  # as of an unstable loop's peak
