@@ -349,6 +349,7 @@ def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatc
         return SimpleNamespace(each=lambda: {"delay_margin": delays[loops.number][:, None]})
 
     monkeypatch.setattr(margin_verdicts, "_look", looked)
+    monkeypatch.setattr(margin_verdicts, "JUDGED", 16)
     monkeypatch.setattr(margin_verdicts.margins, "of_each", of_each)
     nothing: Any = None
     found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": 0.25})

@@ -102,6 +102,13 @@ def test_what_has_no_answer_is_refused(tune, said):
         robustness.check(known)
 
 
+def test_the_scenarios_own_limit_is_one_of_the_usual_ones():
+    tables = tomllib.loads(SHORT_CHAIN)
+    assert robustness.usual_limits(scenario.from_tables(tables)) == robustness.LIMITS
+    asked = scenario.from_tables({**tables, "requirements": {"modulus_margin": 5.5}})
+    assert robustness.usual_limits(asked) == (3.0, 4.0, 5.0, 5.5, 6.0, 8.0, 12.0)
+
+
 def test_a_limit_stands_for_the_margins_that_it_bounds():
     asked = {"peak_torque": 3.0, "gain_margin": 8.0, "phase_margin": 45.0, "delay_margin": 0.02, "modulus_margin": 5.0}
     known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "requirements": asked})
@@ -137,7 +144,7 @@ def test_limits_without_gains_and_loops_without_margins_are_told():
     assert gains.rows == [("none", "3", "25"), ("6", "3", "25")]
     nothing = {**told, "robust": [], "idle": [], "without": [None, 6.0], "floor": None}
     assert list(front_sentences.robust_lines(nothing)) == [
-        "no gains found keep |S| at most any and 6 dB on the training trials",
+        "no gains found keep the limits on the training trials, whatever margins they leave",
         "for none of these limits do gains meet every requirement on the fresh trials",
     ]
     assert front_sentences.robust(nothing).rows == front_sentences.robust_gains(nothing).rows == []

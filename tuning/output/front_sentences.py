@@ -163,14 +163,16 @@ def robust_lines(summary: Summary) -> Iterator[str]:
         )
     if summary["idle"]:
         yield f"the gains found for a looser limit keep {_listed(summary['idle'])} dB too"
-    if summary["without"]:
+    if None in summary["without"]:
+        yield "no gains found keep the limits on the training trials, whatever margins they leave"
+    elif summary["without"]:
         yield f"no gains found keep |S| at most {_listed(summary['without'])} dB on the training trials"
     if summary["requirements"] and not any(one["meets"] for one in found):
         yield "for none of these limits do gains meet every requirement on the fresh trials"
 
 
-def _listed(limits: list[float | None]) -> str:
-    *first, last = (digits(limit, "g", "any") for limit in limits)
+def _listed(limits: list[float]) -> str:
+    *first, last = (f"{limit:g}" for limit in limits)
     return f"{', '.join(first)} and {last}" if first else last
 
 

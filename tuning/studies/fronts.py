@@ -26,7 +26,7 @@ def study_of(against: str, scenario: Scenario, points: int | None, listed: tuple
         return pareto, points or POINTS
     if against == "margins":
         robustness.check(scenario)
-        return robustness, listed or robustness.LIMITS
+        return robustness, listed or robustness.usual_limits(scenario)
     times = listed or slew_times.usual_times(scenario)
     slew_times.check(scenario, times)
     return slew_times, times

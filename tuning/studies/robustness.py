@@ -28,7 +28,7 @@ from tuning.search.objective import T_F, Problem, replaced
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, pareto, posing
 
-LIMITS = (12.0, 8.0, 6.0, 5.0, 4.0, 3.0)  # on the largest sensitivity [dB], where none are given
+LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # on the largest sensitivity [dB], where none are given
 NONE = np.inf
 SENSITIVITY = "modulus_margin"
 IN_PLACE = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the sensitivity stands for
@@ -65,6 +65,12 @@ class Ladder:
     def status(self) -> str:
         """Whether the gains for some limit meet every requirement on the fresh trials."""
         return "met" if any(one.meets for one in self.robust) else "not met"
+
+
+def usual_limits(scenario: Scenario) -> tuple[float, ...]:
+    """Limits on the largest sensitivity, the scenario's own among them [dB]."""
+    own_limit = judging.limit_of(SENSITIVITY, scenario)
+    return tuple(sorted({*LIMITS, *([] if own_limit is None else [own_limit])}))
 
 
 def check(scenario: Scenario) -> None:
