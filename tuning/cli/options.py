@@ -126,7 +126,7 @@ def listed_against(against: str, points: int | None, times: str | None, limits: 
     if times is not None:
         return _numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
     if limits is not None:
-        return _numbers("--limits", limits, 1, "limits in dB, all different, such as 4,6,9")
+        return _numbers("--limits", limits, 1, "limits in dB, greater than 0 and all different, such as 4,6,9")
     return ()
 
 
