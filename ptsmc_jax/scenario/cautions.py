@@ -39,21 +39,15 @@ def _fast_surface(scenario: Scenario) -> list[str]:
     law: Any = scenario.controller
     if not scenario.sampled or law.kind != "prescribed_time" or scenario.order != 2:
         return []
-    period, delay = scenario.loop.period, float(scenario.devices.delay_periods)
-    share = getattr(law, "a", (1.0,))[0] * period  # of the rate: c h, of a chain c a_1 h
-
-    def held(rate: float) -> bool:
-        return borders.largest_reaching(share * rate, delay, implicit=law.implicit) > 0.0
-
-    if held(law.surface_rate):
+    period, delay = scenario.loop.period, scenario.devices.delay_periods
+    share = getattr(law, "a", (1.0,))[0]  # of the rate: a chain's surface has c a_1
+    border = borders.largest_surface(delay, implicit=law.implicit) / (share * period)
+    if law.surface_rate < border:
         return []
-    slower = law.surface_rate
-    while not held(slower):
-        slower /= 1.1
-    late = f" and a delay of {delay:g}" if delay else ""
+    late = f" and a delay of {delay}" if delay else ""
     return [
         f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 makes the loop "
-        f"after the hand-over stable; from {slower:.2g} 1/s down some do: give a smaller one, or name it in tune.free"
+        f"after the hand-over stable; below {border:.3g} 1/s some do: give a smaller one, or name it in tune.free"
     ]
 
 

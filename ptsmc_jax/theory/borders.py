@@ -114,6 +114,19 @@ def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool =
     return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - before) * h)
 
 
+def largest_surface(delay: int = 0, *, implicit: bool = False) -> float:
+    """Largest c h for which some k, however small, leaves the frozen loop after the hand-over stable [-].
+
+    As k goes to 0 its poles are 1, which any k moves inwards, and those of z^d (z - 1) + c h: inside the unit circle up
+    to c h = 2 sin(pi / (4 d + 2)), which is 2 without delay. With implicit sampling c h / (1 + c h/2) stands in place
+    of c h: infinite without delay. delay: d, in periods.
+    """
+    border = 2.0 * float(np.sin(np.pi / (4 * delay + 2)))
+    if not implicit:
+        return border
+    return border / (1.0 - border / 2) if delay else float("inf")
+
+
 def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = False) -> float:
     """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
 

@@ -57,3 +57,15 @@ def test_borders_are_those_of_the_theory_notes():
         np.testing.assert_allclose(borders.smallest_delta(eta, 0.05, anchored=False), (eta - 0.5) * 0.05, rtol=1e-8)
         assert 0.74 < borders.largest_index(eta, 1.0) < 0.85  # "about 0.75"
         assert borders.largest_index(eta, 2.0) < borders.largest_index(eta, 1.0)
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+@pytest.mark.parametrize("delay", [0, 1, 2, 5])
+def test_the_fastest_surface_that_can_be_held_is_the_border_of_small_k(delay, implicit):
+    border = borders.largest_surface(delay, implicit=implicit)
+    if implicit and not delay:
+        assert border == np.inf
+        assert borders.largest_reaching(1e3, 0.0, implicit=True) > 0.0
+        return
+    assert borders.largest_reaching(0.999 * border, float(delay), implicit=implicit) > 0.0
+    assert borders.largest_reaching(1.001 * border, float(delay), implicit=implicit) == 0.0
