@@ -40,6 +40,7 @@ QUICK = {  # gains that reach the goal in so short a run; others fly with their 
     "terminal": {"p": 1.3, "b": 1.0, "k": 1.0},
     "fixed_time": {"a1": 0.5, "b1": 0.8},
     "super_twisting": {"surface_rate": 1.5, "lipschitz": 0.5},
+    "predefined_time": {"q1": 0.5, "q2": 0.5},
 }
 ROWS: dict[str, dict] = {
     "continuous": {"controller": SLEW, "loop": SHORT, "dispersion": SPREAD},

@@ -59,7 +59,7 @@ def smallest_eigenvalue(a: Float[Array, "n n"]) -> Float[Array, ""]:
     8.5). Good to all digits where eigenvalues fall together, too, which the closed form for three of them is not.
     """
 
-    def sweep(_: Array, a: Array) -> Array:
+    def sweep(_: Array | int, a: Array) -> Array:  # a whole number where nothing is compiled
         for p, q in combinations(range(a.shape[0]), 2):
             a = _rotated(a, p, q)
         return a
