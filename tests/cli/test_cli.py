@@ -549,7 +549,7 @@ def test_a_chain_is_tuned(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, _ = command("tune", "c.toml", "--seed", 2)
     assert status in (0, 1)
-    assert "the tuned gains keep peak_torque below 20 from t_f = " in out
+    assert "the tuned gains keep peak_torque below 20 u from t_f = " in out
     assert "observer_gain" not in out
     folder = tmp_path / "out" / "tune-c"
     summary = json.loads((folder / "summary.json").read_text())
