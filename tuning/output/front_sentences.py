@@ -115,9 +115,14 @@ def slew_times_lines(summary: Summary) -> Iterator[str]:
 
 def slew_times_heading(summary: Summary) -> str:
     """How many times, and on what they were judged."""
-    many = len(summary["slews"]) != 1
-    times = f"{len(summary['slews'])} prescribed time{'s' if many else ''}"
-    return f"gains tuned for {times}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
+    return _tuned_for(summary, "slews", "prescribed time")
+
+
+def _tuned_for(summary: Summary, points: str, what: str, of: str = "") -> str:
+    """How many points of such a name there are, what each is tuned for, and on what they were judged."""
+    count = len(summary[points])
+    many, each = ("s", "each ") if count != 1 else ("", "")
+    return f"gains tuned for {count} {what}{many}{of}, {each}judged on {summary['trials']} fresh trials"
 
 
 def robust(summary: Summary) -> Table:
@@ -178,7 +183,4 @@ def _listed(limits: list[float]) -> str:
 
 def robust_heading(summary: Summary) -> str:
     """How many limits, and on what they were judged."""
-    found = summary["robust"]
-    many = len(found) != 1
-    limits = f"{len(found)} limit{'s' if many else ''} on |S|"
-    return f"gains tuned for {limits}, {'each ' if many else ''}judged on {summary['trials']} fresh trials"
+    return _tuned_for(summary, "robust", "limit", " on |S|")

@@ -136,13 +136,21 @@ def trace(
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where there is no front of accuracy against torque to look for."""
-    of, tune = "for a front of the window error", scenario.search
-    if tune.objective == T_F:
-        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {of}')
-    if tune.torque_weight:
-        raise wrong("tune.torque_weight", tune.torque_weight, f"absent {of} against the torque")
-    if tune.worst_case:
-        raise wrong("tune.worst_case", True, f"false {of}, whose points keep their limits in the trials drawn")
+    of, weight = "for a front of the window error", scenario.search.torque_weight
+    check_search(scenario, of, ", whose points keep their limits in the trials drawn")
+    if weight:
+        raise wrong("tune.torque_weight", weight, f"absent {of} against the torque")
+
+
+def check_search(scenario: Scenario, against: str, why: str = "") -> None:
+    """Raise ScenarioError where a search minimises no error, or moves the trials; against: what that is in the way of.
+
+    why: what speaks against moving them.
+    """
+    if scenario.search.objective == T_F:
+        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
+    if scenario.search.worst_case:
+        raise wrong("tune.worst_case", True, f"false {against}{why}")
 
 
 def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:

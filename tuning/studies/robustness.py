@@ -24,7 +24,7 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.search import gains, trust
 from tuning.search.journal import Journal
-from tuning.search.objective import T_F, Problem, replaced
+from tuning.search.objective import Problem, replaced
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, pareto, posing
 
@@ -75,13 +75,10 @@ def usual_limits(scenario: Scenario) -> tuple[float, ...]:
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where there is nothing to ask."""
-    against, tune = "to ask what margins cost", scenario.search
+    against = "to ask what margins cost"
     if not scenario.sampled:
         raise wrong("loop.mode", scenario.loop.mode, f'"sampled" {against}')
-    if tune.objective == T_F:
-        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
-    if tune.worst_case:
-        raise wrong("tune.worst_case", True, f"false {against}")
+    pareto.check_search(scenario, against)
 
 
 def _limited(scenario: Scenario, limit: float) -> Scenario:

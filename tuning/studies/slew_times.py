@@ -68,15 +68,12 @@ def usual_times(scenario: Scenario) -> tuple[float, ...]:
 
 def check(scenario: Scenario, times: Sequence[float]) -> None:
     """Raise ScenarioError where there is nothing to ask, or a time that cannot be flown [s]."""
-    against, tune = "to ask what a faster slew costs", scenario.search
+    against = "to ask what a faster slew costs"
     if not scenario.controller.prescribed:
         raise wrong("controller.kind", scenario.controller.kind, f"prescribed_time {against}")
-    if tune.objective == T_F:
-        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
-    if T_F in tune.gains:
-        raise wrong("tune.free", list(tune.gains), f"without t_f {against}")
-    if tune.worst_case:
-        raise wrong("tune.worst_case", True, f"false {against}")
+    pareto.check_search(scenario, against)
+    if T_F in scenario.search.gains:
+        raise wrong("tune.free", list(scenario.search.gains), f"without t_f {against}")
     for key in scenario.requirements:
         if key in catalogues.MARGINS:
             raise ScenarioError(
