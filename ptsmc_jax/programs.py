@@ -32,10 +32,11 @@ from ptsmc_jax import configure
 
 KEPT = 400  # programs; those not used for longest make room
 # for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
-# compile in half the time besides, and run faster, at this level
+# compile in half the time besides, and run faster, at this level; jaxlib 0.11 has no older ones any more
+OLDER_EMITTERS = jaxlib.version.__version_info__ < (0, 11)
 QUICKLY = {
     "xla_backend_optimization_level": 0,
-    "xla_cpu_use_fusion_emitters": False,
+    **({"xla_cpu_use_fusion_emitters": False} if OLDER_EMITTERS else {}),
     "xla_cpu_parallel_codegen_split_count": 1,
 }
 OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files

@@ -347,10 +347,10 @@ _REDUCTIONS = {
 _CUMULATIVE = {"cumsum": lax.add, "cumprod": lax.mul, "cummax": lax.max, "cummin": lax.min}
 _ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp clz complex conj
     convert_element_type copy copy_p cos cosh digamma div eq eq_to erf erf_inv erfc exp exp2 expm1
-    floor ge gt imag integer_pow is_finite le le_to lgamma log log1p logistic lt lt_to max min mul ne
-    neg nextafter not or population_count pow real reduce_precision rem round rsqrt select_n
+    floor ge gt imag integer_pow is_finite le le_to lgamma log log1p log2 logistic lt lt_to max min mul ne
+    neg nextafter not one_minus_square or population_count pow real reduce_precision rem round rsqrt select_n
     shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub
-    tan tanh xor""".split()
+    tan tanh xor""".split()  # log2 and one_minus_square since jax 0.11
 _STRUCTURAL = """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
     transpose unstack""".split()
 # An index that differs from trial to trial wants whole arrays.

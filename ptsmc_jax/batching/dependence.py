@@ -25,8 +25,11 @@ def opened(closed: Any) -> tuple[core.Jaxpr, Sequence]:
 
 def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
     """The operands of a `lax.scan`, or its body's inputs: constants, carries, and what it goes through."""
-    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
-    return operands[:first], operands[first:second], operands[second:]
+    if "num_consts" in params:
+        fixed, carried = params["num_consts"], params["num_carry"]
+    else:  # from jax 0.11 on: three branches of a tree
+        fixed, carried, _ = (len(branch) for branch in params["ft_in"].unpack())
+    return operands[:fixed], operands[fixed : fixed + carried], operands[fixed + carried :]
 
 
 def of_while(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:

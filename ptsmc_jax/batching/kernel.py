@@ -220,9 +220,10 @@ class _Inside:
 
     def scan(self, params: Any, values: list) -> list:
         """A loop, its steps written out if they are few."""
-        body, carried, length = params["jaxpr"], params["num_carry"], params["length"]
+        body, length = params["jaxpr"], params["length"]
         *inside, xs = of_scan(params, values)
         consts, state = ([_lane(v) for v in part] for part in inside)
+        carried = len(state)
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= MAPPED):

@@ -94,8 +94,9 @@ def _carry(to: Any, region: Region, init: Sequence[np.ndarray], like: Sequence[A
 def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.scan and fori_loop of a fixed length: written out where it is short, else a loop in C."""
     params = eqn.params
-    body, carried, length = params["jaxpr"], params["num_carry"], params["length"]
+    body, length = params["jaxpr"], params["length"]
     consts, init, xs = of_scan(params, values)
+    carried = len(init)
     order = range(length)[:: -1 if params["reverse"] else 1]
     if length <= 1 or (length <= UNROLLED and length * len(body.jaxpr.eqns) <= WRITTEN):
         carry, rows = list(init), [[] for _ in body.jaxpr.outvars[carried:]]

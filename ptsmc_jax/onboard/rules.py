@@ -95,6 +95,9 @@ ELEMENTWISE: dict[str, Callable] = {
     "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
     "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
     "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
+    "one_minus_square": lambda pool, params, kind, x: pool.make(
+        "mul", *(pool.make(op, pool.constant(1, kind), x, kind=kind) for op in ("add", "sub")), kind=kind
+    ),
     "rsqrt": lambda pool, params, kind, x: _one_over(pool, pool.make("sqrt", x)),
     "clamp": lambda pool, params, kind, low, x, high: pool.make(
         "min", pool.make("max", x, low, kind=kind), high, kind=kind
