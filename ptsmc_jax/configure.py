@@ -96,8 +96,8 @@ def configure(
         jax.config.update("jax_debug_infs", False)
         jax.config.update("jax_numpy_dtype_promotion", "standard")
         jax.config.update("jax_transfer_guard", "allow")
-    if device is not None:
-        jax.config.update("jax_platforms", device)
+    if device is not None:  # "gpu" would ask for every maker's: what JAX finds by itself is one, if there is one
+        jax.config.update("jax_platforms", "cpu" if device == "cpu" else None)
     try:
         jax.config.update("jax_num_cpu_devices", devices or _cores())
     except RuntimeError:
@@ -110,11 +110,8 @@ def configure(
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         _tell_of_rejected_once(folder)
-    if device == "gpu":
-        try:
-            jax.devices()  # starts the backend
-        except RuntimeError:
-            raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]") from None
+    if device == "gpu" and jax.default_backend() != "gpu":  # starts it
+        raise NoDeviceError("JAX finds no GPU here; allowed is cpu, or install jax[cuda12]")
 
 
 def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -> None:
