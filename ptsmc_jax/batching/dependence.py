@@ -23,6 +23,13 @@ def opened(closed: Any) -> tuple[core.Jaxpr, Sequence]:
     return (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
 
 
+def place(eqn: Any) -> str:
+    """Where in the user's files an equation stands, as far as JAX knows."""
+    trace = eqn.source_info.traceback
+    frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
+    return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""
+
+
 def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
     """The operands of a `lax.scan`, or its body's inputs: constants, carries, and what it goes through."""
     if "num_consts" in params:

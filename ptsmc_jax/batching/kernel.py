@@ -1,18 +1,15 @@
-"""Whole rollouts as one kernel of an accelerator: a trace of one trial, evaluated by components over a block of trials.
+"""A loop over time as one kernel of an accelerator, all trials side by side: what `lanes` flies with on a GPU.
 
-`kernel.vmap` computes what `lanes.vmap` does, for functions of numbers that return numbers. Under `lax.scan` an
-accelerator is handed a few launches a step, which below a million trials cost more than the step; here the loop over
-time lies inside one Pallas kernel, each block of trials keeps its state in registers, and only metrics leave it.
-
-What does not depend on the trial is computed before, outside: constants become one table of numbers for each type, what
-a loop goes through (times, hand-over, numbers of samples) a table with a row a step. Inside there are only numbers and
-vectors over the block, which is all that a kernel's compiler takes.
+Under `lax.scan` an accelerator is handed a few launches a step, which below a million trials cost more than the step.
+Here the loop lies inside one Pallas kernel: each block of trials keeps its state in registers, and only the last state
+leaves it. Inside there are only numbers and vectors over the block, which is all that a kernel's compiler takes: what
+is equal in all trials comes from tables of numbers, what differs from tables with a row for each component.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial, reduce
-from typing import Any
+from collections.abc import Iterable, Sequence
+from functools import reduce
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +20,9 @@ from jax.experimental.pallas import triton
 from jax.extend import core
 from jaxtyping import Array
 
-from ptsmc_jax.batching import components, lanes
-from ptsmc_jax.batching.components import Lane, object_array
-from ptsmc_jax.batching.dependence import called, dependence, of_scan, opened, settle
+from ptsmc_jax.batching import components
+from ptsmc_jax.batching.components import TRIAL, Lane, object_array, plain
+from ptsmc_jax.batching.dependence import called, dependence, of_scan, opened, place, settle
 
 BLOCK = 128  # trials in a kernel's block: a power of two
 UNROLLED = 8  # steps: loops no longer than that are written out
@@ -33,158 +30,242 @@ MAPPED = 256  # the same of loops that carry nothing from step to step, whose re
 LARGEST = 1024  # entries of an array: there are none but those taken apart
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
+# what `components` has a rule for, and the kernel's compiler has none
+_UNKNOWN = set(
+    """complex conj copy copy_p digamma eq_to erf erfc imag le_to lgamma log2 lt_to one_minus_square real
+    reduce_precision round""".split()
+)
 
 
-def vmap(function: Callable, *, block: int = BLOCK, interpret: bool = False) -> Callable:
-    """`jax.vmap(function)` for arguments (trials,) and results that are trees of numbers, as one kernel.
+def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, ...], interpret: bool) -> list:
+    """The last carries of a `lax.scan`, each an object array of components (*lead).
 
-    function: of numbers, to a tree of numbers; what it closes over is equal in all trials. interpret: evaluated by
-    JAX on any device, slowly, for tests. Take derivatives inside, of `function`. Raises NotImplementedError at what a
-    kernel cannot do: results with axes, loops of unknown length, long loops that stack results.
+    Args:
+        params: the scan's.
+        values: its operands: lanes, or what is equal in all trials and directions.
+        varies: which carries come to differ from trial to trial.
+        lead: (trials,), or (directions, trials) of slopes: each direction is flown by itself.
+        interpret: evaluated by JAX on any device, slowly, for tests.
+
+    Raises NotImplementedError at what a kernel cannot do: primitives that its compiler lacks, loops of unknown length,
+    long ones that stack results, run backward, or go through what differs from trial to trial; and at short ones,
+    which are no work for one.
     """
+    body, length, inputs = params["jaxpr"], params["length"], params["jaxpr"].jaxpr.invars
+    carried = of_scan(params, inputs)[1]
+    if length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carried) or not any(varies):
+        raise NotImplementedError("a kernel flies long loops that run forward and stack no results")
+    if any(map(_by_trial, of_scan(params, values)[2])):
+        raise NotImplementedError("a kernel's loop goes through what is equal in all trials")
+    *directions, trials = lead
+    blocks, each = -(-trials // BLOCK), math.prod(directions)
+    numbers, rows, ends = _Numbers(each), _Rows(), _Rows()
+    fixed = len(values) - len(of_scan(params, values)[2])
+    shapes = [of.aval.shape if k < fixed else (length, *of.aval.shape) for k, of in enumerate(inputs)]
+    given = [
+        (rows if _by_trial(v) else numbers).take(v, shape, of.aval.dtype)
+        for v, shape, of in zip(values, shapes, inputs, strict=True)
+    ]
+    results = [ends.places([None] * math.prod(of.aval.shape), of.aval.shape, of.aval.dtype) for of in carried]
 
-    def mapped(*arguments: Any) -> Any:
-        one = [jax.ShapeDtypeStruct((), jnp.asarray(a).dtype) for a in arguments]
-        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*one)
-        outputs, tree = jax.tree.flatten(shapes)
-        if any(out.shape for out in outputs):
-            raise NotImplementedError("a kernel returns numbers for each trial, no arrays")
-        trials = arguments[0].shape[0]
-        program = _Program(closed)
-        blocks = -(-trials // block)
-        padded = [jnp.resize(jnp.asarray(a), (blocks * block,)) for a in arguments]
-        across = pl.BlockSpec((block,), lambda k: (k,))
-        tables = program.tables()
-        results = pl.pallas_call(
-            partial(_body, program, len(arguments), len(tables), block),
-            out_shape=[jax.ShapeDtypeStruct((blocks * block,), out.dtype) for out in outputs],
-            grid=(blocks,),
-            in_specs=[across] * len(arguments) + [pl.BlockSpec(table.shape, lambda k: (0,)) for table in tables],
-            out_specs=[across] * len(outputs),
-            interpret=interpret,
-            compiler_params=triton.CompilerParams(num_warps=max(1, block // 32)),
-        )(*padded, *tables)
-        return jax.tree.unflatten(tree, [v[:trials] for v in results])
+    def flown(*refs: Any) -> None:
+        tables, refs = _named(numbers.parts, refs)
+        takes, refs = _named(rows.parts, refs)
+        gives, _ = _named(ends.parts, refs)
+        vectors = {kind: _loaded(ref, len(rows.parts[kind])) for kind, ref in takes.items()}
+        known = [v.of(vectors if isinstance(v, _Places) else tables) for v in given]
+        last = _Inside(BLOCK, interpret).loop(body, length, of_scan(params, known), varies)
+        made = {kind: [] for kind in gives}
+        for value, of in zip(last, carried, strict=True):
+            kind = _held_as(of.aval.dtype)
+            made[kind] += (jnp.broadcast_to(jnp.asarray(part, kind), (BLOCK,)) for part in value.parts.flat)
+        for kind, ref in gives.items():
+            _put(ref, made[kind])
 
-    return mapped
+    def across(table: _Rows) -> list:
+        heights = (_filled(len(parts)) for parts in table.parts.values())
+        return [pl.BlockSpec((height, BLOCK), lambda block, direction: (direction, block)) for height in heights]
+
+    flat = numbers.tables()
+    found = pl.pallas_call(
+        flown,
+        out_shape=[
+            jax.ShapeDtypeStruct((each * _filled(len(parts)), blocks * BLOCK), kind)
+            for kind, parts in ends.parts.items()
+        ],
+        grid=(blocks, each),
+        in_specs=[*(pl.BlockSpec(table.shape, lambda block, direction: (0,)) for table in flat), *across(rows)],
+        out_specs=across(ends),
+        interpret=interpret,
+        compiler_params=triton.CompilerParams(num_warps=BLOCK // 32),
+    )(*flat, *rows.tables(lead, blocks * BLOCK))
+    by_row = {
+        kind: jnp.moveaxis(table.reshape(*directions, -1, blocks * BLOCK)[..., :trials], -2, 0)
+        for kind, table in zip(ends.parts, found, strict=True)
+    }
+    return [places.of(by_row).parts for places in results]
 
 
-class _Outside:
-    """A value computed before the kernel."""
-
-    def __init__(self, value: Array):
-        self.value, self.shape, self.dtype = value, jnp.shape(value), jnp.asarray(value).dtype
-        self.where: tuple[str, int] = ("", 0)  # table, and where it begins there
+def _by_trial(value: Any) -> bool:
+    return isinstance(value, Lane) and bool(value.differs & TRIAL)
 
 
-class _Program:
-    """A trace split in two: what depends on the trial, to be evaluated in the kernel, and the values that it needs."""
+def _filled(length: int) -> int:
+    """A length that a kernel's compiler takes: a power of two."""
+    return 1 << (length - 1).bit_length()
 
-    def __init__(self, closed: core.ClosedJaxpr):
-        self.equations: list[tuple[Any, list, list]] = []
-        self.outside: list[_Outside] = []
-        variables = closed.jaxpr.invars
-        known: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, map(_Outside, closed.consts), strict=True))
-        known |= {variable: variable for variable in variables}
-        self.arguments = list(variables)
-        self._walk(closed.jaxpr, known)
-        self.results = [self._use(known, atom) for atom in closed.jaxpr.outvars]
-        self.layout = self._lay_out()
 
-    def _walk(self, jaxpr: core.Jaxpr, known: dict[Any, Any]) -> None:
-        """Compute what does not depend on the trial, keep the rest; calls are opened."""
-        for eqn in jaxpr.eqns:
-            read = [atom if isinstance(atom, core.Literal) else known[atom] for atom in eqn.invars]
-            if all(isinstance(value, core.Literal | _Outside) for value in read):
-                plain = [value.val if isinstance(value, core.Literal) else value.value for value in read]
-                known |= zip(eqn.outvars, map(_Outside, components.bind(eqn, plain)), strict=True)
-            elif (inner := _called(eqn)) is not None:
-                inside: dict[Any, Any] = dict(zip(inner.jaxpr.constvars, map(_Outside, inner.consts), strict=True))
-                inside |= zip(inner.jaxpr.invars, read, strict=True)
-                self._walk(inner.jaxpr, inside)
-                known |= {
-                    out: inside.get(atom, atom) for out, atom in zip(eqn.outvars, inner.jaxpr.outvars, strict=True)
-                }
-            else:
-                outputs = [object() for _ in eqn.outvars]
-                self.equations.append((eqn, [self._use(known, atom) for atom in eqn.invars], outputs))
-                known |= zip(eqn.outvars, outputs, strict=True)
+def _held_as(kind: np.dtype) -> str:
+    """The type that numbers of this one have in a table."""
+    return "int32" if kind == np.dtype(bool) else np.dtype(kind).name
 
-    def _use(self, known: dict, atom: Any) -> Any:
-        value = atom if isinstance(atom, core.Literal) else known[atom]
-        if isinstance(value, _Outside) and value not in self.outside:
-            self.outside.append(value)
-        return value
 
-    def _lay_out(self) -> dict[str, int]:
-        """Give each value from outside its place in the table of its type; returns the tables' lengths."""
-        lengths: dict[str, int] = {}
-        for value in self.outside:
-            name = "int32" if value.dtype == bool else value.dtype.name
-            value.where = (name, lengths.get(name, 0))
-            lengths[name] = value.where[1] + math.prod(value.shape)
-        return lengths
+def _named(names: Iterable[str], refs: Sequence) -> tuple[dict[str, Any], Sequence]:
+    """The first of these by their names, and the others."""
+    named = dict(zip(names, refs, strict=False))
+    return named, refs[len(named) :]
 
-    def tables(self) -> list[Array]:
-        """A table (length,) for each type, as long as a power of two."""
+
+class _Places(NamedTuple):
+    """Where the components of a value lie among rows."""
+
+    kind: str
+    rows: np.ndarray  # object array of whole numbers
+    boolean: bool
+
+    def of(self, vectors: dict[str, Any]) -> Lane:
+        """The components."""
+        found = (vectors[self.kind][k] for k in self.rows.flat)
+        return Lane(self.rows.shape, object_array(self.rows.shape, (v != 0 if self.boolean else v for v in found)))
+
+
+class _Rows:
+    """Tables of what differs from trial to trial, one for each type, with a row for each component."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, list] = {}
+
+    def places(self, parts: Iterable, shape: tuple[int, ...], dtype: np.dtype) -> _Places:
+        """Rows for these components of a value."""
+        kind = _held_as(dtype)
+        rows = self.parts.setdefault(kind, [])
+        first = len(rows)
+        rows += parts
+        return _Places(kind, object_array(shape, range(first, len(rows))), dtype == np.dtype(bool))
+
+    def take(self, value: Lane, shape: tuple[int, ...], dtype: np.dtype) -> _Places:
+        """Rows for a lane."""
+        if math.prod(shape) > LARGEST:
+            raise NotImplementedError(f"a kernel takes arrays of up to {LARGEST} entries apart")
+        return self.places(value.parts.flat, shape, dtype)
+
+    def tables(self, lead: tuple[int, ...], width: int) -> list[Array]:
+        """A table (directions * height, width) for each type."""
         made = []
-        for name, length in self.layout.items():
-            parts = [jnp.ravel(value.value).astype(name) for value in self.outside if value.where[0] == name]
-            filled = max(16, 1 << (length - 1).bit_length())
-            made.append(jnp.pad(jnp.concatenate(parts), (0, filled - length)))
+        for kind, parts in self.parts.items():
+            stacked = jnp.stack([jnp.broadcast_to(part, lead).astype(kind) for part in parts], axis=-2)
+            beyond = [(0, 0)] * len(lead[:-1]) + [(0, _filled(len(parts)) - len(parts)), (0, width - lead[-1])]
+            made.append(jnp.pad(stacked, beyond, mode="edge").reshape(-1, width))
         return made
 
 
-def _body(program: _Program, arguments: int, tables: int, block: int, *refs: Any) -> None:
-    """The kernel: refs of the arguments, of the tables, and of the results."""
-    takes, held, gives = refs[:arguments], refs[arguments : arguments + tables], refs[arguments + tables :]
-    inside = _Inside(block, dict(zip(program.layout, held, strict=True)))
-    known: dict[Any, Any] = {
-        variable: Lane((), object_array((), [ref[...]])) for variable, ref in zip(program.arguments, takes, strict=True)
-    }
-
-    def read(value: Any) -> Any:
-        return value if isinstance(value, core.Literal | _Outside) else known[value]
-
-    for eqn, values, outputs in program.equations:
-        known |= zip(outputs, inside.apply(eqn, [inside.value(read(value)) for value in values]), strict=True)
-    for ref, result in zip(gives, program.results, strict=True):
-        ref[...] = jnp.broadcast_to(_lane(inside.value(read(result))).parts[()], (block,)).astype(ref.dtype)
+# Rows are read and written in a loop over them: a compiler that goes through all that hangs on a load or a store, and
+# does so for each, takes a hundred times as long for a hundred that are written out.
 
 
-class _Held:
-    """A value from outside: in a table, from a place on."""
+def _loaded(ref: Any, count: int) -> Sequence:
+    """The first rows of a table."""
 
-    def __init__(self, ref: Any, first: int, value: _Outside):
-        self.ref, self.first, self.shape, self.dtype = ref, first, value.shape, value.dtype
+    def step(k: Any, found: tuple) -> tuple:
+        row = ref[k, :]
+        return tuple(jnp.where(k == np.int32(i), row, value) for i, value in enumerate(found))
+
+    empty = jnp.zeros((ref.shape[1],), ref.dtype)
+    return lax.fori_loop(np.int32(0), np.int32(count), step, (empty,) * count)
+
+
+def _put(ref: Any, rows: Sequence) -> None:
+    """Write the first rows of a table."""
+
+    def step(k: Any, _: None) -> None:
+        ref[k, :] = _chosen(k, rows)
+
+    lax.fori_loop(np.int32(0), np.int32(len(rows)), step, None)
+
+
+def _chosen(k: Any, values: Sequence) -> Any:
+    """The k-th of some values that lie in no table, k being known in the kernel only."""
+    return reduce(lambda found, i: jnp.where(k == np.int32(i), values[i], found), range(1, len(values)), values[0])
+
+
+class _Numbers:
+    """Tables of what is equal in all trials, one for each type; what differs over directions lies there for each."""
+
+    def __init__(self, directions: int):
+        self.directions, self.parts = directions, dict[str, list[Array]]()
+
+    def take(self, value: Any, shape: tuple[int, ...], dtype: np.dtype) -> "_Stretch":
+        """Places for a value."""
+        by_direction = isinstance(value, Lane)
+        array = value.dense((self.directions, 1)) if by_direction else jnp.asarray(plain(value))
+        kind = _held_as(dtype)
+        parts = self.parts.setdefault(kind, [])
+        first = sum(part.size for part in parts)
+        parts.append(jnp.ravel(array).astype(kind))
+        return _Stretch(kind, first, math.prod(shape) if by_direction else 0, shape, dtype)
+
+    def tables(self) -> list[Array]:
+        """A table (length,) for each type."""
+        whole = [jnp.concatenate(parts) for parts in self.parts.values()]
+        return [jnp.pad(v, (0, max(16, _filled(v.size)) - v.size)) for v in whole]
+
+
+class _Stretch(NamedTuple):
+    """Where a value lies in a table of numbers: from a place on, and of each direction by so many places further."""
+
+    kind: str
+    first: int
+    further: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    def of(self, tables: dict[str, Any]) -> "_Held":
+        """The value as it is held in the kernel."""
+        start: Any = np.int32(self.first)
+        if self.further:
+            start = start + pl.program_id(1) * np.int32(self.further)
+        return _Held(tables[self.kind], start, self.shape, self.dtype)
+
+
+class _Held(NamedTuple):
+    """A value in a table of numbers, from a place on."""
+
+    ref: Any
+    start: Any
+    shape: tuple[int, ...]
+    dtype: np.dtype
 
     def lane(self) -> Lane:
         """The whole value as components."""
-        return self._load(self.shape, self.first)
+        if math.prod(self.shape) > LARGEST:
+            raise NotImplementedError(f"a kernel takes arrays of up to {LARGEST} entries apart")
+        return self._load(self.shape, self.start)
 
     def row(self, k: Any) -> Lane:
         """The k-th row as components."""
         shape = self.shape[1:]
-        return self._load(shape, np.int32(self.first) + k * np.int32(math.prod(shape)))
+        return self._load(shape, self.start + k * np.int32(math.prod(shape)))
 
     def _load(self, shape: tuple[int, ...], start: Any) -> Lane:
-        numbers = [self.ref[start + k] for k in range(math.prod(shape))]
+        numbers = [self.ref[start + np.int32(k)] for k in range(math.prod(shape))]
         return Lane(shape, object_array(shape, [n != 0 for n in numbers] if self.dtype == bool else numbers))
 
 
 class _Inside:
     """Evaluation inside the kernel: every value an object array of numbers, or of vectors over the block."""
 
-    def __init__(self, block: int, refs: dict[str, Any]):
-        self.block, self.refs = block, refs
-
-    def value(self, value: Any) -> Any:
-        """A literal as components, a value from outside where it is held."""
-        if isinstance(value, core.Literal):
-            return _constant(value.val)
-        if isinstance(value, _Outside):
-            return _Held(self.refs[value.where[0]], value.where[1], value)
-        return value
+    def __init__(self, block: int, interpret: bool):
+        self.block, self.interpret = block, interpret
 
     def evaluate(self, closed: Any, arguments: Sequence) -> list:
         """Values of the outputs of a trace."""
@@ -205,6 +286,8 @@ class _Inside:
         if name == "scan":
             return self.scan(params, values)
         values = [_lane(value) for value in values]
+        if name in _UNKNOWN and not self.interpret:
+            raise NotImplementedError(f"a kernel's compiler lacks the primitive `{name}`{place(eqn)}")
         if (inner := _called(eqn)) is not None:
             return self.evaluate(inner, values)
         if name == "cond":
@@ -212,37 +295,42 @@ class _Inside:
         if name == "iota":
             with jax.ensure_compile_time_eval():
                 return [_constant(components.bind(eqn, [])[0])]
-        # spread anew for each equation, as its speed on a GPU was measured
+        # spread anew for each equation: what was spread inside a branch or a loop is not known outside
         made = components.apply(eqn, values, components.Alike(), LARGEST) if components.covers(name) else None
         if made is not None:
             return made
-        raise NotImplementedError(f"a kernel has no rule for the primitive `{name}`{lanes.place(eqn)}")
+        raise NotImplementedError(f"a kernel has no rule for the primitive `{name}`{place(eqn)}")
 
     def scan(self, params: Any, values: list) -> list:
         """A loop, its steps written out if they are few."""
         body, length = params["jaxpr"], params["length"]
-        *inside, xs = of_scan(params, values)
-        consts, state = ([_lane(v) for v in part] for part in inside)
-        carried = len(state)
+        operands = of_scan(params, values)
+        carried = len(operands[1])
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= MAPPED):
+            consts, state = ([_lane(v) for v in part] for part in operands[:2])
             rows = []
             for k in range(length):
-                results = self.evaluate(body, [*consts, *state, *(_row(x, k) for x in xs)])
+                results = self.evaluate(body, [*consts, *state, *(_row(x, k) for x in operands[2])])
                 state, row = results[:carried], results[carried:]
                 rows.append(row)
             return [*state, *(_stacked(part) for part in zip(*rows, strict=True))]
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
-        differs = settle(body.jaxpr, _varies(consts), _varies(state), _varies(xs))
-        shapes = [v.aval.shape for v in of_scan(params, body.jaxpr.invars)[1]]
+        return self.loop(body, length, operands, settle(body.jaxpr, *map(_varies, operands)))
+
+    def loop(self, body: Any, length: int, operands: Sequence[Sequence], varies: Sequence[int]) -> list:
+        """The last carries of a loop; operands: constants, carries, and what it goes through."""
+        *inside, xs = operands
+        consts, state = ([_lane(v) for v in part] for part in inside)
+        shapes = [v.shape for v in state]
 
         def step(k: Any, packed: tuple) -> tuple:
             rows = (_row(x, k) for x in xs)
-            return self.pack(self.evaluate(body, [*consts, *_unpacked(packed, shapes), *rows]), differs)
+            return self.pack(self.evaluate(body, [*consts, *_unpacked(packed, shapes), *rows]), varies)
 
-        return _unpacked(lax.fori_loop(np.int32(0), np.int32(length), step, self.pack(state, differs)), shapes)
+        return _unpacked(lax.fori_loop(np.int32(0), np.int32(length), step, self.pack(state, varies)), shapes)
 
     def branch(self, branches: Sequence, values: list) -> list:
         """A branch where all trials agree, else all of them and a choice for each trial."""
@@ -289,13 +377,7 @@ def _row(value: Any, k: Any) -> Lane:
     if isinstance(value, _Held):
         return value.row(k)
     shape, rows = value.shape[1:], value.parts.reshape(value.shape[0], -1)
-    if isinstance(k, int):
-        return Lane(shape, object_array(shape, rows[k]))
-
-    def chosen(numbers: Any) -> Any:  # there is no table of what was made inside
-        return reduce(lambda found, i: jnp.where(k == i, numbers[i], found), range(1, len(numbers)), numbers[0])
-
-    return Lane(shape, object_array(shape, map(chosen, rows.T)))
+    return Lane(shape, object_array(shape, rows[k] if isinstance(k, int) else (_chosen(k, each) for each in rows.T)))
 
 
 def _stacked(rows: Sequence[Lane]) -> Lane:

@@ -19,20 +19,22 @@ from jax.extend import core
 from jaxtyping import Array
 
 from ptsmc_jax.batching import components
-from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, parts_of, plain
-from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, settle, used
+from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
+from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, place, settle, used
+from ptsmc_jax.batching.packed import Packed
 
 
 class LanesWarning(UserWarning):
     """A primitive without a rule went through `jax.vmap`: right, but slower."""
 
 
-def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callable:
+def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bool = False) -> Callable:
     """`jax.vmap(function, in_axes)` for axes 0 and None, evaluated by components; the outputs' trial axis is 0.
 
     Composes with jit, vmap, jvp and grad from outside. A primitive without a rule here goes through `jax.vmap` on its
-    own, with one warning. Raises ValueError where nothing is mapped, with strict=True NotImplementedError at such a
-    primitive.
+    own, with one warning. whole: a long loop is one kernel of an accelerator where it can be, see `kernel`, and has no
+    derivative from outside then. Raises ValueError where nothing is mapped, with strict=True NotImplementedError at
+    such a primitive.
 
     >>> crosses = vmap(lambda a: jnp.cross(a, jnp.array([0.0, 0.0, 1.0])))
     >>> crosses(jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).tolist()
@@ -42,13 +44,13 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Calla
     def mapped(*args: Any) -> Any:
         trials, one, values = _mapped(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
-        results = _Lanes(trials, strict).evaluate(used(closed), values)
+        results = _Lanes(trials, strict, whole=whole).evaluate(used(closed), values)
         return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, (trials,)) for value in results])
 
     return mapped
 
 
-def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callable:
+def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bool = False) -> Callable:
     """(arguments, directions) -> (values, slopes): `vmap(function)`, and its derivatives along several directions.
 
     directions: a tree like each argument, or None for one that stays, its leaves with an axis over the directions
@@ -79,7 +81,7 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False) -> Callab
         inner = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         count = along[0].shape[0] if along[0].ndim else 0
         slopes = [_slope(leaf, shape, count, trials) for leaf, shape in zip(along, inner, strict=True)]
-        lanes = _Lanes(trials, strict, directions=count)
+        lanes = _Lanes(trials, strict, count, whole)
         results = lanes.evaluate(used(closed), [*values, *slopes])
         half = len(results) // 2
         leads = [(trials,)] * half + [(lanes.directions, trials)] * half
@@ -125,49 +127,17 @@ def _spread(axis: int | None, tree: Any) -> Any:
     return jax.tree.map(lambda _: axis == 0, tree)
 
 
-class _Packed:
-    """How values are handed through JAX's loops and branches: lanes as tuples of components, large ones dense."""
-
-    def __init__(self, variables: Sequence, differs: Sequence[int], leads: Sequence[tuple[int, ...]]):
-        self.shapes, self.differs, self.leads = [v.aval.shape for v in variables], differs, leads
-
-    def pack(self, values: Sequence) -> tuple:
-        return tuple(self._pack(*item) for item in zip(values, self.shapes, self.differs, strict=True))
-
-    def _pack(self, value: Any, shape: tuple[int, ...], differs: int) -> Any:
-        if not differs:
-            return plain(value)
-        lead = self.leads[differs]
-        if not self.apart(shape, differs):
-            return dense_of(value, lead)
-        return tuple(jnp.broadcast_to(part, lead) for part in parts_of(value).flat)
-
-    def unpack(self, packed: Sequence) -> list:
-        return [self._unpack(*item) for item in zip(packed, self.shapes, self.differs, strict=True)]
-
-    def _unpack(self, value: Any, shape: tuple[int, ...], differs: int) -> Any:
-        if not differs:
-            return value
-        parts, dense = (object_array(shape, value), None) if self.apart(shape, differs) else (None, value)
-        return Lane(shape, parts, dense, differs)
-
-    @staticmethod
-    def apart(shape: tuple[int, ...], differs: int) -> bool:
-        """Whether a value is taken apart: one that is equal in all trials would gain nothing."""
-        return components.small(shape) and differs != DIRECTION
-
-
 class _Lanes:
     """Evaluation of traces for so many trials; with slopes, along so many directions."""
 
-    def __init__(self, trials: int, strict: bool, directions: int = 0):
-        self.trials, self.directions, self.strict = trials, directions, strict
+    def __init__(self, trials: int, strict: bool, directions: int = 0, whole: bool = False):
+        self.trials, self.directions, self.strict, self.whole = trials, directions, strict, whole
         self.leads = ((), (trials,), (directions, 1), (directions, trials))  # by what differs
         self.alike = components.Alike()
 
     def inside(self) -> "_Lanes":
         """The same in a function that JAX traces by itself: what is computed there belongs to it alone."""
-        return _Lanes(self.trials, self.strict, self.directions)
+        return _Lanes(self.trials, self.strict, self.directions, self.whole)
 
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
@@ -250,9 +220,14 @@ class _Lanes:
         consts, carried = [_apart(value) for value in consts], len(init)
         fixed, rowed = _which(consts), _which(xs)
         differs = settle(body.jaxpr, fixed, _which(init), rowed)
+        if self.whole:
+            try:
+                return self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], differs)
+            except NotImplementedError:  # it is flown step by step
+                pass
         outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
-        state, row = _Packed(carried_in, differs, self.leads), _Packed(gone_through, rowed, self.leads)
-        out = _Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
+        state, row = Packed(carried_in, differs, self.leads), Packed(gone_through, rowed, self.leads)
+        out = Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
 
         def rows(value: Any, shape: tuple[int, ...], differs: int) -> Any:
             if not isinstance(value, Lane):
@@ -278,11 +253,22 @@ class _Lanes:
         stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
         return [*state.unpack(last), *stacked]
 
+    def in_one_kernel(self, params: Any, values: list, differs: Sequence[int]) -> list:
+        """A scan by `kernel.scan`."""
+        from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
+
+        lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
+        interpret = jax.default_backend() == "cpu"
+        last = kernel.scan(params, values, [own & TRIAL for own in differs], lead, interpret)
+        carried = of_scan(params, params["jaxpr"].jaxpr.invars)[1]
+        packed = Packed(carried, differs, self.leads)
+        return packed.unpack([packed.of_all(k, parts) for k, parts in enumerate(last)])
+
     def _stacked(self, y: Any, shape: tuple[int, ...], differs: int, length: int) -> Any:
         """What a scan stacks, components of (time, *lead), or (time, *lead, *shape): a lane of (time, *shape)."""
         if not differs:
             return y
-        whole, lead, apart = (length, *shape), self.leads[differs], _Packed.apart(shape, differs)
+        whole, lead, apart = (length, *shape), self.leads[differs], Packed.apart(shape, differs)
         if 0 in whole:
             return Lane(whole, np.empty(whole, dtype=object), differs=differs)
         if apart and components.small(whole):
@@ -299,7 +285,7 @@ class _Lanes:
         differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
         (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])
         differs = [own | each for own in differs]
-        state = _Packed(body.jaxpr.outvars, differs, self.leads)
+        state = Packed(body.jaxpr.outvars, differs, self.leads)
 
         def going(carry: tuple) -> Any:
             (test_value,) = self.inside().evaluate(test, [*test_consts, *state.unpack(carry)])
@@ -329,7 +315,7 @@ class _Lanes:
         operands = [_apart(value) for value in operands] if agree else operands
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
         differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
-        results = _Packed(eqn.outvars, differs, self.leads)
+        results = Packed(eqn.outvars, differs, self.leads)
         cases = [lambda branch=branch: results.pack(self.inside().evaluate(branch, operands)) for branch in branches]
         if agree:
             return results.unpack(lax.switch(plain(index), cases))
@@ -346,8 +332,8 @@ class _Lanes:
         """A function with a derivative rule of its own (custom_jvp), which is kept."""
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         smooth = [k for k, aval in enumerate(avals) if jnp.issubdtype(aval.dtype, jnp.inexact)]
-        takes = _Packed(eqn.invars, _which(values), self.leads)
-        gives = _Packed(eqn.outvars, [either(takes.differs)] * len(eqn.outvars), self.leads)
+        takes = Packed(eqn.invars, _which(values), self.leads)
+        gives = Packed(eqn.outvars, [either(takes.differs)] * len(eqn.outvars), self.leads)
 
         @jax.custom_jvp
         def function(packed: tuple) -> tuple:
@@ -388,10 +374,3 @@ def _apart(value: Any) -> Any:
     if isinstance(value, Shared) or np.ndim(value) == 0 or not components.small(np.shape(value)):
         return value
     return Shared(jnp.asarray(value))
-
-
-def place(eqn: Any) -> str:
-    """Where in the user's files an equation stands, as far as JAX knows."""
-    trace = eqn.source_info.traceback
-    frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
-    return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""

@@ -138,7 +138,7 @@ def run(
     trials: Sequence[int] | np.ndarray | Row,
     block: int | None = None,
     own: OwnMetrics | None = None,
-    kernel: bool = False,
+    kernel: bool | None = None,
 ) -> Trials:
     """Fly these trials, or rows of a plan: the same whatever the blocks, the devices and the order.
 
@@ -152,7 +152,8 @@ def run(
         trials: their numbers, whole ones below 2^32, or rows of a plan.
         block: trials that a device flies at a time; None: `block_size()`.
         own: see `one`.
-        kernel: whole runs in one kernel, see `kernel`; on a processor it is interpreted, slowly.
+        kernel: the loop over time as one kernel, see `batching.kernel`; None: `by_kernel()`. On a processor it is
+            interpreted, slowly.
 
     Raises ValueError where the trials are no such numbers, TypeError where there are no parts.
     """
@@ -163,6 +164,7 @@ def run(
     block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if count >= FEW else 1
     size = devices * rows * block
+    kernel = by_kernel() if kernel is None else kernel
     calls = []
     for k in range(0, count, size):
         places, share = shared_out(min(size, count - k), devices, rows * block)
@@ -208,7 +210,7 @@ def prepare(parts: Parts, dispersion: Dispersion) -> None:
     """Begin to compile what flies many trials of such parts, beside what is being done."""
     devices, block = len(jax.local_devices()), block_size()
     numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
-    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, kernel=False)
+    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel())
 
 
 @programs.jit(static_argnames=("devices", "own", "kernel"))
@@ -222,23 +224,14 @@ def _fly(
     own: OwnMetrics | None,
     kernel: bool,
 ) -> Flown:
-    """Results of (devices, rows, block) trials; rows from `needed` on are left zero, a kernel flies them too."""
-    shape = jax.tree.leaves(trials)[0].shape[:3]
+    """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
 
     def fly(trial: jax.Array | Row) -> Flown:
         return one(parts, dispersion, seed, trial, own=own)
 
-    def in_one_kernel(trials: jax.Array | Row) -> Flown:
-        from ptsmc_jax.batching.kernel import vmap  # which nothing else needs
-
-        flown = vmap(fly, interpret=jax.default_backend() == "cpu")
-        results = flown(jax.tree.map(lambda v: v.reshape(-1, *v.shape[3:]), trials))
-        return jax.tree.map(lambda v: v.reshape(1, *shape[1:]), results)
-
-    if kernel:
-        return spread(in_one_kernel, trials, devices)
     result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
-    return row_by_row(lanes.vmap(fly), result, shape[2], trials, needed, devices)
+    width = jax.tree.leaves(trials)[0].shape[2]
+    return row_by_row(lanes.vmap(fly, whole=kernel), result, width, trials, needed, devices)
 
 
 def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.Array, devices: int) -> Any:
@@ -270,6 +263,11 @@ def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.
 def block_size() -> int:
     """How many trials a device flies at a time, where a caller does not say."""
     return BLOCK if jax.default_backend() == "cpu" else BLOCK_ON_GPU
+
+
+def by_kernel() -> bool:
+    """Whether loops over time are flown as one kernel each: on a GPU, where every step would cost launches."""
+    return jax.default_backend() == "gpu"
 
 
 def blocks(fly: Callable, trials: Any) -> Any:

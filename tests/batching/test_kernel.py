@@ -1,5 +1,7 @@
-"""Whole runs in one kernel: interpreted they are those of the scan, and they can be compiled for a GPU from here."""
+"""Loops in one kernel: interpreted they are those of the scan, and they can be compiled for a GPU from here."""
 
+import contextlib
+import dataclasses
 from functools import partial
 
 import jax
@@ -10,6 +12,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.dispersions import variation
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import short
 from tuning.search.gains import with_gains
@@ -62,9 +65,28 @@ def derivative(tables):
 AS_FLOWN = {"xla_backend_optimization_level": 3}
 
 
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    monkeypatch.setattr(kernel, "BLOCK", 4)
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """How many steps each loop has that is flown as a kernel."""
+    made, scan = [], kernel.scan
+
+    def counted(params, *rest):
+        results = scan(params, *rest)
+        made.append(params["length"])
+        return results
+
+    monkeypatch.setattr(kernel, "scan", counted)
+    return made
+
+
 def both(function):
     """A kernel's results and those of the scan."""
-    mapped = kernel.vmap(function, block=4, interpret=True), lanes.vmap(function)
+    mapped = lanes.vmap(function, whole=True), lanes.vmap(function)
     return [jax.jit(one, compiler_options=AS_FLOWN)(NUMBERS) for one in mapped]
 
 
@@ -85,13 +107,42 @@ def agree(function, unit):
 
 
 @pytest.mark.parametrize("name", short(["flight", "chain", "continuous"], ["continuous"]))
-def test_interpreted_it_is_the_scan(name):
+def test_interpreted_it_is_the_scan(name, kernels):
     tables = {"flight": FLIGHT, "chain": CHAIN, "continuous": CONTINUOUS}[name]
     agree(primal(tables), 1e-12)
+    assert len(kernels) == 1
 
 
-def test_values_and_slopes_taken_inside_are_those_of_the_scan():
+def test_values_and_slopes_taken_inside_are_those_of_the_scan(kernels):
     agree(derivative(CHAIN), 1e-12)
+    assert len(kernels) == 1
+
+
+def test_slopes_along_several_directions_are_those_of_the_scan(kernels):
+    """delta moves the times that the loop goes through, eta what it is given, the initial state each trial its own."""
+    ready = scenario.study(scenario.from_tables(CHAIN))
+    law = ready.parts.controller
+
+    def of(gains, trial, x0):
+        parts = with_gains(ready.parts, dict(zip(("eta", "delta"), gains, strict=True)))
+        parts = dataclasses.replace(parts, initial=x0)
+        return montecarlo.one(parts, variation.Dispersion(), jnp.uint32(SEED), trial).metrics
+
+    gains, x0 = jnp.array([law.eta, law.delta]), jnp.linspace(0.5, 1.0, 12).reshape(6, 2)
+    along = jnp.eye(3, 2), None, jnp.stack([0.0 * x0, 0.0 * x0, x0])
+    got, wanted = (
+        jax.jit(lanes.jvp(of, (None, 0, 0), whole=whole), compiler_options=AS_FLOWN)((gains, NUMBERS, x0), along)
+        for whole in (True, False)
+    )
+    assert len(kernels) == 1
+    for name, value in wanted[1]._asdict().items():
+        known = np.isfinite(value)
+        found = np.asarray(getattr(got[1], name))
+        np.testing.assert_array_equal(np.isfinite(found), known, err_msg=name)
+        for k in range(3):
+            size = np.abs(value[k][known[k]]).max(initial=1e-3)
+            assert np.abs(found - value)[k][known[k]].max(initial=0.0) <= 1e-11 * size, (name, k)
+    assert all(np.abs(np.asarray(wanted[1].window_error[k])).min() > 1e-9 for k in range(3))
 
 
 def test_in_single_precision_it_is_the_scan_of_single_precision():
@@ -109,11 +160,19 @@ LOWERED = [(32, primal), (32, derivative), (64, primal), (64, derivative)]
 
 
 @pytest.mark.parametrize(("bits", "make"), short(LOWERED, LOWERED[3:4]))
-def test_it_is_lowered_for_cuda_on_a_machine_without(bits, make):
-    with jax.enable_x64(bits == 64):
-        mapped = jax.jit(kernel.vmap(make(FLIGHT)))
-        lowered = mapped.trace(jnp.arange(256, dtype=jnp.uint32)).lower(lowering_platforms=("cuda",)).as_text()
-        assert "triton" in lowered
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+def test_it_is_lowered_for_cuda_on_a_machine_without(bits, make, monkeypatch):
+    """Components are read and written by few loads and stores: each takes its compiler through the whole kernel."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(kernel, "BLOCK", 128)
+    with jax.enable_x64(bits == 64), on_a_gpu():
+        trace = jax.jit(lanes.vmap(make(FLIGHT), whole=True)).trace(jnp.arange(256, dtype=jnp.uint32))
+        assert "triton" in trace.lower(lowering_platforms=("cuda",)).as_text()
+    (flown,) = (eqn for eqn in equations(trace.jaxpr) if eqn.primitive.name == "pallas_call")
+    moved = [eqn for eqn in equations(flown.params["jaxpr"]) if eqn.primitive.name in ("get", "swap")]
+    vectors = [eqn.primitive.name for eqn in moved if eqn.outvars[0].aval.shape]
+    assert 1 <= vectors.count("get") <= 3
+    assert 1 <= vectors.count("swap") <= 3
 
 
 def test_a_batch_flown_by_kernel_is_the_batch():
@@ -126,7 +185,26 @@ def test_a_batch_flown_by_kernel_is_the_batch():
         np.testing.assert_array_equal(own.drawn[name], values)
 
 
-def test_what_is_written_out_and_what_is_looped():
+def equations(jaxpr):
+    """All equations of a trace, of those inside it too."""
+    for eqn in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        yield eqn
+        for value in eqn.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                if hasattr(getattr(inner, "jaxpr", inner), "eqns"):
+                    yield from equations(inner)
+
+
+def on_a_gpu():
+    """Lowering from jax 0.11 on asks for which one."""
+    if not hasattr(jax.sharding, "AbstractDevice"):
+        return contextlib.nullcontext()
+    device = jax.sharding.AbstractDevice(device_kind="NVIDIA H200", num_cores=None, platform="gpu")
+    kind = jax.sharding.AxisType.Auto
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), (kind,), abstract_device=device))
+
+
+def test_what_is_written_out_and_what_is_looped(kernels):
     """Short loops that stack, long ones that go through a table, branches by trial and by step, what all share."""
     table = jnp.linspace(0.0, 1.0, 100)
 
@@ -141,33 +219,49 @@ def test_what_is_written_out_and_what_is_looped():
 
         last, _ = jax.lax.scan(step, x, table)
         pairs, _ = jax.lax.scan(lambda c, row: (0.9 * c + row[1] * x - row[0], None), x, table.reshape(50, 2))
-        own, _ = jax.lax.scan(lambda c, row: (c * 0.5 + row, None), jnp.zeros(()), x * table[:20])
+        own, _ = jax.lax.scan(lambda c, row: (c * 0.5 + row, None), jnp.zeros(()), x * table[:20])  # no kernel's
+
+        def around(carry, row):
+            within = jax.lax.scan(lambda c, r: (c + jnp.sin(r * x) * row, None), carry, table[:12])[0]
+            return 0.5 * within + jax.lax.map(lambda r: r * x, table[:9])[3], row > 0.5
+
+        nested = jax.lax.scan(lambda c, r: (around(c, r)[0], None), x, table[:20])[0]
+        flags = jax.lax.scan(lambda c, r: ((~c[0] | (c[1] > x), c[1] + 1), None), (x > 2.0, 0 * trial), table[:15])[0]
         each = jax.lax.map(lambda row: jnp.abs(row - x / 6.0), table)  # carries nothing: written out too
         single = {"few": jnp.sum(few), "nearest": jnp.min(each), "same": table[3] * 2.0, "number": trial}
-        return {**single, "last": last, "pairs": pairs, "own": own}
+        return {**single, "last": last, "pairs": pairs, "own": own, "nested": nested, "flags": flags}
 
     arguments = NUMBERS, np.linspace(0.5, 1.5, 6)
-    got = kernel.vmap(function, block=4, interpret=True)(*arguments)
+    got = lanes.vmap(function, whole=True)(*arguments)
     wanted = jax.vmap(function)(*arguments)
+    assert sorted(kernels) == [15, 20, 50, 100]
     for name, value in wanted.items():
-        np.testing.assert_allclose(got[name], value, rtol=1e-15, err_msg=name)
+        for a, b in zip(jax.tree.leaves(got[name]), jax.tree.leaves(value), strict=True):
+            assert (a.shape, a.dtype) == (b.shape, b.dtype)
+            np.testing.assert_allclose(a, b, rtol=1e-14, err_msg=name)
 
 
-NINE = np.arange(9, dtype=np.uint32)
+def forward(step, length=9):
+    return lambda n: jax.lax.scan(lambda c, k: (step(c, n), None), n.astype(float), None, length)[0]
 
 
 @pytest.mark.parametrize(
-    ("function", "said"),
+    "function",
     [
-        (lambda n: jnp.stack([n, n]), "returns numbers for each trial"),
-        (lambda n: jax.lax.while_loop(lambda v: v < 9, lambda v: v + 1, n), "no rule for the primitive `while`"),
-        (lambda n: jnp.sum(jax.lax.scan(lambda c, _: (c + n, c), n, None, 100)[1]), "stacks no results of 100 steps"),
-        (
-            lambda n: jax.lax.scan(lambda c, k: (c + k, None), n, jnp.arange(9, dtype=n.dtype), reverse=True)[0],
-            "forward",
-        ),
+        forward(lambda c, n: jax.lax.while_loop(lambda v: v < 9.0, lambda v: v + 1.0, c)),
+        forward(lambda c, n: jnp.sum(jax.lax.scan(lambda v, _: (v + n, v), c, None, 300)[1])),
+        forward(lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0]),
+        forward(lambda c, n: jax.lax.erf(c)),
+        forward(lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0]),
+        forward(lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1))),
+        forward(lambda c, n: c + 1.0, 8),
+        lambda n: jnp.sum(jax.lax.scan(lambda c, _: (c + n, c), n, None, 100)[1]),
+        lambda n: jax.lax.scan(lambda c, k: (c + k, None), n, jnp.arange(9, dtype=n.dtype), reverse=True)[0],
+        lambda n: jax.lax.scan(lambda c, k: (c + k, None), 0.0, n * jnp.arange(9.0))[0],
     ],
+    ids="while stacks backward erf sort large short all_stacked all_backward through".split(),
 )
-def test_what_a_kernel_cannot_do_is_refused_by_name(function, said):
-    with pytest.raises(NotImplementedError, match=said):
-        kernel.vmap(function, block=4, interpret=True)(NUMBERS)
+def test_what_a_kernel_cannot_do_is_flown_step_by_step(function, kernels, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
+    np.testing.assert_allclose(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
+    assert kernels == []

@@ -164,7 +164,9 @@ def _fly(
         return montecarlo.one(moved, dispersion, seed, trial, coordinates)
 
     def flown(row: dict[str, Any]) -> Flown:
-        return lanes.vmap(one, (None, 0, 0))(row["gains"], row["trial"], row["coordinates"])
+        return lanes.vmap(one, (None, 0, 0), whole=montecarlo.by_kernel())(
+            row["gains"], row["trial"], row["coordinates"]
+        )
 
     first = jax.tree.map(lambda v: v[0, 0, 0], {name: rows[name] for name in ("trial", "coordinates")})
     result = jax.eval_shape(one, rows["gains"][0, 0], first["trial"], first["coordinates"])
@@ -193,7 +195,7 @@ def _sloped(
         shifts = jax.tree.map(lambda v: jnp.moveaxis(v, 1, 0), row["shifts"])
         fixed = {name: v for name, v in row["coordinates"].items() if name not in shifts}
         free = {name: row["coordinates"][name] for name in shifts}
-        values, slopes = lanes.jvp(one, (None, 0, 0, 0))(
+        values, slopes = lanes.jvp(one, (None, 0, 0, 0), whole=montecarlo.by_kernel())(
             (row["gains"], row["trial"], fixed, free), (row["directions"], None, None, shifts)
         )
         return values, jnp.moveaxis(slopes, 0, 1)
