@@ -17,14 +17,12 @@ try:
 except NoDeviceError as error:
     sys.exit(f"nothing to measure: {error}")
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from common import medians, peak_rate, row, say, step_operations, steps, study
 
-from ptsmc_jax.batching import kernel, lanes
+from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from tuning.search.gains import with_gains
 
@@ -46,16 +44,14 @@ def primal(ready, trials: int):
 def slopes(ready, trials: int):
     """Metrics and their slopes along eta, by scan and by kernel."""
 
-    def along(trial, eta):
-        parts = with_gains(ready.parts, {"eta": eta})
-        return montecarlo.one(parts, ready.dispersion, jnp.uint32(0), trial).metrics
+    def one(eta, trial):
+        return montecarlo.one(with_gains(ready.parts, {"eta": eta}), ready.dispersion, jnp.uint32(0), trial).metrics
 
-    def both(trial):
-        eta = ready.parts.controller.eta
-        return jax.jvp(partial(along, trial), (eta,), (jnp.ones_like(eta),))
+    def flight(whole: bool):
+        both = jax.jit(lanes.jvp(one, (None, 0), whole=whole))
+        return lambda: both((ready.parts.controller.eta, jnp.arange(trials, dtype=jnp.uint32)), (jnp.ones(1), None))
 
-    numbers = jnp.arange(trials, dtype=jnp.uint32)
-    return {name: partial(jax.jit(way(both)), numbers) for name, way in (("scan", lanes.vmap), ("kernel", kernel.vmap))}
+    return {"scan": flight(False), "kernel": flight(True)}
 
 
 def main(largest: int) -> None:

@@ -18,7 +18,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
 from ptsmc_jax import scenario
-from ptsmc_jax.batching import kernel
+from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.clock import Anchored
@@ -86,7 +86,7 @@ def step_operations(ready: Study) -> int:
     def fly(trial):
         return montecarlo.one(ready.parts, ready.dispersion, jnp.uint32(0), trial).metrics
 
-    traced = jax.make_jaxpr(kernel.vmap(fly))(jnp.arange(kernel.BLOCK, dtype=jnp.uint32))
+    traced = jax.make_jaxpr(lanes.vmap(fly, whole=True))(jnp.arange(kernel.BLOCK, dtype=jnp.uint32))
     (body,) = loops(traced.jaxpr)
     return count(body)
 

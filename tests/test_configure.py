@@ -150,6 +150,18 @@ def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_gpu_is_looked_for_as_jax_does_by_itself(tmp_path):
+    """Asked for by the name "gpu", JAX wants every maker's, and finds none where one of them is missing."""
+    code = (
+        "import jax; jax.default_backend = lambda: 'gpu'\n"
+        "from ptsmc_jax.configure import configure; configure(device='gpu', cache=None, fast=False)\n"
+        "print(jax.config.jax_platforms, len(jax.devices()) > 0)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "tpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("None True\n", "")
+
+
 def test_a_command_flies_where_the_environment_has_jax_look_for_faults(tmp_path):
     """In code of a user's own: it stops at the NaN of a metric that a run lacks, at a number that a run begins with."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
