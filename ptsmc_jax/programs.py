@@ -32,13 +32,14 @@ from ptsmc_jax import configure
 
 KEPT = 400  # programs; those not used for longest make room
 # for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
-# compile in half the time besides, and run faster, at this level; jaxlib 0.11 has no older ones any more
-OLDER_EMITTERS = jaxlib.version.__version_info__ < (0, 11)
-QUICKLY = {
-    "xla_backend_optimization_level": 0,
-    **({"xla_cpu_use_fusion_emitters": False} if OLDER_EMITTERS else {}),
-    "xla_cpu_parallel_codegen_split_count": 1,
-}
+# compile in half the time besides, and run faster, at this level. jaxlib 0.11 has newer ones only, which abort on some
+# fusions of several outputs (batched products with arrays of other shapes), and here nothing is gained by these
+_SAFELY = (
+    {"xla_cpu_use_fusion_emitters": False}
+    if jaxlib.version.__version_info__ < (0, 11)
+    else {"xla_disable_hlo_passes": "cpu_multi_output_fusion"}
+)
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1, **_SAFELY}
 OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files
 PLAIN = (int, float, str, bool, bytes, type(None))
 

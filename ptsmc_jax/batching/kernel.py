@@ -32,13 +32,16 @@ LARGEST = 1024  # entries of an array: there are none but those taken apart
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
 # what `components` has a rule for, and the kernel's compiler has none
 _UNKNOWN = set(
-    """complex conj copy copy_p digamma eq_to erf erfc imag le_to lgamma log2 lt_to one_minus_square real
-    reduce_precision round""".split()
+    """complex conj copy copy_p digamma eq_to erf erfc imag le_to lgamma lt_to real reduce_precision
+    round""".split()
 )
 
 
-def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, ...], interpret: bool) -> list:
+def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, ...], interpret: bool) -> list | None:
     """The last carries of a `lax.scan`, each an object array of components (*lead).
+
+    None: it is no work for a kernel, being short, or the same in all trials, or stacking results, or running backward,
+    or going through what differs from trial to trial.
 
     Args:
         params: the scan's.
@@ -47,16 +50,15 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
         lead: (trials,), or (directions, trials) of slopes: each direction is flown by itself.
         interpret: evaluated by JAX on any device, slowly, for tests.
 
-    Raises NotImplementedError at what a kernel cannot do: primitives that its compiler lacks, loops of unknown length,
-    long ones that stack results, run backward, or go through what differs from trial to trial; and at short ones,
-    which are no work for one.
+    Raises NotImplementedError at what a kernel cannot do: primitives that its compiler lacks, arrays of more than
+    `LARGEST` entries, and inside of it loops of unknown length, or long ones that stack results or run backward.
     """
     body, length, inputs = params["jaxpr"], params["length"], params["jaxpr"].jaxpr.invars
     carried = of_scan(params, inputs)[1]
     if length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carried) or not any(varies):
-        raise NotImplementedError("a kernel flies long loops that run forward and stack no results")
+        return None
     if any(map(_by_trial, of_scan(params, values)[2])):
-        raise NotImplementedError("a kernel's loop goes through what is equal in all trials")
+        return None
     *directions, trials = lead
     blocks, each = -(-trials // BLOCK), math.prod(directions)
     numbers, rows, ends = _Numbers(each), _Rows(), _Rows()

@@ -25,7 +25,7 @@ from ptsmc_jax.batching.packed import Packed
 
 
 class LanesWarning(UserWarning):
-    """A primitive without a rule went through `jax.vmap`: right, but slower."""
+    """A primitive without a rule went through `jax.vmap`, or a loop was flown step by step: right, but slower."""
 
 
 def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bool = False) -> Callable:
@@ -136,8 +136,8 @@ class _Lanes:
         self.alike = components.Alike()
 
     def inside(self) -> "_Lanes":
-        """The same in a function that JAX traces by itself: what is computed there belongs to it alone."""
-        return _Lanes(self.trials, self.strict, self.directions, self.whole)
+        """The same in a function that JAX traces by itself: what is computed there belongs to it alone, also a loop."""
+        return _Lanes(self.trials, self.strict, self.directions)
 
     def evaluate(self, closed: Any, args: Sequence) -> list:
         """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
@@ -222,9 +222,12 @@ class _Lanes:
         differs = settle(body.jaxpr, fixed, _which(init), rowed)
         if self.whole:
             try:
-                return self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], differs)
-            except NotImplementedError:  # it is flown step by step
-                pass
+                whole = self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], differs)
+            except NotImplementedError as error:
+                warnings.warn(f"a loop is flown step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
+                whole = None
+            if whole is not None:
+                return whole
         outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
         state, row = Packed(carried_in, differs, self.leads), Packed(gone_through, rowed, self.leads)
         out = Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
@@ -253,13 +256,15 @@ class _Lanes:
         stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
         return [*state.unpack(last), *stacked]
 
-    def in_one_kernel(self, params: Any, values: list, differs: Sequence[int]) -> list:
-        """A scan by `kernel.scan`."""
+    def in_one_kernel(self, params: Any, values: list, differs: Sequence[int]) -> list | None:
+        """A scan by `kernel.scan`; None: it is none for a kernel."""
         from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
 
         lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
         interpret = jax.default_backend() == "cpu"
         last = kernel.scan(params, values, [own & TRIAL for own in differs], lead, interpret)
+        if last is None:
+            return None
         carried = of_scan(params, params["jaxpr"].jaxpr.invars)[1]
         packed = Packed(carried, differs, self.leads)
         return packed.unpack([packed.of_all(k, parts) for k, parts in enumerate(last)])

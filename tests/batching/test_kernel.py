@@ -77,7 +77,7 @@ def kernels(monkeypatch):
 
     def counted(params, *rest):
         results = scan(params, *rest)
-        made.append(params["length"])
+        made.extend([] if results is None else [params["length"]])
         return results
 
     monkeypatch.setattr(kernel, "scan", counted)
@@ -248,20 +248,35 @@ def forward(step, length=9):
 @pytest.mark.parametrize(
     "function",
     [
-        forward(lambda c, n: jax.lax.while_loop(lambda v: v < 9.0, lambda v: v + 1.0, c)),
-        forward(lambda c, n: jnp.sum(jax.lax.scan(lambda v, _: (v + n, v), c, None, 300)[1])),
-        forward(lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0]),
-        forward(lambda c, n: jax.lax.erf(c)),
-        forward(lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0]),
-        forward(lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1))),
         forward(lambda c, n: c + 1.0, 8),
         lambda n: jnp.sum(jax.lax.scan(lambda c, _: (c + n, c), n, None, 100)[1]),
         lambda n: jax.lax.scan(lambda c, k: (c + k, None), n, jnp.arange(9, dtype=n.dtype), reverse=True)[0],
         lambda n: jax.lax.scan(lambda c, k: (c + k, None), 0.0, n * jnp.arange(9.0))[0],
+        lambda n: jax.lax.scan(lambda c, k: (c + k, None), 0.0, jnp.arange(9.0))[0] + n,
     ],
-    ids="while stacks backward erf sort large short all_stacked all_backward through".split(),
+    ids="short stacked backward through alike".split(),
 )
-def test_what_a_kernel_cannot_do_is_flown_step_by_step(function, kernels, monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
+def test_what_is_no_work_for_a_kernel_stays_a_scan(function, kernels):
     np.testing.assert_allclose(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
+    assert kernels == []
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        (lambda c, n: jax.lax.while_loop(lambda v: v < 9.0, lambda v: v + 1.0, c), "no rule for the primitive `while`"),
+        (lambda c, n: jnp.sum(jax.lax.scan(lambda v, _: (v + n, v), c, None, 300)[1]), "no results of 300 steps"),
+        (lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0], "run forward"),
+        (lambda c, n: jax.lax.erf(c), "compiler lacks the primitive `erf`"),
+        (lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0], "no rule for the primitive `sort`"),
+        (lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1)), "no rule for the primitive"),
+    ],
+    ids="while stacked backward erf sort large".split(),
+)
+def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kernels, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
+    function = forward(step)
+    with pytest.warns(lanes.LanesWarning, match=f"step by step, which may be slow: .*{said}"):
+        got = lanes.vmap(function, whole=True)(NUMBERS)
+    np.testing.assert_allclose(got, jax.vmap(function)(NUMBERS), rtol=1e-14)
     assert kernels == []
