@@ -290,6 +290,8 @@ def blocks(fly: Callable, trials: Any) -> Any:
 
 def spread(function: Callable, shared: Any, devices: int) -> Any:
     """function(shared) with the first axes of `shared`, and of the results, shared out over that many devices."""
+    if devices == 1:
+        return function(shared)
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
     axis = PartitionSpec("device")
     return jax.shard_map(function, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)(shared)
