@@ -64,9 +64,11 @@ def configure(
     devices: number of host devices, all cores that this process may use if None; cache: folder of the compile cache,
     None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
     that make loops 2 to 15 times as fast forward, and reverse mode through them ten times as slow: pass False where
-    you need it, or where the compiler of jax 0.10.2 aborts with them, as it does on some code of one's own that
-    scatters into several arrays under vmap. They are tried out in a process of its own, once for each version of JAX
-    and processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
+    you need it, or where the compiler (of jax 0.10.2 and 0.11.2) aborts with them, as it does on some code of one's own
+    that scatters into several arrays under vmap (or leave out for that program alone what it aborts in:
+    `jax.jit(function, compiler_options={"xla_disable_hlo_passes": "cpu_multi_output_fusion"})`). They are tried out in
+    a process of its own, once for each version of JAX and processor where there is a cache; those that are refused, or
+    give other numbers, are left out with a warning.
     XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
     first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
     of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in

@@ -220,16 +220,12 @@ class _Lanes:
         consts, carried = [_apart(value) for value in consts], len(init)
         fixed, rowed = _which(consts), _which(xs)
         differs = settle(body.jaxpr, fixed, _which(init), rowed)
-        if self.whole:
-            try:
-                whole = self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], differs)
-            except NotImplementedError as error:
-                warnings.warn(f"a loop is flown step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
-                whole = None
-            if whole is not None:
-                return whole
+        state = Packed(carried_in, differs, self.leads)
+        whole = self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], state) if self.whole else None
+        if whole is not None:
+            return whole
         outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
-        state, row = Packed(carried_in, differs, self.leads), Packed(gone_through, rowed, self.leads)
+        row = Packed(gone_through, rowed, self.leads)
         out = Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
 
         def rows(value: Any, shape: tuple[int, ...], differs: int) -> Any:
@@ -256,18 +252,18 @@ class _Lanes:
         stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
         return [*state.unpack(last), *stacked]
 
-    def in_one_kernel(self, params: Any, values: list, differs: Sequence[int]) -> list | None:
-        """A scan by `kernel.scan`; None: it is none for a kernel."""
+    def in_one_kernel(self, params: Any, values: list, state: Packed) -> list | None:
+        """The last carries of a scan by `kernel.scan`; None: it is no kernel, or cannot be one, which is told."""
         from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
 
         lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
-        interpret = jax.default_backend() == "cpu"
-        last = kernel.scan(params, values, [own & TRIAL for own in differs], lead, interpret)
-        if last is None:
+        varies, interpret = [own & TRIAL for own in state.differs], jax.default_backend() == "cpu"
+        try:
+            last = kernel.scan(params, values, varies, lead, interpret)
+        except NotImplementedError as error:
+            warnings.warn(f"a loop is flown step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
             return None
-        carried = of_scan(params, params["jaxpr"].jaxpr.invars)[1]
-        packed = Packed(carried, differs, self.leads)
-        return packed.unpack([packed.of_all(k, parts) for k, parts in enumerate(last)])
+        return last and state.unpack([state.of_all(k, parts) for k, parts in enumerate(last)])
 
     def _stacked(self, y: Any, shape: tuple[int, ...], differs: int, length: int) -> Any:
         """What a scan stacks, components of (time, *lead), or (time, *lead, *shape): a lane of (time, *shape)."""
