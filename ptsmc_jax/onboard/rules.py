@@ -1,5 +1,6 @@
 """What each elementwise primitive is in C."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -95,6 +96,9 @@ ELEMENTWISE: dict[str, Callable] = {
     "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
     "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
     "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
+    "log2": lambda pool, params, kind, x: pool.make(  # as XLA does it
+        "mul", pool.make("log", x), pool.constant(1.0 / math.log(2.0), REAL)
+    ),
     "one_minus_square": lambda pool, params, kind, x: pool.make(
         "mul", *(pool.make(op, pool.constant(1, kind), x, kind=kind) for op in ("add", "sub")), kind=kind
     ),

@@ -72,6 +72,7 @@ ELEMENTWISE: dict[str, tuple] = {
     "arithmetic with constants": (lambda x: (x + FIXED, FIXED * x, FIXED / x, x**FIXED), POSITIVE),
     "matrix and scalar": (lambda m, s: (m * s, m + 1, jnp.maximum(m, s)), M, S),
     "exponentials": (lambda x: (jnp.exp(x), jnp.exp2(x), jnp.expm1(x), jnp.log(x), jnp.log1p(x)), POSITIVE),
+    "logarithm of two": (jnp.log2, POSITIVE),
     "trigonometry": (lambda x: (lax.sin(x), lax.cos(x), lax.tan(x), lax.asin(x), lax.acos(x), lax.atan(x)), POSITIVE),
     "hyperbolics": (lambda x: (jnp.sinh(x), jnp.cosh(x), jnp.tanh(x), jnp.arcsinh(x), jnp.arctanh(x)), POSITIVE),
     "arccosh": (lambda x: jnp.arccosh(1 + x), POSITIVE),

@@ -47,7 +47,11 @@ def tabled(x):
 
 FUNCTIONS = {
     "elementary": (lambda x: (jnp.sin(x) * jnp.cos(x) + jnp.tan(x), jnp.exp(x), jnp.tanh(x), jnp.arctan(x)), X),
-    "roots": (lambda x: (jnp.sqrt(x), jnp.cbrt(x), jnp.log(x), jnp.log1p(x), jnp.expm1(-x), x**0.3), POSITIVE),
+    "slopes of tanh": (lambda x: jax.jvp(jnp.tanh, (x,), (jnp.ones_like(x),)), POSITIVE),
+    "roots": (
+        lambda x: (jnp.sqrt(x), jnp.cbrt(x), jnp.log(x), jnp.log1p(x), jnp.log2(x), jnp.expm1(-x), x**0.3),
+        POSITIVE,
+    ),
     "signs": (lambda x: (jnp.sign(x), jnp.abs(x), jnp.floor(x), jnp.ceil(x), jnp.round(2.0 * x), -x), X),
     "powers": (lambda x: (x**2, x**3, x**5, x**-2, 1.0 / x, x**7), X),
     "limits": (lambda x: (jnp.clip(x, -0.5, 0.5), jnp.maximum(x, 0.1), jnp.minimum(x, x[::-1])), X),
