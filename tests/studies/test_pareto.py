@@ -173,6 +173,14 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
+def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
+    told = []
+    monkeypatch.setattr(pareto, "_step", lambda *_: None)
+    rungs = [("peak torque 0.2", None), ("peak torque 0.4", None)]
+    assert pareto.climbed(rungs, [np.zeros(1)], None, lambda what, *_: told.append(what)) == {}
+    assert told == [f"ladder, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("stage", ["least torque: searching", "ladder"])
 def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):

@@ -113,7 +113,8 @@ def trace(
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
-    best = apart(climbed([under(limit) for limit in ladder], [free.share, least.share], posed, tell))
+    rungs = [(f"peak torque {limit:.3g}", under(limit)) for limit in ladder]
+    best = apart(climbed(rungs, [free.share, least.share], posed, tell))
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
@@ -168,16 +169,20 @@ def uninterrupted(outcome: Search) -> Search:
     return outcome
 
 
-def climbed(ladder: Sequence[Problem], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
+def climbed(
+    ladder: Sequence[tuple[str, Problem]], known: list[np.ndarray], posed: posing.Posed, tell: Report
+) -> dict[int, Best]:
     """What is found on each rung, down the ladder and up again, each from what is known by then.
 
-    known: shares of gains, (gains,) each. A rung on which no gains keep the limits is left out.
+    ladder: what each rung is called, and its problem. known: shares of gains, (gains,) each. A rung on which no gains
+    keep the limits is left out.
     """
     best: dict[int, Best] = {}
     rungs = [*range(len(ladder) - 1, -1, -1), *range(len(ladder))]
     for done, k in enumerate(rungs):
-        tell("ladder", done, len(rungs), np.nan, 0.0)
-        step = _step(posed, ladder[k], np.unique(np.asarray(known), axis=0))
+        name, problem = ladder[k]
+        tell(f"ladder, {name}", done, len(rungs), np.nan, 0.0)
+        step = _step(posed, problem, np.unique(np.asarray(known), axis=0))
         if step is not None and (k not in best or step.f < best[k].f):
             best[k] = step
             known.append(step.share)

@@ -107,11 +107,13 @@ def trace(
     posed = posing.pose(_limited(scenario, limits[-1]), seed, journal)
     ladder, shares = [], []
     for limit in limits:
-        report = headed(tell, f"|S| at most {limit:g} dB" if limit < NONE else "no limit on |S|")
+        name = f"|S| at most {limit:g} dB" if limit < NONE else "no limit on |S|"
         starts = pareto.FEWER if ladder else scenario.search.starts
-        searched = posed.search(_under(posed.problem, limit), posed.own, starts, judged=False, report=report)
+        searched = posed.search(
+            _under(posed.problem, limit), posed.own, starts, judged=False, report=headed(tell, name)
+        )
         outcome = pareto.uninterrupted(searched)
-        ladder.append(outcome.problem)
+        ladder.append((name, outcome.problem))
         shares.append(outcome.share)
     best = pareto.climbed(ladder, shares, posed, tell)
     apart, fresh_seed, robust, flown = pareto.apart(best), judging.seed_of_judge(seed), [], 0

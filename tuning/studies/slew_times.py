@@ -116,7 +116,8 @@ def trace(
         report = headed(tell, f"{times[k]:g} s")
         outcome = posed.search(ladder[k], posed.own, pareto.FEWER, (), judged=False, report=report)
         shares.append(pareto.uninterrupted(outcome).share)
-    best = pareto.climbed(ladder, shares, posed, tell)
+    rungs = [(f"{t_f:g} s", problem) for t_f, problem in zip(times, ladder, strict=True)]
+    best = pareto.climbed(rungs, shares, posed, tell)
     fresh_seed, slews = judging.seed_of_judge(seed), []
     ready = study(judging.as_flown(base), reach=posing.reach(base, base.search, t_f=times[-1]))
     count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements)) if best else 0
