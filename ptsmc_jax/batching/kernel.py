@@ -122,7 +122,7 @@ def _held_as(kind: np.dtype) -> str:
     return "int32" if kind == np.dtype(bool) else np.dtype(kind).name
 
 
-def _named(names: Iterable[str], refs: Sequence) -> tuple[dict[str, Any], Sequence]:
+def _named(names: Iterable[str], refs: tuple) -> tuple[dict[str, Any], tuple]:
     """The first of these by their names, and the others."""
     named = dict(zip(names, refs, strict=False))
     return named, refs[len(named) :]

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -176,8 +177,9 @@ def replace_tune(made, **changes):
 def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
     told = []
     monkeypatch.setattr(pareto, "_step", lambda *_: None)
-    rungs = [("peak torque 0.2", None), ("peak torque 0.4", None)]
-    assert pareto.climbed(rungs, [np.zeros(1)], None, lambda what, *_: told.append(what)) == {}
+    problem: Any = None
+    rungs = [("peak torque 0.2", problem), ("peak torque 0.4", problem)]
+    assert pareto.climbed(rungs, [np.zeros(1)], problem, lambda what, *_: told.append(what)) == {}
     assert told == [f"ladder, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
 
 
