@@ -124,6 +124,16 @@ def robust(limit, rms, **margins):
     }  # fmt: skip
 
 
+def test_a_limit_that_fresh_trials_break_is_told_and_not_set_beside_none():
+    loose, broken = robust(None, 1e-5), robust(6.0, 2e-5, gain_margin=-100.0, modulus_margin=100.0)
+    told = {"plant": "chain", "robust": [loose, broken, robust(4.0, 3e-5, modulus_margin=4.02)], "idle": [],
+            "without": [], "requirements": []}  # fmt: skip
+    assert list(front_sentences.robust_lines(told)) == [
+        "with |S| at most 4 dB the RMS window error is 3e-05 x1, 3 times that without a limit",
+        "the gains found for |S| at most 6 dB do not keep it on the fresh trials: 100 dB",
+    ]
+
+
 def test_limits_without_gains_and_loops_without_margins_are_told():
     loose = robust(None, 1e-5, gain_margin=-0.3, modulus_margin=100.0)
     told = {"plant": "spacecraft", "robust": [loose, robust(6.0, 2e-5)], "idle": [60.0, 20.0], "without": [3.0],

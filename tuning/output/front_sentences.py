@@ -158,7 +158,8 @@ def robust_lines(summary: Summary) -> Iterator[str]:
     loose = next((one for one in found if one["limit"] is None), None)
     if loose is not None and loose["margins"]["gain_margin"] is not None and loose["margins"]["gain_margin"] <= 0.0:
         yield "without a limit on |S| not every loop is stable: the best error lies beyond the border of stability"
-    limited = [one for one in found if one["limit"] is not None and one["rms"]]
+    limits = [one for one in found if one["limit"] is not None]
+    limited = [one for one in limits if one["rms"] and _keeps(one)]
     if limited and loose is not None and loose["rms"]:
         usual = min(limited, key=lambda one: abs(one["limit"] - margin_sentences.ENOUGH["gain_margin"]))
         error = valued(usual["rms"], "window_error", summary["plant"])
@@ -166,6 +167,12 @@ def robust_lines(summary: Summary) -> Iterator[str]:
             f"with |S| at most {usual['limit']:g} dB the RMS window error is {error}, "
             f"{sentences.ratio(usual['rms'] / loose['rms'])} times that without a limit"
         )
+    for one in limits:
+        if not _keeps(one):
+            yield (
+                f"the gains found for |S| at most {one['limit']:g} dB do not keep it on the fresh trials: "
+                f"{digits(one['margins']['modulus_margin'], '.3g', 'no value')} dB"
+            )
     if summary["idle"]:
         yield f"the gains found for a looser limit keep {_listed(summary['idle'])} dB too"
     if None in summary["without"]:
@@ -174,6 +181,12 @@ def robust_lines(summary: Summary) -> Iterator[str]:
         yield f"no gains found keep |S| at most {_listed(summary['without'])} dB on the training trials"
     if summary["requirements"] and not any(one["meets"] for one in found):
         yield "for none of these limits do gains meet every requirement on the fresh trials"
+
+
+def _keeps(one: Summary) -> bool:
+    """Whether the fresh trials' loops keep the limit that gains were found for, within 1 %."""
+    left = one["margins"]["modulus_margin"]
+    return left is not None and left <= 1.01 * one["limit"]
 
 
 def _listed(limits: list[float]) -> str:
