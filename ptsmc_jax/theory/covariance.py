@@ -1,17 +1,16 @@
 """What noise alone does to accuracy and torque: the covariance of the linearised loop, without flying a trial."""
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import error_floor, linear
 
-ROUNDS = 24  # at most, in which the mean slope of a sign and the noise that it leaves of s are found
+ROUNDS = 8  # at most, in which the mean slope of a sign is found where s is not zero in the quiet run
 BEYOND = 1e60  # stands for a size of s that is no number any more
+FLAT = 1e30  # width of a sign without slope
 
 
 class Noise(NamedTuple):
@@ -35,28 +34,43 @@ def predicts(parts: Parts) -> bool:
 def noise(parts: Parts) -> Noise:
     """Linear covariance along the nominal run of sampled parts that it `predicts`: what noise, bias, random walk cost.
 
-    Behind an attitude filter its steady state is known at t = 0. The smooth sign counts with the mean slope that it has
-    under the noise of s, E[sech^2(s / width)] / width (statistical linearisation): a few rounds find both.
+    Behind an attitude filter its steady state is known at t = 0. The smooth sign counts in each period with the mean
+    slope that it has under the noise of s there, E[sech^2(s / width)] / width (statistical linearisation), which the
+    noise before it makes.
     """
     run = linear.nominal_jit(parts)
-    sizes = _covariance(parts, run)
+    ticks = jax.tree.map(np.asarray, run.period.now)
+    lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # beyond rounding
     flown = getattr(parts.controller, "sign_width", None)
     if flown is None:
-        return sizes
-    width, apart, low, high = float(flown), np.inf, 0.0, np.inf  # low, high: between which it lies
+        return _covariance(parts, ticks, lasting, linear.opened_in(parts, run, lasting))[0]
+    flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT))
+    noises = _State(parts, flat).seen_noise
+    widths = np.asarray([_mean_width(float(flown), _size((by @ noises) ** 2)) for by in flat.s_direct])
     for _ in range(ROUNDS):
-        left = sizes.s if np.isfinite(sizes.s) else BEYOND
-        before, wanted = apart, _mean_width(float(flown), left)
-        if abs(wanted - width) <= 0.01 * wanted or high < 1.001 * low:
+        sloped = linear.opened_in(parts, run, lasting, widths)
+        sizes, found = _covariance(parts, ticks, lasting, flat, _Sign(sloped.loop, widths, float(flown)))
+        if np.allclose(found, widths, rtol=0.01, atol=0.0):
             break
-        low, high = (width, high) if wanted > width else (low, width)
-        apart = abs(np.log(wanted / width)) if width > 0.0 else np.inf
-        # a slope that much noise leaves may let the loop come to rest, and the one that little leaves may not
-        halved = low > 0.0 and high < np.inf and (apart > 0.1 * before or not low < wanted < high)
-        width = float(np.sqrt(low * high)) if halved else wanted
-        law = replace(parts.controller, sign_width=jnp.full_like(parts.controller.sign_width, width))
-        sizes = _covariance(replace(parts, controller=law), run)
+        widths = found
     return sizes
+
+
+class _Sign(NamedTuple):
+    """The loops with a smooth sign of these widths, (periods,), and the width that is flown."""
+
+    loops: Any
+    widths: np.ndarray
+    flown: float
+
+    def loop(self, flat: Any, j: int, sigma: float) -> tuple[Any, float]:
+        """The loop of a period under this noise of s, and the sign's width there: slopes of u go by 1/width.
+
+        That is exact where s is zero in the quiet run, and else as near as the widths of these loops are.
+        """
+        width = _mean_width(self.flown, min(sigma, BEYOND))
+        share = self.widths[j] / width if width > 0.0 else 1.0
+        return jax.tree.map(lambda a, b: a + share * (b[j] - a), flat, self.loops), width
 
 
 def _mean_width(width: float, sigma: float) -> float:
@@ -95,7 +109,8 @@ class _State:
         self.size = before + reading.own.size + self._m
         # what the computer sees, by the state and by the noise
         from_readings = np.linalg.pinv(reading.rows[:, :k])
-        self._seen = _Rows(np.zeros((k, self.size)), from_readings * reading.noise)
+        self.seen_noise = from_readings * reading.noise  # (k, readings) of this sample alone, 1 sigma
+        self._seen = _Rows(np.zeros((k, self.size)), self.seen_noise)
         self._seen.state[:, :k] = np.eye(k)
         self._seen.state[:, self._own] = from_readings @ reading.rows[:, k:]
         # by how much the state moves by itself in a second, 1 sigma
@@ -135,24 +150,29 @@ class _State:
         return _Rows(state, noise)
 
 
-def _covariance(parts: Parts, run: linear.Nominal) -> Noise:
-    """The covariance propagated along the run, and what it makes of error, command and s."""
-    ticks = jax.tree.map(np.asarray, run.period.now)
+def _covariance(
+    parts: Parts, ticks: Any, lasting: np.ndarray, opened: linear.Opened, sign: _Sign | None = None
+) -> tuple[Noise, np.ndarray]:
+    """The covariance propagated along the run, and what it makes of error, command and s; widths of the sign."""
     lengths = ticks.t_next - ticks.t
-    lasting = np.flatnonzero(lengths > 1e-9 * float(parts.period))  # beyond rounding
-    opened = linear.opened_in(parts, run, lasting)
     state = _State(parts, opened)
     p = state.start()
-    squares, torque = np.zeros((len(lasting), 2)), 0.0  # of the error and of s
+    squares, torque, widths = np.zeros((len(lasting), 2)), 0.0, np.zeros(len(lasting))  # of the error and of s
     for j, index in enumerate(lasting):
         row = jax.tree.map(lambda v, j=j: v[j], opened)
-        command = state.rows(row.loop.command, row.loop.direct)
-        s = state.rows(row.s_command, row.s_direct)
+        s, loop = state.rows(row.s_command, row.s_direct).covariance(p), row.loop
+        squares[j] = np.trace(row.error @ p[state.plant, state.plant] @ row.error.T), np.mean(np.diag(s))
+        if sign is not None:
+            loop, widths[j] = sign.loop(loop, j, float(np.sqrt(squares[j, 1])))
+        command = state.rows(loop.command, loop.direct)
         torque = max(torque, float(np.sqrt(np.diag(command.covariance(p)).max())))
-        squares[j, 0] = np.trace(row.error @ p[state.plant, state.plant] @ row.error.T)
-        squares[j, 1] = np.mean(np.diag(s.covariance(p)))
-        p = state.moved(row.loop, command).covariance(p) + np.diag((state.drift * lengths[index]) ** 2)
+        p = state.moved(loop, command).covariance(p) + np.diag((state.drift * lengths[index]) ** 2)
     t, t_f = ticks.t[lasting], float(parts.controller.t_f)
     in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
-    error, s = np.sqrt(np.mean(squares[in_window], axis=0))
-    return Noise(float(error), torque, float(s))
+    error, s_size = np.sqrt(np.mean(squares[in_window], axis=0))
+    return Noise(float(error), torque, float(s_size)), widths
+
+
+def _size(squares: np.ndarray) -> float:
+    """RMS over components, (m,), from the shares (m, k) of what each is made of."""
+    return float(np.sqrt(squares.sum(axis=1).mean()))

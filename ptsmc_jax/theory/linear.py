@@ -15,7 +15,6 @@ over its interval is taken, see `Sensors.in_step` too.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -183,23 +182,28 @@ def opened(parts: Parts, during: Nominal) -> Opened:
 TOGETHER = 32  # periods that one call of the compiled program opens
 
 
-def opened_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Opened:
+def opened_in(parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None) -> Opened:
     """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s].
 
-    By one program, however many they are and however many the run has.
+    By one program, however many they are and however many the run has. widths: of the law's smooth sign in each.
     """
     parts = replace(parts, clock=clock.flight(1.0, 1.0))
-    run = jax.tree.map(np.asarray, run)
+    listed = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
     calls = []
     for k in range(0, len(indices), TOGETHER):
-        some = np.resize(indices[k : k + TOGETHER], TOGETHER)
-        calls.append(jax.tree.map(np.asarray, _opened(parts, jax.tree.map(lambda v, some=some: v[some], run))))
+        some = np.resize(np.arange(k, min(k + TOGETHER, len(indices))), TOGETHER)
+        calls.append(jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v, some=some: v[some], listed))))
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
-def _opened(parts: Parts, during: Nominal) -> Opened:
-    return jax.vmap(partial(opened, parts))(during)
+def _opened(parts: Parts, during: Nominal, widths: Array | None) -> Opened:
+    def one(during: Nominal, width: Any) -> Opened:
+        if width is None:
+            return opened(parts, during)
+        return opened(replace(parts, controller=replace(parts.controller, sign_width=width)), during)
+
+    return jax.vmap(one)(during, widths)
 
 
 def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:

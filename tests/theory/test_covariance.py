@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance
 from tests.helpers import FIRST_FLIGHT
 
@@ -81,33 +83,27 @@ def test_the_mean_slope_of_a_sign_under_noise_is_the_integral_over_it(width):
     assert covariance._mean_width(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2.0), rel=1e-12)
 
 
-@pytest.mark.parametrize("size", [1e-9, 1e-6])
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 3.0, 10.0])
-@pytest.mark.parametrize("steep", [0.0, 0.5, 0.9, 3.0, 40.0, 400.0])
-def test_the_noise_of_s_and_the_slope_of_the_sign_under_it_belong_together(size, share, steep, monkeypatch):
-    """What the mean slope leaves of s has this mean slope again, also where that of the least noise cannot be flown.
+def test_the_sign_has_the_slope_that_the_noise_of_its_moment_leaves_it():
+    """Command and s of 200 flown trials, 1 sigma, on the way and in hold; of s that is 25 times as noisy on the way.
 
-    s falls with the width, as steeply as where a loop becomes stable. Rounds without a bracket went to and fro there.
+    Each is known to 5 % (1 sigma), the largest of 160 to some 20 %. One slope for all, that of the hold, predicted 0.26
+    for 0.11.
     """
-    asked, flown = {"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}}, share * size
-    parts = scenario.study(scenario.from_tables({**asked, "controller": {"sign_width": flown}})).parts
-
-    def left(width):
-        grown = steep * np.log(8.0 * size / max(width, 1e-12))
-        return size * (1.0 + np.exp(grown)) if grown < 300.0 else np.nan  # beyond all numbers
-
-    def propagated(parts, run):
-        width = float(parts.controller.sign_width)
-        widths.append(width)
-        return covariance.Noise(0.0, 0.0, left(width))
-
-    widths: list[float] = []
-    monkeypatch.setattr(covariance, "_covariance", propagated)
-    monkeypatch.setattr(covariance.linear, "nominal_jit", lambda parts: None)
-    found = covariance.noise(parts)
-    assert found.s == left(widths[-1])
-    # to 1 %, where the rounds end, or as far as a thousandth of the width moves s
-    np.testing.assert_allclose(covariance._mean_width(flown, found.s), widths[-1], rtol=0.01 + 2e-3 * steep)
+    tables = {
+        "plant": {"kind": "chain", "order": 3, "x0": [0.1, 0.0, 0.0]},
+        "controller": {"t_f": 6.0, "delta": 1.5, "k1": 4.0, "sign_width": 0.01, "surface_rate": 2.0},
+        "observer": {"kind": "nonlinear", "gain": [3.0]},
+        "disturbance": {"kind": "random_walk", "density": [0.02]},
+        "loop": {"mode": "sampled", "period": 0.05, "t_end": 8.0, "window": 2.0},
+        "hardware": {"state_noise": [1e-3] * 3},
+    }
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    fly = jax.jit(jax.vmap(lambda k: rollout.simulate(parts, np.uint32(0), k, record=True)))
+    flown, expected = fly(np.arange(200, dtype=np.uint32)), covariance.noise(parts)
+    command, s, t = (np.asarray(v) for v in (flown.log.commanded, flown.log.s, flown.log.t))
+    np.testing.assert_allclose(expected.torque, command.std(axis=0).max(), rtol=0.2)
+    np.testing.assert_allclose(expected.s, np.sqrt(np.mean(s[:, t[0] >= 6.0].var(axis=0))), rtol=0.1)
+    assert s.std(axis=0).max() > 10.0 * expected.s
 
 
 @pytest.mark.long
