@@ -25,7 +25,7 @@ from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.scenario import Study
+from ptsmc_jax.scenario import Study, own_checks
 from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import Parts
@@ -84,12 +84,19 @@ class Campaign:
         return {} if self.plan is None else self.plan.origin(trials)
 
     def own_names(self) -> list[str]:
-        """Names of the metrics of one's own; raises ValueError where they are none that a row can hold."""
-        if self.own is None:
+        """Names of the metrics of one's own; raises ValueError where they fail, or are none that a row can hold."""
+        made = self.own
+        if made is None:
             return []
-        flown = jax.eval_shape(
-            lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=self.own)
-        )
+
+        def asked(result: Any, parts: Any) -> Any:
+            try:
+                return made(result, parts)
+            except Exception as error:
+                file = getattr(getattr(made, "__code__", None), "co_filename", "")
+                raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
+
+        flown = jax.eval_shape(lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=asked))
         own: Any = flown.own
         if not isinstance(own, dict) or not own or not all(isinstance(name, str) for name in own):
             raise ValueError(f"it returns {type(own).__name__}, but must return named numbers, a dict")

@@ -36,6 +36,13 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
         _draw(parts, dispersion, _Asked("dispersion.own", getattr(scenario.dispersion, "own", None)))
 
 
+def what_fails(error: Exception, file: str) -> str:
+    """What is wrong with code of one's own in this file that ended in an error while it was asked, or traced."""
+    if isinstance(error, _TRACED):
+        return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {_INSTEAD}"
+    return f"fails: {systems.failure(error, file)}"
+
+
 class _Asked:
     """Calls what a table's code names, and says what is wrong with it."""
 
@@ -49,12 +56,7 @@ class _Asked:
             _trace(function, args)
             return returned
         except Exception as error:
-            file = inspect.getsourcefile(self._made) or ""
-            told = f"fails: {systems.failure(error, file)}"
-            if isinstance(error, _TRACED):
-                told = (
-                    f"needs the value of a number that is known in flight only{systems.line(error, file)}; {_INSTEAD}"
-                )
+            told = what_fails(error, inspect.getsourcefile(self._made) or "")
             raise ScenarioError(f"{self._said} {method} {told}") from None
 
     def refused(self, method: str, returns: str, must: str) -> ScenarioError:

@@ -189,6 +189,15 @@ def test_metrics_of_ones_own_stand_in_the_rows():
         (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
         (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),  # with a plan
         (lambda result, parts: {}, "named numbers"),
+        (
+            lambda result, parts: {"x": 1 / 0},
+            r"it fails: ZeroDivisionError: division by zero \(line \d+ of test_campaign",
+        ),
+        (lambda result: {}, "it fails: TypeError: .* takes 1 positional argument but 2 were given"),
+        (
+            lambda result, parts: {"x": float(result.status)},
+            "it needs the value of a number that is known in flight only",
+        ),
     ],
 )
 def test_metrics_that_no_row_can_hold_are_refused(flown, made_of, said):
