@@ -47,12 +47,17 @@ def noise(parts: Parts) -> Noise:
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT))
     noises = _State(parts, flat).seen_noise
     widths = np.asarray([_mean_width(float(flown), _size((by @ noises) ** 2)) for by in flat.s_direct])
+
+    def with_slopes_of(widths: np.ndarray) -> tuple[Noise, np.ndarray]:
+        sloped = linear.opened_in(parts, run, lasting, widths).loop
+        return _covariance(parts, ticks, lasting, flat, _Sign(sloped, widths, float(flown)))
+
+    sizes, found = with_slopes_of(widths)
     for _ in range(ROUNDS):
-        sloped = linear.opened_in(parts, run, lasting, widths)
-        sizes, found = _covariance(parts, ticks, lasting, flat, _Sign(sloped.loop, widths, float(flown)))
         if np.allclose(found, widths, rtol=0.01, atol=0.0):
             break
         widths = found
+        sizes, found = with_slopes_of(widths)
     return sizes
 
 
