@@ -22,6 +22,7 @@ from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions.base import OWN
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -128,13 +129,14 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
     drawn = None  # what its trials would fly with then
     for name, values in plan.given.items():
         quantity = QUANTITIES[name]
-        if name in kinds:
+        columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
+        if not kinds.isdisjoint({name, OWN}):  # a draw of one's own may change any
             if drawn is None:
                 drawn = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
-            columns = quantity.columns(ready.parts)
-            usual = drawn.select(columns).to_numpy() if set(columns) <= set(drawn.columns) else np.zeros_like(values)
-        else:
-            usual = np.asarray(quantity.read(ready.parts))[None]
+            if set(columns) <= set(drawn.columns):
+                usual = drawn.select(columns).to_numpy()
+            elif name in kinds:
+                usual = np.zeros_like(values)
         if np.array_equal(np.broadcast_to(usual, values.shape), values):
             same.append(name)
     campaign = Campaign(ready, seed, own, plan.without(same))

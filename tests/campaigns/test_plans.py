@@ -94,6 +94,32 @@ def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(everything, tmp_
     assert of_plan(made, flown).fly(range(2)).equals(flown)  # and so are its rows again
 
 
+class Farther(ptsmc.Draw):
+    """Starts farther away, from what nothing else draws."""
+
+    count = 1
+
+    def at(self, c, parts):
+        """The parts with another initial state."""
+        return dataclasses.replace(parts, initial=parts.initial * (2.0 + 0.1 * c[0]))
+
+
+def test_a_written_plan_with_a_draw_of_ones_own_is_flown_as_written():
+    """The draw is not made again about what it made: the start was twice as far, the plan's angle refused."""
+    known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
+    drawn = ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}})
+    made = campaign.Campaign(scenario.study(drawn), SEED)
+    plan = made.draw(range(5)).drop("own_1")
+    assert plan["initial_x1"].n_unique() == 5
+    again = of_plan(made, plan)
+    assert again.plan is not None
+    assert not again.plan.given
+    assert_frame_equal(again.draw(range(5)).select(plan.columns), plan, check_exact=True)
+    other = of_plan(made, plan.drop("initial_angle").with_columns(initial_x1=pl.col("initial_x1") + 1.0))
+    assert other.plan is not None
+    assert set(other.plan.given) == {"initial_state"}
+
+
 @pytest.fixture(scope="module")
 def corners(everything):
     """A table that gives everything otherwise than it is drawn, and its rows."""
