@@ -77,10 +77,11 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
         vectors = {kind: _loaded(ref, len(rows.parts[kind])) for kind, ref in takes.items()}
         known = [v.of(vectors if isinstance(v, _Places) else tables) for v in given]
         last = _Inside(BLOCK, interpret).loop(body, length, of_scan(params, known), varies)
-        made = {kind: [] for kind in gives}
+        made: dict[str, list] = {}
         for value, of in zip(last, carried, strict=True):
             kind = _held_as(of.aval.dtype)
-            made[kind] += (jnp.broadcast_to(jnp.asarray(part, kind), (BLOCK,)) for part in value.parts.flat)
+            parts = (jnp.broadcast_to(jnp.asarray(part, kind), (BLOCK,)) for part in value.parts.flat)
+            made.setdefault(kind, []).extend(parts)
         for kind, ref in gives.items():
             _put(ref, made[kind])
 
@@ -150,9 +151,11 @@ class _Rows:
     def places(self, parts: Iterable, shape: tuple[int, ...], dtype: np.dtype) -> _Places:
         """Rows for these components of a value."""
         kind = _held_as(dtype)
-        rows = self.parts.setdefault(kind, [])
+        rows = self.parts.get(kind, [])
         first = len(rows)
         rows += parts
+        if rows:  # a value may have no components, and there is no table without rows
+            self.parts[kind] = rows
         return _Places(kind, object_array(shape, range(first, len(rows))), dtype == np.dtype(bool))
 
     def take(self, value: Lane, shape: tuple[int, ...], dtype: np.dtype) -> _Places:

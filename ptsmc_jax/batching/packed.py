@@ -14,7 +14,8 @@ class Packed:
     """How values are handed through JAX's loops and branches: lanes as tuples of components, large ones dense."""
 
     def __init__(self, variables: Sequence, differs: Sequence[int], leads: Sequence[tuple[int, ...]]):
-        self.shapes, self.differs, self.leads = [v.aval.shape for v in variables], differs, leads
+        self.shapes, self.kinds = ([getattr(v.aval, name) for v in variables] for name in ("shape", "dtype"))
+        self.differs, self.leads = differs, leads
 
     def pack(self, values: Sequence) -> tuple:
         """What JAX is handed for these values."""
@@ -45,6 +46,8 @@ class Packed:
         own = [part if part.ndim == len(axes) else part[0] for part in parts.flat]
         if differs & TRIAL:
             return tuple(own) if self.apart(shape, differs) else Lane(shape, object_array(shape, own)).dense(axes)
+        if not own:
+            return jnp.zeros((*self.leads[differs], *shape), self.kinds[k])
         first = [part[..., :1] if differs else part[0] for part in own]
         return jnp.stack(first, axis=-1).reshape((*self.leads[differs], *shape)) if shape else first[0]
 

@@ -235,14 +235,44 @@ def test_what_is_written_out_and_what_is_looped(kernels):
     got = lanes.vmap(function, whole=True)(*arguments)
     wanted = jax.vmap(function)(*arguments)
     assert sorted(kernels) == [15, 20, 50, 100]
-    for name, value in wanted.items():
-        for a, b in zip(jax.tree.leaves(got[name]), jax.tree.leaves(value), strict=True):
-            assert (a.shape, a.dtype) == (b.shape, b.dtype)
-            np.testing.assert_allclose(a, b, rtol=1e-14, err_msg=name)
+    same(got, wanted)
+
+
+def same(got, wanted):
+    for (where, a), b in zip(jax.tree.leaves_with_path(got), jax.tree.leaves(wanted), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        np.testing.assert_allclose(a, b, rtol=1e-14, err_msg=jax.tree_util.keystr(where))
 
 
 def forward(step, length=9):
     return lambda n: jax.lax.scan(lambda c, k: (step(c, n), None), n.astype(float), None, length)[0]
+
+
+def beside(*values):
+    """Loops that carry one of these beside a number, and let it differ from trial to trial or not."""
+
+    def function(n):
+        def of(value, own):
+            def step(carry, _):
+                return (carry[0] + n.astype(value.dtype) if own else carry[0], 0.5 * carry[1] + n), None
+
+            return jax.lax.scan(step, (value, n.astype(float)), None, 9)[0]
+
+        return [of(value, own) for value in values for own in (False, True)]
+
+    return function
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        beside(jnp.zeros(0), jnp.zeros((3, 0), jnp.int32)),
+    ],
+    ids=["carried"],
+)
+def test_arrays_without_entries_are_carried_and_summed(function, kernels):
+    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    assert set(kernels) == {9}
 
 
 @pytest.mark.parametrize(
