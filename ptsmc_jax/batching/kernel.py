@@ -297,9 +297,10 @@ class _Inside:
             return self.evaluate(inner, values)
         if name == "cond":
             return self.branch(params["branches"], values)
-        if name == "iota":
+        if name == "iota" or (components.covers(name) and not any(value.parts.size for value in values)):
+            nothing = [np.zeros(atom.aval.shape, atom.aval.dtype) for atom in eqn.invars]
             with jax.ensure_compile_time_eval():
-                return [_constant(components.bind(eqn, [])[0])]
+                return [_constant(out) for out in components.bind(eqn, nothing)]
         # spread anew for each equation: what was spread inside a branch or a loop is not known outside
         made = components.apply(eqn, values, components.Alike(), LARGEST) if components.covers(name) else None
         if made is not None:
@@ -315,12 +316,13 @@ class _Inside:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= MAPPED):
             consts, state = ([_lane(v) for v in part] for part in operands[:2])
+            stacked = body.jaxpr.outvars[carried:]
             rows = []
             for k in range(length):
                 results = self.evaluate(body, [*consts, *state, *(_row(x, k) for x in operands[2])])
                 state, row = results[:carried], results[carried:]
                 rows.append(row)
-            return [*state, *(_stacked(part) for part in zip(*rows, strict=True))]
+            return [*state, *(_stacked([row[k] for row in rows], of.aval.shape) for k, of in enumerate(stacked))]
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
         return self.loop(body, length, operands, settle(body.jaxpr, *map(_varies, operands)))
@@ -385,8 +387,8 @@ def _row(value: Any, k: Any) -> Lane:
     return Lane(shape, object_array(shape, rows[k] if isinstance(k, int) else (_chosen(k, each) for each in rows.T)))
 
 
-def _stacked(rows: Sequence[Lane]) -> Lane:
-    shape = (len(rows), *rows[0].shape)
+def _stacked(rows: Sequence[Lane], each: tuple[int, ...]) -> Lane:
+    shape = (len(rows), *each)
     return Lane(shape, object_array(shape, (part for row in rows for part in row.parts.flat)))
 
 

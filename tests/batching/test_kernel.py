@@ -267,8 +267,10 @@ def beside(*values):
     "function",
     [
         beside(jnp.zeros(0), jnp.zeros((3, 0), jnp.int32)),
+        forward(lambda c, n: c + jnp.sum(jnp.zeros((2, 0)) * n) + jnp.prod(jnp.zeros(0, bool))),
+        forward(lambda c, n: c + jnp.sum(jax.lax.map(lambda x: x * n, jnp.zeros(0)))),
     ],
-    ids=["carried"],
+    ids="carried reduced mapped".split(),
 )
 def test_arrays_without_entries_are_carried_and_summed(function, kernels):
     same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
