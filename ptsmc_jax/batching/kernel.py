@@ -301,6 +301,10 @@ class _Inside:
             nothing = [np.zeros(atom.aval.shape, atom.aval.dtype) for atom in eqn.invars]
             with jax.ensure_compile_time_eval():
                 return [_constant(out) for out in components.bind(eqn, nothing)]
+        if name == "select_n" and len(values) > 3:  # its compiler chooses between two
+            shape = eqn.outvars[0].aval.shape
+            each = zip(*(np.broadcast_to(value.parts, shape).flat for value in values), strict=True)
+            return [Lane(shape, object_array(shape, (_chosen(which, cases) for which, *cases in each)))]
         # spread anew for each equation: what was spread inside a branch or a loop is not known outside
         made = components.apply(eqn, values, components.Alike(), LARGEST) if components.covers(name) else None
         if made is not None:
@@ -316,13 +320,12 @@ class _Inside:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (carried == 0 and length <= MAPPED):
             consts, state = ([_lane(v) for v in part] for part in operands[:2])
-            stacked = body.jaxpr.outvars[carried:]
-            rows = []
+            every = []
             for k in range(length):
-                results = self.evaluate(body, [*consts, *state, *(_row(x, k) for x in operands[2])])
-                state, row = results[:carried], results[carried:]
-                rows.append(row)
-            return [*state, *(_stacked([row[k] for row in rows], of.aval.shape) for k, of in enumerate(stacked))]
+                every.append(self.evaluate(body, [*consts, *state, *(_row(x, k) for x in operands[2])]))
+                state = every[k][:carried]
+            stacked = enumerate(of.aval.shape for of in body.jaxpr.outvars[carried:])
+            return [*state, *(_stacked([step[carried + k] for step in every], shape) for k, shape in stacked)]
         if len(body.jaxpr.outvars) > carried:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
         return self.loop(body, length, operands, settle(body.jaxpr, *map(_varies, operands)))
@@ -350,7 +353,7 @@ class _Inside:
             chosen = lax.cond(index, cases[1], cases[0]) if index.dtype == bool else lax.switch(index, cases)
         else:
             which = index if index.dtype == bool else jnp.clip(index, 0, len(branches) - 1)
-            chosen = jax.tree.map(lambda *each: lax.select_n(which, *each), *(case() for case in cases))
+            chosen = jax.tree.map(lambda *each: _chosen(which, each), *(case() for case in cases))
         return _unpacked(chosen, shapes)
 
     def pack(self, values: Sequence, differs: Sequence[int]) -> tuple:

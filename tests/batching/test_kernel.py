@@ -156,6 +156,15 @@ def test_in_single_precision_it_is_the_scan_of_single_precision():
         np.testing.assert_allclose(got[name], wanted[name], rtol=0.0, atol=1e-6 * size, err_msg=name)
 
 
+def lowered(function, arguments, monkeypatch):
+    """Its trace, and the text of what it becomes for CUDA."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(kernel, "BLOCK", 128)
+    with on_a_gpu():
+        trace = jax.jit(lanes.vmap(function, whole=True)).trace(arguments)
+        return trace, trace.lower(lowering_platforms=("cuda",)).as_text()
+
+
 LOWERED = [(32, primal), (32, derivative), (64, primal), (64, derivative)]
 
 
@@ -163,11 +172,9 @@ LOWERED = [(32, primal), (32, derivative), (64, primal), (64, derivative)]
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_it_is_lowered_for_cuda_on_a_machine_without(bits, make, monkeypatch):
     """Components are read and written by few loads and stores: each takes its compiler through the whole kernel."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(kernel, "BLOCK", 128)
-    with jax.enable_x64(bits == 64), on_a_gpu():
-        trace = jax.jit(lanes.vmap(make(FLIGHT), whole=True)).trace(jnp.arange(256, dtype=jnp.uint32))
-        assert "triton" in trace.lower(lowering_platforms=("cuda",)).as_text()
+    with jax.enable_x64(bits == 64):
+        trace, text = lowered(make(FLIGHT), jnp.arange(256, dtype=jnp.uint32), monkeypatch)
+    assert "triton" in text
     (flown,) = (eqn for eqn in equations(trace.jaxpr) if eqn.primitive.name == "pallas_call")
     moved = [eqn for eqn in equations(flown.params["jaxpr"]) if eqn.primitive.name in ("get", "swap")]
     vectors = [eqn.primitive.name for eqn in moved if eqn.outvars[0].aval.shape]
@@ -291,6 +298,22 @@ def test_arrays_without_entries_are_carried_and_summed(function, kernels):
 def test_what_is_no_work_for_a_kernel_stays_a_scan(function, kernels):
     np.testing.assert_allclose(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
     assert kernels == []
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        lambda c, n: jax.lax.switch(n.astype(jnp.int32), [lambda: c, lambda: 0.5 * c, lambda: -c]),
+        lambda c, n: jax.lax.select_n(n.astype(jnp.int32) % 3, c, 0.5 * c, -c),
+    ],
+    ids="switch choice".split(),
+)
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
+    function = forward(step)
+    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    assert "triton" in lowered(function, NUMBERS, monkeypatch)[1]
+    assert kernels == [9, 9]
 
 
 @pytest.mark.parametrize(
