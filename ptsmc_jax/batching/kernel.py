@@ -293,7 +293,8 @@ class _Inside:
         values = [_lane(value) for value in values]
         if name in _UNKNOWN and not self.interpret:
             raise NotImplementedError(f"a kernel's compiler lacks the primitive `{name}`{place(eqn)}")
-        if (inner := _called(eqn)) is not None:
+        inner = params["call_jaxpr"] if name in _CUSTOM else called(eqn)
+        if inner is not None:
             return self.evaluate(inner, values)
         if name == "cond":
             return self.branch(params["branches"], values)
@@ -358,19 +359,17 @@ class _Inside:
 
     def pack(self, values: Sequence, differs: Sequence[int]) -> tuple:
         """Components as loops and branches carry them: numbers where all trials agree, vectors elsewhere."""
-        return tuple(
-            tuple(jnp.broadcast_to(part, (self.block,) if each else ()) for part in value.parts.flat)
-            for value, each in zip(values, differs, strict=False)
-        )
+
+        def one(part: Any, each: int) -> Any:  # a number by an equation: its compiler hands back no known one
+            return jnp.broadcast_to(part, (self.block,)) if each else lax.select(True, part, part)
+
+        every = zip(values, differs, strict=False)
+        return tuple(tuple(one(part, each) for part in value.parts.flat) for value, each in every)
 
 
 def _unpacked(packed: Sequence, shapes: Sequence) -> list[Lane]:
     """The components that `_Inside.pack` packed."""
     return [Lane(shape, object_array(shape, parts)) for parts, shape in zip(packed, shapes, strict=True)]
-
-
-def _called(eqn: Any) -> Any:
-    return eqn.params["call_jaxpr"] if eqn.primitive.name in _CUSTOM else called(eqn)
 
 
 def _constant(value: Any) -> Lane:

@@ -305,8 +305,13 @@ def test_what_is_no_work_for_a_kernel_stays_a_scan(function, kernels):
     [
         lambda c, n: jax.lax.switch(n.astype(jnp.int32), [lambda: c, lambda: 0.5 * c, lambda: -c]),
         lambda c, n: jax.lax.select_n(n.astype(jnp.int32) % 3, c, 0.5 * c, -c),
+        lambda c, n: (
+            c
+            + n * jax.lax.scan(lambda v, k: (jax.lax.cond(k > 2, lambda: v, lambda: 0.5), None), 1.0, jnp.arange(9))[0]
+        ),
+        lambda c, n: c + jax.lax.scan(lambda v, k: ((0.5, v[0], v[1] * n), None), (1.0, 2.0, c), None, 9)[0][2],
     ],
-    ids="switch choice".split(),
+    ids="switch choice known carried".split(),
 )
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
