@@ -40,8 +40,8 @@ _UNKNOWN = set(
 def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, ...], interpret: bool) -> list | None:
     """The last carries of a `lax.scan`, each an object array of components (*lead).
 
-    None: it is no work for a kernel, being short, or the same in all trials, or stacking results, or running backward,
-    or going through what differs from trial to trial.
+    None: it is no work for a kernel, being short, or the same in all trials, or of none, or stacking results, or
+    running backward, or going through what differs from trial to trial.
 
     Args:
         params: the scan's.
@@ -57,7 +57,7 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
     carried = of_scan(params, inputs)[1]
     if length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carried) or not any(varies):
         return None
-    if any(map(_by_trial, of_scan(params, values)[2])):
+    if 0 in lead or any(map(_by_trial, of_scan(params, values)[2])):
         return None
     *directions, trials = lead
     blocks, each = -(-trials // BLOCK), math.prod(directions)

@@ -300,6 +300,12 @@ def test_what_is_no_work_for_a_kernel_stays_a_scan(function, kernels):
     assert kernels == []
 
 
+def test_a_loop_of_no_trials_stays_a_scan(kernels):
+    function = forward(lambda c, n: 0.5 * c + n)
+    same(lanes.vmap(function, whole=True)(NUMBERS[:0]), jax.vmap(function)(NUMBERS[:0]))
+    assert kernels == []
+
+
 @pytest.mark.parametrize(
     "step",
     [
