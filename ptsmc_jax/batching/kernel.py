@@ -32,9 +32,11 @@ LARGEST = 1024  # entries of an array: there are none but those taken apart
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")  # calls here: derivatives are taken before
 # what `components` has a rule for, and the kernel's compiler has none
 _UNKNOWN = set(
-    """complex conj copy copy_p digamma eq_to erf erfc imag le_to lgamma lt_to real reduce_precision
+    """complex conj copy copy_p digamma eq_to erf erf_inv erfc imag le_to lgamma lt_to real reduce_precision
     round""".split()
 )
+_EXTREMES = set("clamp cummax cummin max min reduce_max reduce_min".split())  # which it has of numbers only
+_TYPES = set("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
 
 
 def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, ...], interpret: bool) -> list | None:
@@ -71,9 +73,8 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
     results = [ends.places([None] * math.prod(of.aval.shape), of.aval.shape, of.aval.dtype) for of in carried]
 
     def flown(*refs: Any) -> None:
-        tables, refs = _named(numbers.parts, refs)
-        takes, refs = _named(rows.parts, refs)
-        gives, _ = _named(ends.parts, refs)
+        every = iter(refs)
+        tables, takes, gives = ({kind: next(every) for kind in table.parts} for table in (numbers, rows, ends))
         vectors = {kind: _loaded(ref, len(rows.parts[kind])) for kind, ref in takes.items()}
         known = [v.of(vectors if isinstance(v, _Places) else tables) for v in given]
         last = _Inside(BLOCK, interpret).loop(body, length, of_scan(params, known), varies)
@@ -120,13 +121,9 @@ def _filled(length: int) -> int:
 
 def _held_as(kind: np.dtype) -> str:
     """The type that numbers of this one have in a table."""
-    return "int32" if kind == np.dtype(bool) else np.dtype(kind).name
-
-
-def _named(names: Iterable[str], refs: tuple) -> tuple[dict[str, Any], tuple]:
-    """The first of these by their names, and the others."""
-    named = dict(zip(names, refs, strict=False))
-    return named, refs[len(named) :]
+    if str(kind) not in _TYPES:
+        raise NotImplementedError(f"a kernel holds nothing of the type {kind}")
+    return "int32" if kind == np.dtype(bool) else str(kind)
 
 
 class _Places(NamedTuple):
@@ -291,7 +288,10 @@ class _Inside:
         if name == "scan":
             return self.scan(params, values)
         values = [_lane(value) for value in values]
-        if name in _UNKNOWN and not self.interpret:
+        for of in eqn.outvars:
+            _held_as(of.aval.dtype)
+        truths = name in _EXTREMES and eqn.outvars[0].aval.dtype == bool
+        if (name in _UNKNOWN or truths) and not self.interpret:
             raise NotImplementedError(f"a kernel's compiler lacks the primitive `{name}`{place(eqn)}")
         inner = params["call_jaxpr"] if name in _CUSTOM else called(eqn)
         if inner is not None:

@@ -19,6 +19,7 @@ from tuning.search.gains import with_gains
 
 SEED = 3
 NUMBERS = np.arange(6, dtype=np.uint32)
+KEY = jax.random.key(0)
 FLIGHT = {
     "plant": {"kind": "spacecraft"},
     "controller": {"t_f": 5.0, "delta": 0.5},
@@ -334,10 +335,14 @@ def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
         (lambda c, n: jnp.sum(jax.lax.scan(lambda v, _: (v + n, v), c, None, 300)[1]), "no results of 300 steps"),
         (lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0], "run forward"),
         (lambda c, n: jax.lax.erf(c), "compiler lacks the primitive `erf`"),
+        (lambda c, n: c + jax.lax.erf_inv(0.1 * n), "compiler lacks the primitive `erf_inv`"),
+        (lambda c, n: c + jnp.maximum(c > 2.0, n > 3), "compiler lacks the primitive `max`"),
+        (lambda c, n: 0.5 * c + n.astype(jnp.float16), "nothing of the type float16"),
+        (lambda c, n: 0.5 * c + jax.random.uniform(KEY) + n, "nothing of the type key<fry>"),
         (lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0], "no rule for the primitive `sort`"),
         (lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1)), "no rule for the primitive"),
     ],
-    ids="while stacked backward erf sort large".split(),
+    ids="while stacked backward erf inverse extreme type key sort large".split(),
 )
 def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kernels, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
