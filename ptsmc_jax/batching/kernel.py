@@ -8,7 +8,6 @@ is equal in all trials comes from tables of numbers, what differs from tables wi
 
 import math
 from collections.abc import Iterable, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +20,7 @@ from jax.extend import core
 from jaxtyping import Array
 
 from ptsmc_jax.batching import components
+from ptsmc_jax.batching.choices import chosen, otherwise
 from ptsmc_jax.batching.components import TRIAL, Lane, object_array, plain
 from ptsmc_jax.batching.dependence import called, dependence, of_scan, opened, place, settle
 
@@ -35,7 +35,6 @@ _UNKNOWN = set(
     """complex conj copy copy_p digamma eq_to erf erf_inv erfc imag le_to lgamma lt_to real reduce_precision
     round""".split()
 )
-_EXTREMES = set("clamp cummax cummin max min reduce_max reduce_min".split())  # which it has of numbers only
 _TYPES = set("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
 
 
@@ -190,14 +189,9 @@ def _put(ref: Any, rows: Sequence) -> None:
     """Write the first rows of a table."""
 
     def step(k: Any, _: None) -> None:
-        ref[k, :] = _chosen(k, rows)
+        ref[k, :] = chosen(k, rows)
 
     lax.fori_loop(np.int32(0), np.int32(len(rows)), step, None)
-
-
-def _chosen(k: Any, values: Sequence) -> Any:
-    """The k-th of some values that lie in no table, k being known in the kernel only."""
-    return reduce(lambda found, i: jnp.where(k == np.int32(i), values[i], found), range(1, len(values)), values[0])
 
 
 class _Numbers:
@@ -290,8 +284,7 @@ class _Inside:
         values = [_lane(value) for value in values]
         for of in eqn.outvars:
             _held_as(of.aval.dtype)
-        truths = name in _EXTREMES and eqn.outvars[0].aval.dtype == bool
-        if (name in _UNKNOWN or truths) and not self.interpret:
+        if name in _UNKNOWN and not self.interpret:
             raise NotImplementedError(f"a kernel's compiler lacks the primitive `{name}`{place(eqn)}")
         inner = params["call_jaxpr"] if name in _CUSTOM else called(eqn)
         if inner is not None:
@@ -302,12 +295,10 @@ class _Inside:
             nothing = [np.zeros(atom.aval.shape, atom.aval.dtype) for atom in eqn.invars]
             with jax.ensure_compile_time_eval():
                 return [_constant(out) for out in components.bind(eqn, nothing)]
-        if name == "select_n" and len(values) > 3:  # its compiler chooses between two
-            shape = eqn.outvars[0].aval.shape
-            each = zip(*(np.broadcast_to(value.parts, shape).flat for value in values), strict=True)
-            return [Lane(shape, object_array(shape, (_chosen(which, cases) for which, *cases in each)))]
         # spread anew for each equation: what was spread inside a branch or a loop is not known outside
-        made = components.apply(eqn, values, components.Alike(), LARGEST) if components.covers(name) else None
+        made = otherwise(eqn, values)
+        if made is None and components.covers(name):
+            made = components.apply(eqn, values, components.Alike(), LARGEST)
         if made is not None:
             return made
         raise NotImplementedError(f"a kernel has no rule for the primitive `{name}`{place(eqn)}")
@@ -351,11 +342,11 @@ class _Inside:
         differs = [np.ndim(index) > 0 or any(each) for each in zip(*depends, strict=True)]
         cases = [lambda branch=branch: self.pack(self.evaluate(branch, operands), differs) for branch in branches]
         if np.ndim(index) == 0:
-            chosen = lax.cond(index, cases[1], cases[0]) if index.dtype == bool else lax.switch(index, cases)
+            found = lax.cond(index, cases[1], cases[0]) if index.dtype == bool else lax.switch(index, cases)
         else:
             which = index if index.dtype == bool else jnp.clip(index, 0, len(branches) - 1)
-            chosen = jax.tree.map(lambda *each: _chosen(which, each), *(case() for case in cases))
-        return _unpacked(chosen, shapes)
+            found = jax.tree.map(lambda *each: chosen(which, each), *(case() for case in cases))
+        return _unpacked(found, shapes)
 
     def pack(self, values: Sequence, differs: Sequence[int]) -> tuple:
         """Components as loops and branches carry them: numbers where all trials agree, vectors elsewhere."""
@@ -386,7 +377,7 @@ def _row(value: Any, k: Any) -> Lane:
     if isinstance(value, _Held):
         return value.row(k)
     shape, rows = value.shape[1:], value.parts.reshape(value.shape[0], -1)
-    return Lane(shape, object_array(shape, rows[k] if isinstance(k, int) else (_chosen(k, each) for each in rows.T)))
+    return Lane(shape, object_array(shape, rows[k] if isinstance(k, int) else (chosen(k, each) for each in rows.T)))
 
 
 def _stacked(rows: Sequence[Lane], each: tuple[int, ...]) -> Lane:

@@ -193,6 +193,32 @@ def test_a_batch_flown_by_kernel_is_the_batch():
         np.testing.assert_array_equal(own.drawn[name], values)
 
 
+def limited(c, n):
+    """Of numbers that are NaN in one trial, in none, and in all; and of truths."""
+    wild, none = jnp.stack([c, 1.0 / (n - 3.0) * 0.0, 0.5 * c]), jnp.where(c > -9.0, jnp.nan, c)
+    pairs = jnp.maximum(wild[1], c) + jnp.minimum(none, c), jnp.clip(wild[1], -1.0, 1.0) + jnp.max(wild)
+    folds = jnp.min(wild), jax.lax.cummax(wild)[2], jax.lax.cummin(wild, reverse=True)[0], jax.lax.clamp(0.0, c, 9.0)
+    truths = jnp.maximum(c > 2.0, n > 3) & ~jnp.minimum(c > 2.0, n > 3)
+    return jnp.stack([*pairs, *folds, truths + jnp.max(jnp.stack([0.1 * c, n.astype(float)]))])
+
+
+def test_extremes_keep_what_is_not_a_number(kernels, monkeypatch):
+    """Triton's own maximum of NaN and 1 is 1, where this machine's is NaN."""
+
+    def function(n):
+        start = jnp.ones(7) * n
+        return jax.lax.scan(lambda c, k: (jnp.where(k < 8.0, 0.5 * c, limited(c[0], n)), None), start, jnp.arange(9.0))[
+            0
+        ]
+
+    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    trace, text = lowered(function, NUMBERS, monkeypatch)
+    (flown,) = (eqn for eqn in equations(trace.jaxpr) if eqn.primitive.name == "pallas_call")
+    used = {eqn.primitive.name for eqn in equations(flown.params["jaxpr"])}
+    assert "triton" in text
+    assert not used & {"max", "min", "clamp"}
+
+
 def equations(jaxpr):
     """All equations of a trace, of those inside it too."""
     for eqn in getattr(jaxpr, "jaxpr", jaxpr).eqns:
@@ -336,13 +362,12 @@ def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
         (lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0], "run forward"),
         (lambda c, n: jax.lax.erf(c), "compiler lacks the primitive `erf`"),
         (lambda c, n: c + jax.lax.erf_inv(0.1 * n), "compiler lacks the primitive `erf_inv`"),
-        (lambda c, n: c + jnp.maximum(c > 2.0, n > 3), "compiler lacks the primitive `max`"),
         (lambda c, n: 0.5 * c + n.astype(jnp.float16), "nothing of the type float16"),
         (lambda c, n: 0.5 * c + jax.random.uniform(KEY) + n, "nothing of the type key<fry>"),
         (lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0], "no rule for the primitive `sort`"),
         (lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1)), "no rule for the primitive"),
     ],
-    ids="while stacked backward erf inverse extreme type key sort large".split(),
+    ids="while stacked backward erf inverse type key sort large".split(),
 )
 def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kernels, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
