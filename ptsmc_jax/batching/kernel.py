@@ -291,10 +291,13 @@ class _Inside:
             return self.evaluate(inner, values)
         if name == "cond":
             return self.branch(params["branches"], values)
-        if name == "iota" or (components.covers(name) and not any(value.parts.size for value in values)):
-            nothing = [np.zeros(atom.aval.shape, atom.aval.dtype) for atom in eqn.invars]
+        if (name == "iota" or components.covers(name)) and all(map(_known, values)):
+            arrays = [
+                np.array(list(v.parts.flat), of.aval.dtype).reshape(v.shape)
+                for v, of in zip(values, eqn.invars, strict=True)
+            ]
             with jax.ensure_compile_time_eval():
-                return [_constant(out) for out in components.bind(eqn, nothing)]
+                return [_constant(out) for out in components.bind(eqn, arrays)]
         # spread anew for each equation: what was spread inside a branch or a loop is not known outside
         made = otherwise(eqn, values)
         if made is None and components.covers(name):
@@ -366,6 +369,11 @@ def _unpacked(packed: Sequence, shapes: Sequence) -> list[Lane]:
 def _constant(value: Any) -> Lane:
     array = np.asarray(value)
     return Lane(array.shape, object_array(array.shape, (array[i] for i in np.ndindex(*array.shape))))
+
+
+def _known(value: Lane) -> bool:
+    """Whether nothing is left to the kernel to compute, whose compiler takes no primitive of known numbers alone."""
+    return all(isinstance(part, np.ndarray | np.generic) for part in value.parts.flat)
 
 
 def _lane(value: Any) -> Lane:

@@ -343,8 +343,9 @@ def test_a_loop_of_no_trials_stays_a_scan(kernels):
             + n * jax.lax.scan(lambda v, k: (jax.lax.cond(k > 2, lambda: v, lambda: 0.5), None), 1.0, jnp.arange(9))[0]
         ),
         lambda c, n: c + jax.lax.scan(lambda v, k: ((0.5, v[0], v[1] * n), None), (1.0, 2.0, c), None, 9)[0][2],
+        lambda c, n: 0.5 * c + n * jnp.square(0.3) + jnp.sum(-jnp.arange(3.0)),
     ],
-    ids="switch choice known carried".split(),
+    ids="switch choice known carried constant".split(),
 )
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
