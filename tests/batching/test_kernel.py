@@ -202,6 +202,7 @@ def limited(c, n):
     return jnp.stack([*pairs, *folds, truths + jnp.max(jnp.stack([0.1 * c, n.astype(float)]))])
 
 
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_extremes_keep_what_is_not_a_number(kernels, monkeypatch):
     """Triton's own maximum of NaN and 1 is 1, where this machine's is NaN."""
 
