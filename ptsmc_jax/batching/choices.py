@@ -19,17 +19,17 @@ def chosen(k: Any, values: Sequence) -> Any:
 
 def otherwise(eqn: Any, values: Sequence[Lane]) -> list[Lane] | None:
     """The outputs of a primitive that the compiler lacks, or takes for another; None: it has that one."""
-    name, shape = eqn.primitive.name, eqn.outvars[0].aval.shape
+    name, shapes = eqn.primitive.name, [of.aval.shape for of in eqn.outvars]
     if name in _OF_ENTRIES:
         found = components.reduced(eqn, values[0].parts, lambda row: reduce(_OF_ENTRIES[name], row))
     elif name in _SO_FAR:
         found = components.cumulated(eqn, values[0].parts, _SO_FAR[name])
     elif name in _FORMS and not (name == "select_n" and len(values) == 3):
-        each = zip(*(np.broadcast_to(value.parts, shape).flat for value in values), strict=True)
-        found = object_array(shape, itertools.starmap(_FORMS[name], each))
+        each = zip(*(np.broadcast_to(value.parts, *shapes).flat for value in values), strict=True)
+        found = object_array(*shapes, itertools.starmap(_FORMS[name], each))
     else:
         return None
-    return [Lane(shape, found)]
+    return [Lane(found.shape, found)]
 
 
 # Triton's own give the other number where one is NaN, so that a torque's limits would hide that a flight has failed.

@@ -364,12 +364,13 @@ def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
         (lambda c, n: jax.lax.scan(lambda v, k: (v + k, None), c, jnp.arange(9.0), reverse=True)[0], "run forward"),
         (lambda c, n: jax.lax.erf(c), "compiler lacks the primitive `erf`"),
         (lambda c, n: c + jax.lax.erf_inv(0.1 * n), "compiler lacks the primitive `erf_inv`"),
+        (lambda c, n: (jax.debug.callback(lambda: None), 0.5 * c + n)[1], "no rule for the primitive `debug_callback`"),
         (lambda c, n: 0.5 * c + n.astype(jnp.float16), "nothing of the type float16"),
         (lambda c, n: 0.5 * c + jax.random.uniform(KEY) + n, "nothing of the type key<fry>"),
         (lambda c, n: jnp.sort(jnp.stack([c, 1.0 - c]))[0], "no rule for the primitive `sort`"),
         (lambda c, n: c + jnp.sum(jnp.ones((33, 33)) * n, axis=(0, 1)), "no rule for the primitive"),
     ],
-    ids="while stacked backward erf inverse type key sort large".split(),
+    ids="while stacked backward erf inverse told type key sort large".split(),
 )
 def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kernels, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
