@@ -45,37 +45,28 @@ def noise(parts: Parts) -> Noise:
     if flown is None:
         return _covariance(parts, ticks, lasting, linear.opened_in(parts, run, lasting))[0]
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT))
-    noises = _State(parts, flat).seen_noise
-    widths = np.asarray([_mean_width(float(flown), _size((by @ noises) ** 2)) for by in flat.s_direct])
-
-    def with_slopes_of(widths: np.ndarray) -> tuple[Noise, np.ndarray]:
-        sloped = linear.opened_in(parts, run, lasting, widths).loop
-        return _covariance(parts, ticks, lasting, flat, _Sign(sloped, widths, float(flown)))
-
-    sizes, found = with_slopes_of(widths)
+    own = _State(parts, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
+    found = np.asarray([_mean_width(float(flown), float(np.sqrt(np.sum(by**2) / len(by)))) for by in own])
+    sizes, widths = None, np.zeros(lasting.size)
     for _ in range(ROUNDS):
-        if np.allclose(found, widths, rtol=0.01, atol=0.0):
+        if sizes is not None and np.allclose(found, widths, rtol=0.01, atol=0.0):
             break
         widths = found
-        sizes, found = with_slopes_of(widths)
+        sign = _Sign(linear.opened_in(parts, run, lasting, widths).loop, widths, float(flown))
+        sizes, found = _covariance(parts, ticks, lasting, flat, sign)
+    assert sizes is not None
     return sizes
 
 
 class _Sign(NamedTuple):
-    """The loops with a smooth sign of these widths, (periods,), and the width that is flown."""
+    """The loops with a smooth sign of these widths, (periods,), and the width that is flown.
+
+    Slopes of u go by 1/width: exactly where s is zero in the quiet run, else as nearly as the widths of these loops.
+    """
 
     loops: Any
     widths: np.ndarray
     flown: float
-
-    def loop(self, flat: Any, j: int, sigma: float) -> tuple[Any, float]:
-        """The loop of a period under this noise of s, and the sign's width there: slopes of u go by 1/width.
-
-        That is exact where s is zero in the quiet run, and else as near as the widths of these loops are.
-        """
-        width = _mean_width(self.flown, min(sigma, BEYOND))
-        share = self.widths[j] / width if width > 0.0 else 1.0
-        return jax.tree.map(lambda a, b: a + share * (b[j] - a), flat, self.loops), width
 
 
 def _mean_width(width: float, sigma: float) -> float:
@@ -89,7 +80,7 @@ def _mean_width(width: float, sigma: float) -> float:
 
 
 class _Rows(NamedTuple):
-    """How something follows from the state that is propagated, and from the noise of this sample."""
+    """How something follows from the state that is propagated, and from the noise of this sample; or in each period."""
 
     state: np.ndarray  # (rows, size)
     noise: np.ndarray  # (rows, readings), times 1 sigma
@@ -97,6 +88,13 @@ class _Rows(NamedTuple):
     def covariance(self, p: np.ndarray) -> np.ndarray:
         """Covariance (rows, rows), from that of the state before the sample, (size, size)."""
         return self.state @ p @ self.state.T + self.noise @ self.noise.T
+
+    def at(self, j: int, other: "_Rows | None" = None, share: float = 0.0) -> "_Rows":
+        """Those of the j-th period, of rows (periods, rows, ..), so far on the way to other ones."""
+        mine = _Rows(self.state[j], self.noise[j])
+        if other is None:
+            return mine
+        return _Rows(*(a + share * (b[j] - a) for a, b in zip(mine, other, strict=True)))
 
 
 class _State:
@@ -114,8 +112,7 @@ class _State:
         self.size = before + reading.own.size + self._m
         # what the computer sees, by the state and by the noise
         from_readings = np.linalg.pinv(reading.rows[:, :k])
-        self.seen_noise = from_readings * reading.noise  # (k, readings) of this sample alone, 1 sigma
-        self._seen = _Rows(np.zeros((k, self.size)), self.seen_noise)
+        self._seen = _Rows(np.zeros((k, self.size)), from_readings * reading.noise)
         self._seen.state[:, :k] = np.eye(k)
         self._seen.state[:, self._own] = from_readings @ reading.rows[:, k:]
         # by how much the state moves by itself in a second, 1 sigma
@@ -135,49 +132,49 @@ class _State:
         return factor @ factor.T
 
     def rows(self, by_z: np.ndarray, by_seen: np.ndarray) -> _Rows:
-        """Rows of something that follows from z, and from what the computer sees."""
-        padded = np.pad(by_z, [(0, 0), (0, self.size - self._n)])
+        """Rows of something that follows from z, and from what the computer sees; in each period where these are so."""
+        padded = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
         return _Rows(padded + by_seen @ self._seen.state, by_seen @ self._seen.noise)
 
-    def moved(self, loop: Any, command: _Rows) -> _Rows:
-        """The whole state a period later; loop: a `linear.Loop` of numpy arrays."""
-        n, m, waiting, new = self._n, self._m, self._waiting, loop.new[0]
-        state, noise = np.eye(self.size), np.zeros((self.size, command.noise.shape[1]))
-        state[:n], noise[:n] = self.rows(loop.a, loop.seen)
-        state[:n, self.size - m :] += loop.disturbed
+    def moved(self, loops: Any) -> tuple[_Rows, _Rows]:
+        """The command, and the whole state a period later, in each period; loops: a `linear.Loop` of numpy arrays."""
+        n, m, waiting, new = self._n, self._m, self._waiting, loops.new[:, 0]
+        command = self.rows(loops.command, loops.direct)
+        state = np.tile(np.eye(self.size), (len(new), 1, 1))
+        noise = np.zeros((len(new), self.size, command.noise.shape[-1]))
+        state[:, :n], noise[:, :n] = self.rows(loops.a, loops.seen)
+        state[:, :n, self.size - m :] += loops.disturbed
         if waiting:
-            state[:n, n + waiting - m : n + waiting] += new
-            state[n : n + waiting] = np.eye(self.size)[n - m : n + waiting - m]
-            state[n : n + m], noise[n : n + m] = command
+            state[:, :n, n + waiting - m : n + waiting] += new
+            state[:, n : n + waiting] = np.eye(self.size)[n - m : n + waiting - m]
+            state[:, n : n + m], noise[:, n : n + m] = command
         else:
-            state[:n] += new @ command.state
-            noise[:n] += new @ command.noise
-        return _Rows(state, noise)
+            state[:, :n] += new @ command.state
+            noise[:, :n] += new @ command.noise
+        return command, _Rows(state, noise)
 
 
 def _covariance(
     parts: Parts, ticks: Any, lasting: np.ndarray, opened: linear.Opened, sign: _Sign | None = None
 ) -> tuple[Noise, np.ndarray]:
     """The covariance propagated along the run, and what it makes of error, command and s; widths of the sign."""
-    lengths = ticks.t_next - ticks.t
+    lengths = (ticks.t_next - ticks.t)[lasting]
     state = _State(parts, opened)
-    p = state.start()
+    p, sliding = state.start(), state.rows(opened.s_command, opened.s_direct)
+    command, moved = state.moved(opened.loop)
+    sloped = (None, None) if sign is None else state.moved(sign.loops)
     squares, torque, widths = np.zeros((len(lasting), 2)), 0.0, np.zeros(len(lasting))  # of the error and of s
-    for j, index in enumerate(lasting):
-        row = jax.tree.map(lambda v, j=j: v[j], opened)
-        s, loop = state.rows(row.s_command, row.s_direct).covariance(p), row.loop
-        squares[j] = np.trace(row.error @ p[state.plant, state.plant] @ row.error.T), np.mean(np.diag(s))
+    for j, length in enumerate(lengths):
+        error, s = opened.error[j], sliding.at(j).covariance(p)
+        squares[j] = np.trace(error @ p[state.plant, state.plant] @ error.T), np.mean(np.diag(s))
+        share = 0.0
         if sign is not None:
-            loop, widths[j] = sign.loop(loop, j, float(np.sqrt(squares[j, 1])))
-        command = state.rows(loop.command, loop.direct)
-        torque = max(torque, float(np.sqrt(np.diag(command.covariance(p)).max())))
-        p = state.moved(loop, command).covariance(p) + np.diag((state.drift * lengths[index]) ** 2)
+            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 1])), BEYOND))
+            share = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
+        commanded = command.at(j, sloped[0], share).covariance(p)
+        torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
+        p = moved.at(j, sloped[1], share).covariance(p) + np.diag((state.drift * length) ** 2)
     t, t_f = ticks.t[lasting], float(parts.controller.t_f)
     in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
     error, s_size = np.sqrt(np.mean(squares[in_window], axis=0))
     return Noise(float(error), torque, float(s_size)), widths
-
-
-def _size(squares: np.ndarray) -> float:
-    """RMS over components, (m,), from the shares (m, k) of what each is made of."""
-    return float(np.sqrt(squares.sum(axis=1).mean()))

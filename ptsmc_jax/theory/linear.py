@@ -179,7 +179,7 @@ def opened(parts: Parts, during: Nominal) -> Opened:
     return Opened(loop, error, s_command, s_direct)
 
 
-TOGETHER = 32  # periods that one call of the compiled program opens
+TOGETHER = 64  # periods that one call of the compiled program opens
 
 
 def opened_in(parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None) -> Opened:
@@ -189,10 +189,12 @@ def opened_in(parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarra
     """
     parts = replace(parts, clock=clock.flight(1.0, 1.0))
     listed = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
-    calls = []
-    for k in range(0, len(indices), TOGETHER):
+
+    def call(k: int) -> Opened:
         some = np.resize(np.arange(k, min(k + TOGETHER, len(indices))), TOGETHER)
-        calls.append(jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v, some=some: v[some], listed))))
+        return jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v: v[some], listed)))
+
+    calls = [call(k) for k in range(0, len(indices), TOGETHER)]
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
 
 

@@ -179,7 +179,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "peak_torque": float(np.mean(peaks)),
             "largest_peak_torque": float(peaks.max()),
         }
-    parts = common(ready.parts)
+    # of the plant's own steps as many as it needs, nearly: a program for each power of two
+    parts = replace(common(ready.parts), substeps=1 << (ready.parts.substeps - 1).bit_length())
     if ready.scenario.sampled:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
