@@ -25,8 +25,8 @@ def otherwise(eqn: Any, values: Sequence[Lane]) -> list[Lane] | None:
     elif name in _SO_FAR:
         found = components.cumulated(eqn, values[0].parts, _SO_FAR[name])
     elif name in _FORMS and not (name == "select_n" and len(values) == 3):
-        each = zip(*(np.broadcast_to(value.parts, *shapes).flat for value in values), strict=True)
-        found = object_array(*shapes, itertools.starmap(_FORMS[name], each))
+        each = zip(*(np.broadcast_to(value.parts, shapes[0]).flat for value in values), strict=True)
+        found = object_array(shapes[0], itertools.starmap(_FORMS[name], each))
     else:
         return None
     return [Lane(found.shape, found)]

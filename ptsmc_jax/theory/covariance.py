@@ -131,8 +131,8 @@ class _State:
             factor = np.hstack([factor, start])
         return factor @ factor.T
 
-    def rows(self, by_z: np.ndarray, by_seen: np.ndarray) -> _Rows:
-        """Rows of something that follows from z, and from what the computer sees; in each period where these are so."""
+    def rows(self, by_z: Any, by_seen: Any) -> _Rows:
+        """Rows of something by z and by what the computer sees, of NumPy; in each period where these are so."""
         padded = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
         return _Rows(padded + by_seen @ self._seen.state, by_seen @ self._seen.noise)
 
