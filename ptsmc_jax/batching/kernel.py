@@ -56,15 +56,14 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
     """
     body, length, inputs = params["jaxpr"], params["length"], params["jaxpr"].jaxpr.invars
     carried = of_scan(params, inputs)[1]
-    if length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carried) or not any(varies):
-        return None
-    if 0 in lead or any(map(_by_trial, of_scan(params, values)[2])):
+    xs = of_scan(params, values)[2]
+    other = length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carried) or not any(varies)
+    if other or 0 in lead or any(map(_by_trial, xs)):
         return None
     *directions, trials = lead
     blocks, each = -(-trials // BLOCK), math.prod(directions)
     numbers, rows, ends = _Numbers(each), _Rows(), _Rows()
-    fixed = len(values) - len(of_scan(params, values)[2])
-    shapes = [of.aval.shape if k < fixed else (length, *of.aval.shape) for k, of in enumerate(inputs)]
+    shapes = [of.aval.shape if k < len(values) - len(xs) else (length, *of.aval.shape) for k, of in enumerate(inputs)]
     given = [
         (rows if _by_trial(v) else numbers).take(v, shape, of.aval.dtype)
         for v, shape, of in zip(values, shapes, inputs, strict=True)
@@ -76,7 +75,7 @@ def scan(params: Any, values: Sequence, varies: Sequence[int], lead: tuple[int, 
         tables, takes, gives = ({kind: next(every) for kind in table.parts} for table in (numbers, rows, ends))
         vectors = {kind: _loaded(ref, len(rows.parts[kind])) for kind, ref in takes.items()}
         known = [v.of(vectors if isinstance(v, _Places) else tables) for v in given]
-        last = _Inside(BLOCK, interpret).loop(body, length, of_scan(params, known), varies)
+        last = _Inside(interpret).loop(body, length, of_scan(params, known), varies)
         made: dict[str, list] = {}
         for value, of in zip(last, carried, strict=True):
             kind = _held_as(of.aval.dtype)
@@ -125,6 +124,11 @@ def _held_as(kind: np.dtype) -> str:
     return "int32" if kind == np.dtype(bool) else str(kind)
 
 
+def _check_size(shape: tuple[int, ...]) -> None:
+    if not components.small(shape, LARGEST):
+        raise NotImplementedError(f"a kernel takes arrays of up to {LARGEST} entries apart")
+
+
 class _Places(NamedTuple):
     """Where the components of a value lie among rows."""
 
@@ -156,8 +160,7 @@ class _Rows:
 
     def take(self, value: Lane, shape: tuple[int, ...], dtype: np.dtype) -> _Places:
         """Rows for a lane."""
-        if math.prod(shape) > LARGEST:
-            raise NotImplementedError(f"a kernel takes arrays of up to {LARGEST} entries apart")
+        _check_size(shape)
         return self.places(value.parts.flat, shape, dtype)
 
     def tables(self, lead: tuple[int, ...], width: int) -> list[Array]:
@@ -243,8 +246,7 @@ class _Held(NamedTuple):
 
     def lane(self) -> Lane:
         """The whole value as components."""
-        if math.prod(self.shape) > LARGEST:
-            raise NotImplementedError(f"a kernel takes arrays of up to {LARGEST} entries apart")
+        _check_size(self.shape)
         return self._load(self.shape, self.start)
 
     def row(self, k: Any) -> Lane:
@@ -260,8 +262,8 @@ class _Held(NamedTuple):
 class _Inside:
     """Evaluation inside the kernel: every value an object array of numbers, or of vectors over the block."""
 
-    def __init__(self, block: int, interpret: bool):
-        self.block, self.interpret = block, interpret
+    def __init__(self, interpret: bool):
+        self.interpret = interpret
 
     def evaluate(self, closed: Any, arguments: Sequence) -> list:
         """Values of the outputs of a trace."""
@@ -355,7 +357,7 @@ class _Inside:
         """Components as loops and branches carry them: numbers where all trials agree, vectors elsewhere."""
 
         def one(part: Any, each: int) -> Any:  # a number by an equation: its compiler hands back no known one
-            return jnp.broadcast_to(part, (self.block,)) if each else lax.select(True, part, part)
+            return jnp.broadcast_to(part, (BLOCK,)) if each else lax.select(True, part, part)
 
         every = zip(values, differs, strict=False)
         return tuple(tuple(one(part, each) for part in value.parts.flat) for value, each in every)
