@@ -1,8 +1,11 @@
-"""What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer."""
+"""What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer.
+
+And reverse mode, with the compiler options for programs that write arrays in a loop and without.
+"""
 
 import jax
 
-from ptsmc_jax.configure import configure
+from ptsmc_jax.configure import IN_PLACE, configure
 
 configure()
 
@@ -10,9 +13,12 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
+from ptsmc_jax.batching import lanes  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.simulation import rollout  # noqa: E402
 from ptsmc_jax.simulation.requirements import Requirement  # noqa: E402
 from tuning.search import objective  # noqa: E402
+from tuning.search.gains import with_gains  # noqa: E402
 from tuning.search.objective import Problem, measure  # noqa: E402
 
 GAINS = ("eta", "delta", "observer_gain")
@@ -79,7 +85,33 @@ def memory() -> None:
         say(f"  {steps:7d} periods: {told.temp_size_in_bytes / 1e6:.2f} MB")
 
 
+def reverse() -> None:
+    """Reverse mode of one run, and of 64 in lanes, on one device."""
+    say("\nvalue and gradient by reverse mode:")
+
+    def squares(ready, trials):
+        def one(gains, trial):
+            parts = with_gains(ready.parts, dict(zip(GAINS, gains, strict=True)))
+            return rollout.simulate(parts, 0, trial).metrics.window_error ** 2
+
+        many = trials is not None
+        return lambda gains: jnp.sum(lanes.vmap(one, (None, 0))(gains, trials) if many else one(gains, 0))
+
+    for steps, count in ((900, 1), (3600, 1), (900, 64)):
+        ready = study(True, loop__period=45.0 / steps)
+        error = squares(ready, np.arange(count, dtype=np.uint32) if count > 1 else None)
+        programs = {
+            "forward": jax.jit(error),
+            "reverse": jax.jit(jax.value_and_grad(error)),
+            "in place": jax.jit(jax.value_and_grad(error), compiler_options=IN_PLACE),
+        }
+        seconds = medians({name: lambda f=f: f(AT) for name, f in programs.items()})
+        told = ", ".join(f"{name} {1e6 * s / steps:.2f}" for name, s in seconds.items())
+        say(f"  {steps:5d} periods, {count:3d} trials, microseconds a period: {told}")
+
+
 if __name__ == "__main__":
     say(machine())
     ratios()
     memory()
+    reverse()

@@ -38,6 +38,10 @@ def _flags(options: tuple[str, ...]) -> str:
     return " ".join([*([f"--xla_backend_extra_options={extra}"] if extra else []), *plain])
 
 
+# Compiler options for a program of one's own that writes several arrays in a loop, as reverse mode does of all that it
+# needs later: the first of `_FASTER` would copy each of them whole in every step, see `numerics.stacking`.
+IN_PLACE = {"xla_disable_hlo_passes": "cpu_multi_output_fusion"}
+
 # folder of whole compiled programs, see `ptsmc_jax.programs`; None: they are not kept
 programs: Path | None = None
 
@@ -63,12 +67,11 @@ def configure(
 
     devices: number of host devices, all cores that this process may use if None; cache: folder of the compile cache,
     None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
-    that make loops 2 to 15 times as fast forward, and reverse mode through them ten times as slow: pass False where
-    you need it, or where the compiler (of jax 0.10.2 and 0.11.2) aborts with them, as it does on some code of one's own
-    that scatters into several arrays under vmap (or leave out for that program alone what it aborts in:
-    `jax.jit(function, compiler_options={"xla_disable_hlo_passes": "cpu_multi_output_fusion"})`). They are tried out in
-    a process of its own, once for each version of JAX and processor where there is a cache; those that are refused, or
-    give other numbers, are left out with a warning.
+    that make loops 2 to 15 times as fast forward. One of them is not for programs in reverse mode, which become
+    quadratic in the number of steps, nor for some code of one's own that scatters into several arrays under vmap, on
+    which the compiler (of jax 0.10.2 and 0.11.2) aborts: `jax.jit(function, compiler_options=configure.IN_PLACE)`
+    compiles these. The options are tried out in a process of its own, once for each version of JAX and processor where
+    there is a cache; those that are refused, or give other numbers, are left out with a warning.
     XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
     first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
     of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in

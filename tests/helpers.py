@@ -272,3 +272,13 @@ def same(one, other):
     assert_frame_equal(one.select(pl.exclude(pl.Float64)), other.select(pl.exclude(pl.Float64)))
     for name in one.select(pl.col(pl.Float64)).columns:
         np.testing.assert_allclose(one[name].to_numpy(), other[name].to_numpy(), rtol=1e-12, atol=1e-300, err_msg=name)
+
+
+def equations(trace: Any) -> Any:
+    """All equations of a trace, of those inside it too."""
+    for eqn in getattr(trace, "jaxpr", trace).eqns:
+        yield eqn
+        for value in eqn.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                if hasattr(getattr(inner, "jaxpr", inner), "eqns"):
+                    yield from equations(inner)

@@ -18,7 +18,7 @@ from tests.tree import ROOT, modules
 HOUSE = {
     "ptsmc_jax": {
         ".": "configure formulas | programs",
-        "numerics": "elementary guards pytrees statistics | attitude draws matrices | integrators",
+        "numerics": "elementary guards pytrees stacking statistics | attitude draws matrices | integrators",
         "batching": "components dependence | choices packed | kernel | lanes",
         "plants": "base | integrator_chain rigid_body second_order | flexible_body",
         "signals": "disturbances references",

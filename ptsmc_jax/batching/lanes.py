@@ -22,6 +22,7 @@ from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
 from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, place, settle, used
 from ptsmc_jax.batching.packed import Packed
+from ptsmc_jax.numerics import stacking
 
 
 class LanesWarning(UserWarning):
@@ -241,14 +242,9 @@ class _Lanes:
             results = self.inside().evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
             return state.pack(results[:carried]), out.pack(results[carried:])
 
-        last, ys = lax.scan(
-            step,
-            state.pack(init),
-            tuple(rows(*item) for item in zip(xs, row.shapes, rowed, strict=True)),
-            params["length"],
-            params["reverse"],
-            params["unroll"],
-        )
+        packed_xs = tuple(rows(*item) for item in zip(xs, row.shapes, rowed, strict=True))
+        as_asked = {name: params[name] for name in ("length", "reverse", "unroll")}
+        last, ys = stacking.scan(step, state.pack(init), packed_xs, **as_asked)
         stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
         return [*state.unpack(last), *stacked]
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.numerics import draws
+from ptsmc_jax.numerics import draws, stacking
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import assumed_torque, boot, decide, schedule, star_state
@@ -101,7 +101,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
     unknown, star_x = jnp.full_like(parts.t_end, jnp.nan), star_state(parts, started, lambda t: x0)
     start = x0, computer, actuators.begin(parts.plant.inputs), walk, unknown, star_x
-    return jax.lax.scan(flown, start, listed)[1]
+    return stacking.scan(flown, start, listed)[1]
 
 
 @programs.jit(compiler_options=programs.QUICKLY)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ptsmc_jax.numerics import integrators, matrices
+from ptsmc_jax.numerics import integrators, matrices, stacking
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import run_state
@@ -48,7 +48,7 @@ def fly(run: Run) -> Result:
 
     state = run_state.begin(run)
     first = state.snapshot
-    (state, memory), rows = jax.lax.scan(step, (state, observer.begin()), (ticks, decays))
+    (state, memory), rows = stacking.scan(step, (state, observer.begin()), (ticks, decays))
     log = None
     if rows is not None:
         t = run.criteria.t_end

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.numerics import draws, integrators
+from ptsmc_jax.numerics import draws, integrators, stacking
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Bound
@@ -181,6 +181,6 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
         computer = computer._replace(applied=None)
     offset = loop.offset(run.ticks.t[0], run.ticks.sample[0])
     hardware = _Equipment(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
-    (state, hardware), rows = jax.lax.scan(loop.fly, (state, hardware), periods)
+    (state, hardware), rows = stacking.scan(loop.fly, (state, hardware), periods)
     log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
     return run_state.finish(run, first, state, log, hardware.actuators.h)

@@ -11,6 +11,8 @@ from ptsmc_jax.theory import error_floor, linear
 ROUNDS = 8  # at most, in which the mean slope of a sign is found where s is not zero in the quiet run
 BEYOND = 1e60  # stands for a size of s that is no number any more
 FLAT = 1e30  # width of a sign without slope
+_AT = np.linspace(-20.0, 20.0, 401)
+_SLOPE, _GAUSS = 1.0 / np.cosh(_AT) ** 2, np.exp(-(_AT**2) / 2.0)
 
 
 class Noise(NamedTuple):
@@ -43,8 +45,8 @@ def noise(parts: Parts) -> Noise:
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # beyond rounding
     flown = getattr(parts.controller, "sign_width", None)
     if flown is None:
-        return _covariance(parts, ticks, lasting, linear.opened_in(parts, run, lasting))[0]
-    flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT))
+        return _covariance(parts, ticks, lasting, linear.opened_in(parts, run, lasting, late=False))[0]
+    flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
     own = _State(parts, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
     found = np.asarray([_mean_width(float(flown), float(np.sqrt(np.sum(by**2) / len(by)))) for by in own])
     sizes, widths = None, np.zeros(lasting.size)
@@ -52,7 +54,7 @@ def noise(parts: Parts) -> Noise:
         if sizes is not None and np.allclose(found, widths, rtol=0.01, atol=0.0):
             break
         widths = found
-        sign = _Sign(linear.opened_in(parts, run, lasting, widths).loop, widths, float(flown))
+        sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown))
         sizes, found = _covariance(parts, ticks, lasting, flat, sign)
     assert sizes is not None
     return sizes
@@ -74,9 +76,11 @@ def _mean_width(width: float, sigma: float) -> float:
     if sigma == 0.0:
         return width
     share = width / sigma
-    at = np.linspace(-20.0, 20.0, 401) / max(1.0, share)  # in widths: steps of a tenth of what falls off sooner
-    mean = np.trapezoid(np.exp(-((share * at) ** 2) / 2.0) / np.cosh(at) ** 2, at) / np.sqrt(2.0 * np.pi)
-    return sigma / float(mean)
+    if share < 1.0:  # at _AT widths, else at _AT sigmas: steps of a tenth of what falls off sooner
+        weighed = np.exp(-((share * _AT) ** 2) / 2.0) @ _SLOPE
+    else:
+        weighed = _GAUSS @ (1.0 / np.cosh(_AT / share) ** 2) / share
+    return sigma / float(weighed * (_AT[1] - _AT[0]) / np.sqrt(2.0 * np.pi))
 
 
 class _Rows(NamedTuple):

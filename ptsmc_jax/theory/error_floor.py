@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax import programs
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import stacking
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.simulation.sampled import PeriodMotion
@@ -223,7 +224,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
         drive, queue = actuators.command(state, wanted, plant.velocity(x), tick.t, dt, tick.noise_weight)
         return actuators.end(state, drive, queue, dt), drive
 
-    _, drives = jax.lax.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))
+    _, drives = stacking.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))
 
     def period(tick: Ticks, x: Any, x_next: Any, drive: Any, disturbance: Array) -> _Linear:
         dt, target, target_next = tick.t_next - tick.t, parts.reference(tick.t), parts.reference(tick.t_next)

@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import stacking
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
@@ -43,7 +44,7 @@ class Loop:
 
     a: Leaf  # (n, n) A
     seen: Leaf  # (n, k) B
-    new: Leaf  # (nodes, n, m) N, for `part` at NODES of a period
+    new: Leaf  # (nodes, n, m) N, for `part` at NODES of a period; at the first of them alone: `opened(late=False)`
     old: Leaf  # (nodes, n, m) O
     command: Leaf  # (m, n) C
     direct: Leaf  # (m, k) D
@@ -99,7 +100,7 @@ def nominal(parts: Parts) -> Nominal:
         return after, Nominal(period, carry, after, wanted)
 
     first = Carry(x0, model._replace(queue=None), computer, model._replace(h=None))
-    return jax.lax.scan(step, first, listed)[1]
+    return stacking.scan(step, first, listed)[1]
 
 
 nominal_jit = programs.jit(nominal)
@@ -148,8 +149,12 @@ class Opened(NamedTuple):
     s_direct: Array  # (components, k) and by x_seen
 
 
-def opened(parts: Parts, during: Nominal) -> Opened:
-    """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock."""
+def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
+    """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock.
+
+    late: for commands that act late within the period too, which `at_input` and `delayed_axis` need for a share of a
+    period; most of the work.
+    """
     parts = quiet(parts)
     period, before, after, arriving = during
     k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
@@ -173,7 +178,7 @@ def opened(parts: Parts, during: Nominal) -> Opened:
         return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
 
     (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
-    old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES))
+    old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES if late else NODES[:1]))
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
     error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
     return Opened(loop, error, s_command, s_direct)
@@ -182,8 +187,10 @@ def opened(parts: Parts, during: Nominal) -> Opened:
 TOGETHER = 64  # periods that one call of the compiled program opens
 
 
-def opened_in(parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None) -> Opened:
-    """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s].
+def opened_in(
+    parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None, *, late: bool = True
+) -> Opened:
+    """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s]; late: `opened`.
 
     By one program, however many they are and however many the run has. widths: of the law's smooth sign in each.
     """
@@ -192,18 +199,18 @@ def opened_in(parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarra
 
     def call(k: int) -> Opened:
         some = np.resize(np.arange(k, min(k + TOGETHER, len(indices))), TOGETHER)
-        return jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v: v[some], listed)))
+        return jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v: v[some], listed), late=late))
 
     calls = [call(k) for k in range(0, len(indices), TOGETHER)]
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _opened(parts: Parts, during: Nominal, widths: Array | None) -> Opened:
+@programs.jit(static_argnames=("late",), compiler_options=programs.QUICKLY)
+def _opened(parts: Parts, during: Nominal, widths: Array | None, late: bool) -> Opened:
     def one(during: Nominal, width: Any) -> Opened:
         if width is None:
-            return opened(parts, during)
-        return opened(replace(parts, controller=replace(parts.controller, sign_width=width)), during)
+            return opened(parts, during, late=late)
+        return opened(replace(parts, controller=replace(parts.controller, sign_width=width)), during, late=late)
 
     return jax.vmap(one)(during, widths)
 

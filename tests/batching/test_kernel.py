@@ -14,7 +14,7 @@ from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import short
+from tests.helpers import equations, short
 from tuning.search.gains import with_gains
 
 SEED = 3
@@ -176,7 +176,7 @@ def test_it_is_lowered_for_cuda_on_a_machine_without(bits, make, monkeypatch):
     with jax.enable_x64(bits == 64):
         trace, text = lowered(make(FLIGHT), jnp.arange(256, dtype=jnp.uint32), monkeypatch)
     assert "triton" in text
-    (flown,) = (eqn for eqn in equations(trace.jaxpr) if eqn.primitive.name == "pallas_call")
+    (flown,) = (eqn for eqn in equations(trace) if eqn.primitive.name == "pallas_call")
     moved = [eqn for eqn in equations(flown.params["jaxpr"]) if eqn.primitive.name in ("get", "swap")]
     vectors = [eqn.primitive.name for eqn in moved if eqn.outvars[0].aval.shape]
     assert 1 <= vectors.count("get") <= 3
@@ -214,20 +214,10 @@ def test_extremes_keep_what_is_not_a_number(kernels, monkeypatch):
 
     same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
     trace, text = lowered(function, NUMBERS, monkeypatch)
-    (flown,) = (eqn for eqn in equations(trace.jaxpr) if eqn.primitive.name == "pallas_call")
+    (flown,) = (eqn for eqn in equations(trace) if eqn.primitive.name == "pallas_call")
     used = {eqn.primitive.name for eqn in equations(flown.params["jaxpr"])}
     assert "triton" in text
     assert not used & {"max", "min", "clamp"}
-
-
-def equations(jaxpr):
-    """All equations of a trace, of those inside it too."""
-    for eqn in getattr(jaxpr, "jaxpr", jaxpr).eqns:
-        yield eqn
-        for value in eqn.params.values():
-            for inner in value if isinstance(value, tuple | list) else (value,):
-                if hasattr(getattr(inner, "jaxpr", inner), "eqns"):
-                    yield from equations(inner)
 
 
 def on_a_gpu():

@@ -28,6 +28,7 @@ from tests.batching.test_lanes import (
     squared,
     time_and_state,
 )
+from tests.helpers import equations
 
 # transformations from outside
 
@@ -228,13 +229,6 @@ def test_what_no_trial_touches_is_computed_once(run):
     assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))
 
 
-def primitives(jaxpr):
-    for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in jaxprs_in_params(eqn.params):
-            yield from primitives(inner)
-
-
 def test_a_branch_on_the_time_stays_a_branch():
     def run(s):
         late = lambda c, k: lax.cond(k > 3, lambda: jnp.exp(c), lambda: c)  # noqa: E731
@@ -243,7 +237,7 @@ def test_a_branch_on_the_time_stays_a_branch():
     def by_trial(s):
         return lax.cond(s > 0, lambda: jnp.exp(s), lambda: s)
 
-    branches, selected = (list(primitives(jax.make_jaxpr(lanes.vmap(f))(S).jaxpr)) for f in (run, by_trial))
+    branches, selected = (list(equations(jax.make_jaxpr(lanes.vmap(f))(S))) for f in (run, by_trial))
     (cond,) = [eqn for eqn in branches if eqn.primitive.name == "cond"]
     assert [v.aval.shape for v in cond.outvars] == [(TRIALS,)]
     assert not [eqn for eqn in selected if eqn.primitive.name == "cond"]
@@ -253,13 +247,13 @@ def test_a_loop_that_all_trials_leave_at_once_tests_one_number():
     def run(s):
         return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, s))
 
-    (loop,) = [e for e in primitives(jax.make_jaxpr(lanes.vmap(run))(S).jaxpr) if e.primitive.name == "while"]
+    (loop,) = [e for e in equations(jax.make_jaxpr(lanes.vmap(run))(S)) if e.primitive.name == "while"]
     assert sorted(v.aval.shape for v in loop.outvars) == [(), (TRIALS,)]
 
 
 def test_custom_derivatives_are_evaluated_by_components():
     traced = jax.make_jaxpr(lambda x: jax.jvp(lanes.vmap(cubed), (x,), (x,)))(X)
-    shapes = {v.aval.shape for eqn in primitives(traced.jaxpr) for v in eqn.outvars if eqn.primitive.name == "mul"}
+    shapes = {v.aval.shape for eqn in equations(traced) for v in eqn.outvars if eqn.primitive.name == "mul"}
     assert shapes == {(TRIALS,)}
 
 
@@ -287,7 +281,7 @@ def test_custom_derivatives_beside_whole_numbers_survive(in_axes):
 def test_a_large_carry_is_carried_whole():
     big = draw(70)
     traced = jax.make_jaxpr(lanes.vmap(lambda t: lax.scan(lambda c, _: (2 * c, None), t, None, 3)[0]))(big)
-    (loop,) = [eqn for eqn in primitives(traced.jaxpr) if eqn.primitive.name == "scan"]
+    (loop,) = [eqn for eqn in equations(traced) if eqn.primitive.name == "scan"]
     assert [v.aval.shape for v in loop.outvars] == [(TRIALS, 70)]
 
 

@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins, run_margins
-from tests.helpers import FIRST_FLIGHT, ROOT, short
+from tests.helpers import FIRST_FLIGHT, ROOT, equations, short
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
 from tuning.studies import posing
@@ -170,21 +170,11 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
-def equations(jaxpr):
-    """Those of a trace, and of all traces in it."""
-    for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda v: hasattr(v, "eqns")):
-            inner = getattr(inner, "jaxpr", inner)
-            if hasattr(inner, "eqns"):
-                yield from equations(inner)
-
-
 def test_no_product_has_an_inertia_for_each_case(drawn):
     """With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith.."."""
     asked, bounds = drawn.problem.margins, drawn.evaluate.bounds
     trace = jax.make_jaxpr(lambda share: jax.jacfwd(lambda at: margin_rows.rows(asked, bounds.gains(at)))(share))
-    products = [e for e in equations(trace(np.full(len(bounds.names), 0.5)).jaxpr) if e.primitive.name == "dot_general"]
+    products = [e for e in equations(trace(np.full(len(bounds.names), 0.5))) if e.primitive.name == "dot_general"]
     assert products
     each = (margin_rows.CASES, 3, 3)
     assert not [e for e in products if e.params["dimension_numbers"][1][0] and each in [v.aval.shape for v in e.invars]]

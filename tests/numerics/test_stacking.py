@@ -1,0 +1,86 @@
+"""Loops that record many things are those of JAX, and write one array for each type of number."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax.batching import lanes
+from ptsmc_jax.numerics import stacking
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory import linear
+from tests.helpers import equations, parts
+
+X0, TIMES = jnp.asarray([0.3, -0.2, 0.1]), jnp.arange(7.0)
+OUTER = {"state": (X0, jnp.asarray(0.5))}
+
+
+def pendulum(carry, t):
+    """Records numbers of every type and shape, some of them Python's, none at all, and empty ones."""
+    x, v = carry["state"]
+    v = v - 0.1 * jnp.sin(x[0]) + 0.01 * t
+    count = t.astype(jnp.int32)
+    seen = {
+        "x": x,
+        "outer": jnp.outer(x, x),
+        "late": t > 3.0,
+        "count": (count, count.astype(jnp.uint32) + 4_000_000_000),
+    }
+    return {"state": (x + 0.1 * v, v)}, (seen, None, jnp.zeros((2, 0)), 2.5)
+
+
+@pytest.mark.parametrize("options", [{}, {"reverse": True}, {"length": 7, "unroll": 2}])
+def test_what_is_recorded_is_what_jax_records(options):
+    ours, theirs = stacking.scan(pendulum, OUTER, TIMES, **options), jax.lax.scan(pendulum, OUTER, TIMES, **options)
+    assert jax.tree.structure(ours) == jax.tree.structure(theirs)
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert (one.shape, one.dtype, one.weak_type) == (other.shape, other.dtype, other.weak_type)
+        np.testing.assert_array_equal(one, other)
+
+
+def test_no_steps_and_nothing_recorded():
+    (seen, *_), length = stacking.scan(pendulum, OUTER, TIMES[:0])[1], len(TIMES)
+    assert seen["outer"].shape == (0, 3, 3)
+    last, nothing = stacking.scan(lambda x, _: (2.0 * x, None), 1.0, None, length=length)
+    assert (last, nothing) == (2.0**length, None)
+
+
+def slopes_of(scan):
+    def error(gain):
+        (_, (seen, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
+        return jnp.sum(seen["outer"] ** 2)
+
+    return jnp.stack([jax.grad(error)(1.3), jax.jacfwd(error)(1.3), *jax.vmap(error)(TIMES)])
+
+
+def test_it_composes_with_transformations():
+    np.testing.assert_allclose(slopes_of(stacking.scan), slopes_of(jax.lax.scan), rtol=1e-12)
+    with jax.checking_leaks():
+        jax.jit(stacking.scan, static_argnums=0)(pendulum, OUTER, TIMES)
+
+
+def arrays_written(trace):
+    """The types of the arrays that each of its loops writes."""
+    for eqn in equations(trace):
+        if eqn.primitive.name == "scan":
+            yield [v.aval.dtype for v in eqn.outvars[eqn.params["num_carry"] :]]
+
+
+SAMPLED = parts(t_f=2.0, t_end=2.5, period=0.1)
+RUNS = {
+    "nominal run": lambda: jax.make_jaxpr(linear.nominal)(SAMPLED),
+    "sampled": lambda: jax.make_jaxpr(lambda run: rollout.simulate(run, record=True))(SAMPLED),
+    "continuous": lambda: jax.make_jaxpr(lambda run: rollout.simulate(run, record=True))(parts()),
+    "batch": lambda: jax.make_jaxpr(
+        lanes.vmap(lambda trial: rollout.simulate(SAMPLED, 0, trial, record=True))
+    )(np.arange(3, dtype=np.uint32)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_loop_of_a_run_writes_one_array_of_each_type(name):
+    """XLA copies several, all of them in every step: a run's time would grow with the square of its length."""
+    written = list(arrays_written(RUNS[name]()))
+    assert any(written)
+    for types in written:
+        assert len(types) == len(set(types))
