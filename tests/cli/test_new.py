@@ -21,6 +21,7 @@ from tuning.errors import UsageError
 KEY = re.compile(r"^#?([a-z]\w*) = ")
 TABLE = re.compile(r"^#?\[(\w+)\]")
 ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
+PLANTS = " or ".join(layouts.SCENARIOS)
 FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 
 
@@ -139,7 +140,7 @@ def test_each_attitude_key_is_allowed_as_it_stands(key):
 
 
 def test_what_cannot_be_written_is_refused():
-    with pytest.raises(UsageError, match="--plant is boat, but must be spacecraft or chain or system"):
+    with pytest.raises(UsageError, match=f"--plant is boat, but must be {PLANTS}"):
         new.text("boat", {})
     with pytest.raises(UsageError, match="--plant is chain, but the scenario of --like has"):
         new.text("chain", parsing.load(FLIGHT))
@@ -177,7 +178,7 @@ def test_a_name_is_told_where_the_output_lacks_its_letters(command, tmp_path, mo
     [
         (["nowhere/s.toml"], "the file is nowhere/s.toml, but nowhere is no folder; allowed is one that exists"),
         (["."], "the file is ., which is there already; allowed is another name"),
-        (["a.toml", "--plant", "boat"], "--plant is boat, but must be spacecraft or chain or system"),
+        (["a.toml", "--plant", "boat"], f"--plant is boat, but must be {PLANTS}"),
         (["a.toml", "--like", "none.toml"], "the scenario file none.toml is not there"),
     ],
 )

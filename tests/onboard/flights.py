@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ptsmc_jax.scenario.baseline_tables import BASELINES
 from tests.tree import ROOT
 
 LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
@@ -63,7 +64,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
                    reference={"kind": "slew", "to_quat_xyzw": [0.0, 0.0, 0.3826834323650898, 0.9238795325112867],
                               "duration": 4.0}),
     **{kind: {**flight(), "controller": {"kind": kind, "t_f": 5.0}} for kind in
-       ("pd", "terminal", "fixed_time", "time_base_pd", "time_base_sliding", "scaling", "super_twisting")},
+       BASELINES},
     # from farther it turns by more than 1 rad in a period, which the C refuses
     "predefined_time": {**flight(), "controller": {"kind": "predefined_time", "t_f": 5.0},
                         "dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 15.0}}},

@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import tomllib
+import typing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,11 +16,13 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import study_plots
 from ptsmc_jax.scenario import systems
+from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
 from tests.output.pages import checked
+from tuning.cli import options
 from tuning.errors import UsageError
 from tuning.output import law_sentences, page
 from tuning.search import gains, own_parts
@@ -36,10 +39,7 @@ def tuned(scenario):
 def test_every_law_is_asked_for_the_same(monkeypatch):
     base = scenario.from_tables(TABLES)
     posed = compare.contenders(base)
-    assert list(posed) == [
-        "prescribed_time", "pd", "terminal", "fixed_time", "time_base_pd", "time_base_sliding", "scaling",
-        "predefined_time", "super_twisting",
-    ]  # fmt: skip
+    assert list(posed) == ["prescribed_time", *BASELINES]
     assert posed["prescribed_time"] is base
     for kind, other in posed.items():
         assert other.controller.kind == kind
@@ -52,6 +52,11 @@ def test_every_law_is_asked_for_the_same(monkeypatch):
     assert free["pd"] == ("k_p", "k_d", "observer_gain")
     assert free["terminal"] == ("p", "b", "k", "observer_gain", "sign_width")
     assert free["fixed_time"] == ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "observer_gain", "sign_width")
+
+
+def test_the_command_names_every_law():
+    said = typing.get_args(options.Against)[1].help.split(": ")[1].split(";")[0]
+    assert said.split(", ") == compare.laws()[1:]
 
 
 def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
