@@ -77,7 +77,7 @@ def check(scenario: Scenario) -> None:
     if scenario.motion != "spacecraft":
         kind = errors.show(scenario.plant.kind)
         raise ScenarioError(
-            f'plant.kind is {kind}, but must be "spacecraft": the laws to compare with are for attitudes'
+            f'plant.kind is {kind}, but must be "spacecraft": laws are compared with a wrong inertia, too'
         )
     if not scenario.sampled:
         mode = errors.show(scenario.loop.mode)
