@@ -20,8 +20,8 @@ STATUS = {
     "MISSED": "done; the last sample is not one period ago, so the observer has left this one out",
     "SINGULAR": "the law is next to its singularity: its last good command",
     "INPUT": "an input that is not finite, beyond all measure, no rotation, or no later than the last: the last good "
-    "command; nothing is kept",
-    "OVERFLOW": "a result is not finite: the last good command; nothing is kept",
+    "output; nothing is kept",
+    "OVERFLOW": "a result is not finite: the last good output; nothing is kept",
 }
 
 
