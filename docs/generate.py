@@ -22,9 +22,9 @@ MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. 
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
 SCENARIOS = """\
 A scenario is a TOML file of tables; every table and every key is optional. What is not said has the default, for a
-spacecraft the paper's Case I. `flexible`, `hardware`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and
-`tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused
-by name. `ptsmc new` writes all this into a file, to be changed.
+spacecraft the paper's Case I. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
+`requirements` and `tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not
+finite is refused by name. `ptsmc new` writes all this into a file, to be changed.
 
 Numbers are in the unit of their key. One in rad, rad/s, N m, N m s, s or a noise's unit may have another:
 `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`; in a list each number may.
