@@ -68,7 +68,7 @@ run.plot("convergence")
 run.animate()
 
 # %% [markdown]
-# All of the paper's claims, set beside what is measured. Most hold; three do so in part or not at all, and the last
+# All of the paper's claims, set beside what is measured. Most hold; two hold in part and three do not, and the last
 # column says by how much. `ptsmc reproduce` makes this table, gives the reasons and draws every figure of the paper.
 
 # %%
