@@ -152,8 +152,9 @@ class _File:
             "the largest sensitivity."
         )
         yield f"{'#' if live is None else ''}[requirements]"
+        known = {**catalogue, **catalogues.MARGINS}
         for name, limit in (live or REQUIREMENTS).items():
-            entry = catalogue[name]
+            entry = known[name]
             yield from _line(live is None, name, limit, f"{entry.meaning} [{entry.unit}]")
 
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
