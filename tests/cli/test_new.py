@@ -93,8 +93,8 @@ def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
             wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
-    for metric in catalogues.CATALOGUES[plant]:
-        assert metric in text
+    for metric in catalogues.CATALOGUES[plant]:  # a share of the time is asked for by the metric's own key
+        assert bool(re.search(rf"\b{metric}\b", text)) == (not metric.startswith(catalogues.WITHIN)), metric
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])

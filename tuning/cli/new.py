@@ -144,10 +144,11 @@ class _File:
     def requirements(self) -> Iterator[str]:
         """Those that are there, or two of the many."""
         catalogue, live = self.resolved.metrics, self.live.get("requirements")
+        limited = [name for name in catalogue if not name.startswith(catalogues.WITHIN)]  # which other keys ask for
         yield from _prose(
             "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
             f"A limit may be given with its unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
-            f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(catalogue)}. '
+            f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(limited)}. '
             f"Of the sampled loop also {', '.join(catalogues.MARGINS)}: the least allowed, but for the last, which is "
             "the largest sensitivity."
         )
