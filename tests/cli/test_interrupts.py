@@ -1,5 +1,6 @@
 """Ctrl-C where it came to nothing, or was told wrongly."""
 
+import importlib
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from tests.helpers import ROOT, SHORT_CHAIN, tree
-from tuning.cli import searches
+from tuning.cli import options, searches
 
 SWALLOWED = """
 import sys, time
@@ -94,3 +95,53 @@ def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_f
     assert shown == [("interrupted", "interrupted")]
     assert capsys.readouterr().err == (f"{told} goes on from here\n" if told else "")
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
+
+
+TWICE = """
+import builtins
+from tuning.cli import main
+
+told = builtins.print
+
+def first(*_, **__):
+    builtins.print = told
+    raise KeyboardInterrupt
+
+def working(*_, **__):
+    builtins.print = first  # polars raises a Ctrl-C, and Python the same one once more in what answers it
+    raise KeyboardInterrupt
+
+main.app = working
+main.main()
+"""
+WHILE_IMPORTED = """
+from tuning.cli import main
+
+def working(*_, **__):
+    raise ImportError("initialization failed") from KeyboardInterrupt()  # as pybind11 does
+
+main.app = working
+main.main()
+"""
+
+
+@pytest.mark.parametrize("program", [TWICE, WHILE_IMPORTED])
+def test_a_ctrl_c_that_comes_twice_or_as_another_error_ends_the_command_in_one_sentence(program):
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
+
+
+def test_a_ctrl_c_that_comes_once_more_while_it_is_answered_is_answered():
+    times = iter([KeyboardInterrupt])
+
+    def answer():
+        for error in times:
+            raise error
+        return 130
+
+    def work():
+        raise KeyboardInterrupt
+
+    assert options.answered(work, answer) == 130
+    with pytest.raises(ImportError, match="no such"):
+        options.answered(lambda: importlib.import_module("no such"), answer)

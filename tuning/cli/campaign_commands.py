@@ -17,6 +17,7 @@ from tuning.cli.options import (
     ScenarioFile,
     Seed,
     Trust,
+    answered,
     fraction,
     interrupted,
     prepare,
@@ -132,21 +133,23 @@ def montecarlo(
     if scenario is not None:
         searches.say_seen(scenario, seed)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
-    try:
+
+    def flown() -> int:
         with _elsewhere(cluster, tls) as elsewhere:
             campaign_folder.begin(folder, force)
             with campaign_terminal.Progress(quiet) as report:
                 if dry_run:
                     campaign_folder.write_plan(folder, report)
+                    done = folder
                 else:
-                    folder = _flown(folder, share, report, elsewhere, until_confident)
+                    done = _flown(folder, share, report, elsewhere, until_confident)
         if not a_part:
-            return _summarised(folder, quiet, figures)
-    except KeyboardInterrupt:
-        return interrupted(force)
-    if not quiet:
-        campaign_terminal.share_done(folder, share, planned=dry_run)
-    return 0
+            return _summarised(done, quiet, figures)
+        if not quiet:
+            campaign_terminal.share_done(done, share, planned=dry_run)
+        return 0
+
+    return answered(flown, lambda: interrupted(force))
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":

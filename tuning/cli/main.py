@@ -32,6 +32,7 @@ from tuning.cli.options import (
     SensitivityLimits,
     Times,
     Trust,
+    answered,
     listed_against,
     prepare,
     whole_number,
@@ -326,7 +327,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as the error stream's are: names have any letters
     unraisable, sys.unraisablehook = sys.unraisablehook, _once_more
     try:
-        status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+        status = answered(_asked, _nothing_written)
     except UnusedCliTokensError as error:
         _fail(_too_many(error))
     except CycloptsError as error:
@@ -336,9 +337,6 @@ def main() -> None:
         if _expected(error):
             _fail(str(error))
         raise
-    except KeyboardInterrupt:
-        print("ptsmc: interrupted; nothing was written", file=sys.stderr)
-        sys.exit(INTERRUPTED)
     except OSError as error:
         name = error.filename2 or error.filename  # where it was to be moved; of a full disk it is not known
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
@@ -347,6 +345,15 @@ def main() -> None:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _asked() -> object:
+    return app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+
+
+def _nothing_written() -> int:
+    print("ptsmc: interrupted; nothing was written", file=sys.stderr)
+    return INTERRUPTED
 
 
 def _once_more(unraisable: "sys.UnraisableHookArgs") -> None:

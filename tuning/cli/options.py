@@ -1,7 +1,7 @@
 """What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -107,6 +107,25 @@ def interrupted(force: bool) -> int:
     same = "the same command without --force" if force else "the same command"
     print(f"ptsmc: interrupted; {same} goes on from here", file=sys.stderr)
     return INTERRUPTED
+
+
+def answered(work: Callable[[], Any], answer: Callable[[], int]) -> Any:
+    """What work() returns, or answer() where a Ctrl-C ends it.
+
+    Polars raises a Ctrl-C itself, and Python the same one once more right behind it, in what answers the first. A
+    compiled module (pybind11) that is being imported makes an ImportError of one.
+    """
+    try:
+        try:
+            return work()
+        except KeyboardInterrupt:
+            return answer()
+        except ImportError as error:
+            if not isinstance(error.__cause__, KeyboardInterrupt):
+                raise
+            return answer()
+    except KeyboardInterrupt:
+        return answer()
 
 
 LISTED = {"t_f": "--times", "margins": "--limits"}  # what says where a front's points lie, by what it is against

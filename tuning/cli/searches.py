@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tuning.cli.options import INTERRUPTED, interrupted
+from tuning.cli.options import INTERRUPTED, answered, interrupted
 from tuning.output import terminal
 
 if TYPE_CHECKING:
@@ -73,12 +73,16 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     from tuning.search.journal import Journal
 
     journal = Journal(store.begin(folder, tables, search.known_by, fresh=not going_on))
-    try:
+
+    def searched() -> Any:
         with terminal.Progress(quiet, search.goal) as report:
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))
-    except KeyboardInterrupt:
-        return interrupted(force)
+        return outcome
+
+    outcome = answered(searched, lambda: interrupted(force))
+    if outcome == INTERRUPTED:
+        return INTERRUPTED
     if outcome.status != "interrupted":
         store.end(folder)
     elif force:
