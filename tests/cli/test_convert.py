@@ -61,6 +61,8 @@ def test_every_form_is_the_same_attitude(sequence):
     (("--rotvec-deg", "0,0,200"), "160 degrees about [0, 0, -1]"),
     (("--euler-deg", "90,0,0", "--sequence", "XYZ"), "90 degrees about [1, 0, 0]"),
     (("--rotvec-deg", "0,0,0"), "0 degrees"),
+    (("--rotvec-deg", "-90,0,0"), "90 degrees about [-1, 0, 0]"),
+    (("--dcm-body-to-inertial", "-1 0 0 0 -1 0 0 0 1"), "180 degrees about [0, 0, 1]"),
 ])  # fmt: skip
 def test_the_command_takes_each_of_them(command, options, angle):
     code, said, error = command("convert-attitude", *options)

@@ -89,7 +89,9 @@ def _examples() -> Path:
     return packed if packed.is_dir() else package.parent / "scenarios"
 
 
-_Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.")]
+# the first of them may be negative: -10,20,30 is no option
+_Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.", allow_leading_hyphen=True)]
+_Rows = Annotated[str | None, Parameter(help="Nine numbers, row by row.", allow_leading_hyphen=True)]
 
 
 def convert_attitude(
@@ -98,7 +100,7 @@ def convert_attitude(
     quat_wxyz: _Numbers = None,
     rotvec_deg: _Numbers = None,
     mrp: _Numbers = None,
-    dcm_body_to_inertial: Annotated[str | None, Parameter(help="Nine numbers, row by row.")] = None,
+    dcm_body_to_inertial: _Rows = None,
     euler_deg: _Numbers = None,
     sequence: Annotated[
         str | None, Parameter(help="Three axes in SciPy's notation, of euler_deg and of what is printed; default ZYX.")
