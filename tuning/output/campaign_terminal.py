@@ -1,7 +1,6 @@
 """What the commands of a campaign print."""
 
 import itertools
-import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,7 +100,7 @@ def why(inputs: list[dict[str, Any]], kind: str, trials: int) -> None:
         rows = list(group)
         value = rows[0]["value"]
         with_share = [row for row in rows if row["first_order"] is not None]
-        if with_share and math.isfinite(value):
+        if with_share and value is not None:
             with_share = [row for row in with_share if statistics.beyond_chance(row, trials)]
             rows = sorted((row for row in with_share if _explained(row) >= COUNTS), key=_explained, reverse=True)
         else:
@@ -109,7 +108,8 @@ def why(inputs: list[dict[str, Any]], kind: str, trials: int) -> None:
         texts = [f"{row['input']} {_of(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
         nothing = f"{metric} goes with nothing that was drawn; what is left is the noise of the trial"
         unit = catalogues.units(kind).get(metric, "")  # of one of one's own none is known
-        terminal.say(f"{metric} {_of(value, unit)} in trial {trial}: {', '.join(texts) or nothing}")
+        reached = f"no {metric}" if value is None else f"{metric} {_of(value, unit)}"
+        terminal.say(f"{reached} in trial {trial}: {', '.join(texts) or nothing}")
 
 
 def _among(row: dict[str, Any]) -> str:

@@ -40,7 +40,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                 {
                     "metric": metric,
                     "trial": int(frame["trial"][int(at)]),
-                    "value": float(values[at]),
+                    "value": float(values[at]) if np.isfinite(values[at]) else None,
                     "input": name,
                     "drawn": float(inputs[name][at]),
                     "unit": unit_of.get(name, ""),
