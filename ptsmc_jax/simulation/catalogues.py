@@ -44,7 +44,9 @@ CATALOGUE = {
     "peak_torque_delivered": Entry("N m", "largest delivered torque about one axis"),
     "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
     "effort": Entry("N m s", "integral of the 1-norm of the delivered torque"),
-    "settling_time": Entry("s", "time from which the angle stays below settling_angle, at ends of periods"),
+    "settling_time": Entry(
+        "s", "time from which the angle stays below settling_angle, interpolated between ends of periods"
+    ),
     "chattering": Entry("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
     "peak_rate": Entry("rad/s", "largest 2-norm of the body rate"),
     "peak_momentum": Entry("N m s", "largest 2-norm of the body's angular momentum"),
@@ -73,7 +75,9 @@ STATE_CATALOGUE = {
     "peak_torque_delivered": Entry("u", "largest delivered component of the input"),
     "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
     "effort": Entry("u s", "integral of the 1-norm of the delivered input"),
-    "settling_time": Entry("s", "time from which |x_1| stays below settling_angle, at ends of periods"),
+    "settling_time": Entry(
+        "s", "time from which |x_1| stays below settling_angle, interpolated between ends of periods"
+    ),
     "chattering": Entry("u/s", "total variation of the delivered input per second after t_f, largest component"),
     "peak_rate": Entry("x2", "largest |x_2|"),
 }

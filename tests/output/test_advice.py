@@ -198,6 +198,11 @@ def test_a_broken_requirement_is_named_with_its_limit():
     )
 
 
+@pytest.mark.parametrize(("times", "error"), [(1.002, "the same error"), (1.02, "1.02 times the error")])
+def test_beyond_a_bound_the_error_may_stay_as_it_is(times, error):
+    assert tune_files._beyond(tuner.Beyond(4.3, times, None), 4.0) == f"no better beyond its bound: {error} at 4.3"
+
+
 def test_beyond_a_bound_gains_may_arrive_where_no_trial_does_with_the_tuned_ones():
     """Trained on the anchored clock and lost on that which flies, they have no error to tell another one by."""
     seen = tuner.Beyond(4.3, None, None)

@@ -96,8 +96,9 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
 def _swings(swing: Mapping[str, Any]) -> str:
     return (
         f"the nominal run does NOT come to rest in hold: without noise and disturbance its command still swings by "
-        f"{swing['size']:.3g} {swing['unit']} every {swing['periods']:.3g} control periods, as a sign does whose width "
-        "is too small for the period; a loop that swings by itself has no margins left, and they count as zero"
+        f"{swing['size']:.3g} {swing['unit']} every {swing['periods']:.3g} control periods, as with a smooth sign too "
+        "narrow for the period, or gains at the border of stability; a loop that swings by itself has no margins left, "
+        "and they count as zero"
     )
 
 

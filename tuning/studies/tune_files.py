@@ -157,7 +157,9 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
         return f"no better beyond its bound: at {seen.value:g} {seen.broken}"
     if seen.times is None:  # no trial is flown to the end by the tuned gains, or their error is zero
         return f"on its bound {bound:g}: every requirement kept at {seen.value:g}, with no error to set that beside"
-    return f"no better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}"
+    times = f"{seen.times:.3g}"
+    error = "the same error" if times == "1" else f"{times} times the error"
+    return f"no better beyond its bound: {error} at {seen.value:g}"
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
