@@ -12,9 +12,9 @@ from jax import lax
 def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **options: Any) -> tuple[Any, Any]:
     """`jax.lax.scan` of these arguments, with what a step records written as one row for each type of number.
 
-    Arrays that a loop writes into are updated in place, but for those that XLA writes by one fusion of several outputs,
-    as it does on processors under `configure`: they are copied whole in every step, and the time of a run grew with the
-    square of its length.
+    Arrays that a loop writes into are updated in place, but for those that XLA writes by one fusion of several outputs
+    (`programs.BATCHED`): they are copied whole in every step, so that the time of a run would grow with the square of
+    its length.
     """
     recorded: list[Any] = []  # the structure of what one step records, and the types of its arrays
 
