@@ -224,6 +224,6 @@ def test_what_reverse_mode_keeps_of_each_step_is_written_in_place(options):
         return jnp.sum(jax.lax.scan(step, (x, 0.5 * x), jnp.arange(2000.0))[0][0] ** 2)
 
     compiled = jax.jit(jax.grad(off), compiler_options=options).lower(jnp.arange(3.0)).compile().as_text()
-    writes = [line.split()[0] for line in compiled.splitlines() if " dynamic-update-slice(" in line]
+    writes = [line.split()[0] for line in str(compiled).splitlines() if " dynamic-update-slice(" in line]
     assert len(writes) >= 4
     assert set(writes) == {"ROOT"}  # each the only output of its fusion

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.batching import lanes
+from ptsmc_jax.batching.dependence import of_scan
 from ptsmc_jax.numerics import stacking
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
@@ -63,7 +64,8 @@ def arrays_written(trace):
     """The types of the arrays that each of its loops writes."""
     for eqn in equations(trace):
         if eqn.primitive.name == "scan":
-            yield [v.aval.dtype for v in eqn.outvars[eqn.params["num_carry"] :]]
+            _, carried, _ = of_scan(eqn.params, eqn.invars)
+            yield [v.aval.dtype for v in eqn.outvars[len(carried) :]]
 
 
 SAMPLED = parts(t_f=2.0, t_end=2.5, period=0.1)
