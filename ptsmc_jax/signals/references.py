@@ -66,7 +66,9 @@ def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
 @pytree
 @dataclass(frozen=True)
 class TurningFunction(Function):
-    """A plain function of time [s] as a reference attitude: of a `Target`, or of a quaternion (4,) of any length."""
+    """A function of time [s] as a reference attitude: of a `Target`, or of a quaternion (4,) of any length."""
+
+    function: Callable  # a pytree, as `jax.tree_util.Partial` is: its numbers are leaves
 
     def __call__(self, t: Time) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Target at t [s]; a quaternion's rates are its derivatives. Raises TypeError where it is neither."""

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field, fields, replace
 from types import FunctionType
 from typing import Any, TypeVar
 
+from jax.tree_util import Partial
+
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
@@ -38,12 +40,15 @@ class Setup:
     pointing: Pointing | None = None  # which pointing errors are observed
 
     def __post_init__(self) -> None:
-        """Wraps plain functions and lambdas as disturbance or reference; that of an attitude may give a quaternion."""
+        """Wraps functions as reference of an attitude, which may give a quaternion, and plain ones as any signal."""
+        path = self.reference
+        if isinstance(path, FunctionType | Partial) and self.plant.attitude:
+            whole = path if isinstance(path, Partial) else Partial(path)  # one of another has no leaves
+            object.__setattr__(self, "reference", TurningFunction(whole))
         for name in ("disturbance", "reference"):
             value = getattr(self, name)
             if isinstance(value, FunctionType):
-                turning = name == "reference" and self.plant.attitude
-                object.__setattr__(self, name, TurningFunction(value) if turning else Function(value))
+                object.__setattr__(self, name, Function(value))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
         """The parts with another prescribed time [s]; the time after it is kept."""

@@ -50,6 +50,20 @@ def test_a_function_that_returns_a_quaternion_is_a_reference():
             np.testing.assert_allclose(found, expected, atol=1e-16)  # some rounding of 0.02
 
 
+def test_the_numbers_of_a_reference_function_are_leaves_of_the_parts():
+    """As docs/python.md says of any function: the quaternion of such a one was taken for a Target."""
+
+    def turning(rate, t):
+        return jnp.stack([0.0 * t, 0.0 * t, jnp.sin(rate * t / 2.0), jnp.cos(rate * t / 2.0)])
+
+    run = parts(8.0, 3.0, 0.5, reference=jax.tree_util.Partial(turning, vector(0.02)), period=0.1, flight=True)
+    spin = Spin(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0, 0.0, 0.02]))
+    for found, expected in zip(run.reference(jnp.asarray(7.0)), spin(jnp.asarray(7.0)), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-16)
+    slopes = jax.jacfwd(lambda run: run.reference(jnp.asarray(7.0)).w)(run).reference
+    np.testing.assert_allclose(jax.tree.leaves(slopes), [[0.0, 0.0, 1.0]], atol=1e-15)
+
+
 def test_what_is_no_attitude_and_what_has_no_inertia_is_refused_in_a_sentence():
     wrong = parts(8.0, 3.0, 0.5, reference=lambda t: jnp.zeros(3))
     with pytest.raises(TypeError, match=r"must return a quaternion \(4,\), scalar last, or a Target"):
