@@ -62,7 +62,8 @@ def simulate(
     pointing = None if parts.pointing is None else parts.pointing.of_run(ticks.t.size)
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
-    x0 = parts.controller.align(parts.initial, target)
+    # whole numbers and single precision in a start are numbers of the run, as they are in any other part
+    x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.controller.align(parts.initial, target))
     unit = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
     unit, gap = jax.lax.stop_gradient(unit), _gap(ticks, parts.t_end)

@@ -134,6 +134,16 @@ def test_what_does_not_fit_is_refused_in_a_sentence(what):
         call()
 
 
+def test_a_start_of_whole_numbers_or_in_single_precision_flies():
+    """As gains and weights of these types do: JAX spoke of the carry of a scan."""
+    q, w = jnp.asarray([0, 0, 1, 0]), RUN.initial.w.astype(jnp.float32)
+    run = replace(RUN, initial=RUN.initial._replace(q=q, w=w))
+    for record in (False, True):
+        shapes = jax.eval_shape(lambda run, record=record: ptsmc.simulate_jit(run, record=record), run)
+        assert shapes.metrics.window_error.dtype == float
+    assert shapes.log.x.q.dtype == float
+
+
 def test_a_study_and_other_values_are_made_of_a_file_too(tmp_path):
     (tmp_path / "s.toml").write_text("controller = { eta = 3.5 }")
     assert float(ptsmc.study(tmp_path / "s.toml").parts.controller.eta) == 3.5
