@@ -14,8 +14,10 @@ def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **opti
 
     Arrays that a loop writes into are updated in place, but for those that XLA writes by one fusion of several outputs
     (`programs.BATCHED`): they are copied whole in every step, so that the time of a run would grow with the square of
-    its length.
+    its length. Under `jax.disable_jit` it is that of JAX: nothing is compiled, and steps may differ in types.
     """
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return lax.scan(step, init, xs, **options)
     recorded: list[Any] = []  # the structure of what one step records, and the types of its arrays
 
     def packed(carry: Any, x: Any) -> tuple[Any, dict[str, Any]]:

@@ -46,6 +46,18 @@ def test_no_steps_and_nothing_recorded():
     assert (last, nothing) == (2.0**length, None)
 
 
+def test_step_by_step_in_python_it_is_that_of_jax():
+    """A number that is weakly typed in the first step and not later, and keys, ended in errors on pytrees."""
+
+    def step(c, t):
+        return c + t, (c, jax.random.key(0), t > 1.0, 2.0 * t)
+
+    with jax.disable_jit():
+        ours, theirs = (scan(step, 1.0, TIMES) for scan in (stacking.scan, jax.lax.scan))
+    assert jax.tree.map(jnp.shape, ours) == jax.tree.map(jnp.shape, theirs)
+    np.testing.assert_array_equal(ours[1][0], theirs[1][0])
+
+
 def slopes_of(scan):
     def error(gain):
         (_, (seen, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
