@@ -1,11 +1,11 @@
 """What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer.
 
-And reverse mode, as `configure` has it and with the compiler options of batches, which are not meant for it.
+And reverse mode, with the compiler options for programs that write arrays in a loop and without.
 """
 
 import jax
 
-from ptsmc_jax.configure import configure
+from ptsmc_jax.configure import IN_PLACE, configure
 
 configure()
 
@@ -13,7 +13,6 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
-from ptsmc_jax import programs  # noqa: E402
 from ptsmc_jax.batching import lanes  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
@@ -101,12 +100,12 @@ def reverse() -> None:
     for steps, count in ((900, 1), (3600, 1), (900, 64)):
         ready = study(True, loop__period=45.0 / steps)
         error = squares(ready, np.arange(count, dtype=np.uint32) if count > 1 else None)
-        ways = {
+        programs = {
             "forward": jax.jit(error),
             "reverse": jax.jit(jax.value_and_grad(error)),
-            "as batches are compiled": jax.jit(jax.value_and_grad(error), compiler_options=programs.BATCHED),
+            "in place": jax.jit(jax.value_and_grad(error), compiler_options=IN_PLACE),
         }
-        seconds = medians({name: lambda f=f: f(AT) for name, f in ways.items()})
+        seconds = medians({name: lambda f=f: f(AT) for name, f in programs.items()})
         told = ", ".join(f"{name} {1e6 * s / steps:.2f}" for name, s in seconds.items())
         say(f"  {steps:5d} periods, {count:3d} trials, microseconds a period: {told}")
 
