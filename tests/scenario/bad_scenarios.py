@@ -57,7 +57,7 @@ BAD = [
     (
         "disturbance.kind = 'white'",
         'disturbance.kind is "white"',
-        '"gravity_gradient"',
+        '"sinusoid" or "none" or "constant" or "gravity_gradient"',
     ),
     ("disturbance = { kind = 'none', bias = [0, 0, 0] }", "disturbance.bias is not a known key", "disturbance.kind"),
     ("disturbance.amplitude = [0.1, 0.1]", "disturbance.amplitude is [0.1, 0.1]", "three numbers"),

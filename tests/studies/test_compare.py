@@ -40,6 +40,10 @@ def test_every_law_is_asked_for_the_same(monkeypatch):
     base = scenario.from_tables(TABLES)
     posed = compare.contenders(base)
     assert list(posed) == ["prescribed_time", *BASELINES]
+    assert set(posed) >= {
+        "prescribed_time", "pd", "terminal", "fixed_time", "time_base_pd", "time_base_sliding", "scaling",
+        "predefined_time", "super_twisting",
+    }  # fmt: skip
     assert posed["prescribed_time"] is base
     for kind, other in posed.items():
         assert other.controller.kind == kind

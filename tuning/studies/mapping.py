@@ -169,7 +169,8 @@ def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
 
 def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
     count = trials if ready.drawn else 1
-    flown = montecarlo.run(common(ready.parts), ready.dispersion, seed, np.arange(count))
+    parts = common(ready.parts)
+    flown = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
     done, counts = flown.finished, flown.counts()
     errors, peaks = flown.metrics.window_error[done], flown.metrics.peak_torque[done]
     figures: dict[str, float] = {}
@@ -180,7 +181,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "largest_peak_torque": float(peaks.max()),
         }
     # of the plant's own steps as many as it needs, nearly: a program for each power of two
-    parts = replace(common(ready.parts), substeps=1 << (ready.parts.substeps - 1).bit_length())
+    parts = replace(parts, substeps=1 << (ready.parts.substeps - 1).bit_length())
     if ready.scenario.sampled:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
