@@ -1,6 +1,7 @@
 """A controller's folder compiled, and flown in the loop: `ptsmc_step` decides where else the parts' own code does."""
 
 import ctypes
+import itertools
 import json
 import os
 import shlex
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import tempfile
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,53 +21,13 @@ from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import named
-from ptsmc_jax.onboard.templates import STATUS
+from ptsmc_jax.onboard.templates import STATUS, filled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
 
-# many steps, a row each: parameters, states, inputs -> states, outputs, statuses
-GLUE = """
-#include "ptsmc_@name@_flat.h"
-
-void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
-                int *status);
-void ptsmc_first(const double *params, double *state);
-void ptsmc_set(double *params);
-
-void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
-                int *status)
-{
-    for (long k = 0; k < count; k++) {
-        ptsmc_params p;
-        ptsmc_state x;
-        ptsmc_in given;
-        ptsmc_out found;
-        params_from(params + k * PTSMC_PARAMS_SIZE, &p);
-        ptsmc_init(&p, &x); /* with what is derived, which is not among the columns */
-        state_from(state + k * PTSMC_STATE_SIZE, &x);
-        in_from(in + k * PTSMC_IN_SIZE, &given);
-        status[k] = ptsmc_step(&p, &x, &given, &found);
-        state_to(&x, after + k * PTSMC_STATE_SIZE);
-        out_to(&found, out + k * PTSMC_OUT_SIZE);
-    }
-}
-
-void ptsmc_first(const double *params, double *state)
-{
-    ptsmc_params p;
-    ptsmc_state x;
-    params_from(params, &p);
-    ptsmc_init(&p, &x);
-    state_to(&x, state);
-}
-
-void ptsmc_set(double *params)
-{
-    params_to(&ptsmc_parameters, params);
-}
-"""
-OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC")
+OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", f"-I{jax.ffi.include_dir()}")
+_loaded = itertools.count()
 
 
 def compiler() -> list[str]:
@@ -89,19 +51,28 @@ class Library:
             layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
-            self.parameters = np.zeros(len(self.columns["params"]))  # (columns,) in the order of columns["params"]
+            size = len(self.columns["params"])
         except (OSError, ValueError, KeyError, TypeError):
             raise ScenarioError(
                 f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
             ) from None
-        self.statuses: Counter[str] = Counter()
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
             self._made = ctypes.CDLL(str(self._compiled(Path(place), real, options)))
-        self._made.ptsmc_set(_at(self.parameters))
+        self._made.ptsmc_set()
+        # (columns,) in the order of columns["params"]: C's own memory
+        self.parameters = np.ctypeslib.as_array((ctypes.c_double * size).in_dll(self._made, "ptsmc_given"))
+        self._counted = np.ctypeslib.as_array((ctypes.c_long * len(STATUS)).in_dll(self._made, "ptsmc_counted"))
+        self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # what XLA knows it by
+        jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
+
+    @property
+    def statuses(self) -> Counter[str]:
+        """Number of steps by their status."""
+        return Counter({name.lower(): int(n) for name, n in zip(STATUS, self._counted, strict=True) if n})
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
-        glue.write_text(GLUE.replace("@name@", self.name), encoding="utf-8")
+        glue.write_text(filled("in_the_loop.c", name=self.name, statuses=str(len(STATUS))), encoding="utf-8")
         sources = [self.folder / f"ptsmc_{self.name}{end}.c" for end in ("", "_parameters")]
         command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{self.folder}", *map(str, sources)]
         compiled = subprocess.run(
@@ -115,22 +86,29 @@ class Library:
     def first(self) -> np.ndarray:
         """The state that `ptsmc_init` leaves."""
         state = np.zeros(len(self.columns["state"]))
-        self._made.ptsmc_first(_at(self.parameters), _at(state))
+        self._made.ptsmc_first(_at(state))
         return state
 
-    def many(self, state: Any, given: Any, parameters: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A step of each row (.., columns): states after it, outputs, statuses; parameters: by default all the same."""
+    def many(self, state: Any, given: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A step of each row (.., columns): states after it, outputs, statuses; parameters: where NaN, `parameters`."""
         state, given = (np.ascontiguousarray(v, dtype=float) for v in (state, given))
         shape = state.shape[:-1]
-        each = self.parameters if parameters is None else np.asarray(parameters, dtype=float)
-        each = np.ascontiguousarray(np.broadcast_to(each, (*shape, self.parameters.size)))
+        each = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), (*shape, self.parameters.size)))
         after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
         status = np.empty(shape, dtype=np.int32)
         count = ctypes.c_long(int(np.prod(shape, dtype=int)))
         self._made.ptsmc_many(count, *map(_at, (each, state, given, after, out, status)))
-        names = list(STATUS)
-        self.statuses.update({names[k].lower(): int(n) for k, n in enumerate(np.bincount(status.ravel())) if n})
         return after, out, status
+
+    def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`many` of one row, in a program of JAX: states after it, outputs; under vmap of many rows."""
+        out = jax.ShapeDtypeStruct((len(self.columns["out"]),), state.dtype)
+        results = jax.ShapeDtypeStruct(state.shape, state.dtype), out, jax.ShapeDtypeStruct((), jnp.int32)
+        # a callback waits for arrays that a CPU's threads copy: with one on each device none is left that could
+        here = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
+        there = partial(jax.pure_callback, self.many, results, vmap_method="broadcast_all")
+        after, out, _ = jax.lax.platform_dependent(state, given, parameters, cpu=here, default=there)
+        return after, out
 
 
 def _at(array: np.ndarray) -> ctypes.c_void_p:
@@ -196,7 +174,7 @@ class InTheLoop:
             inputs["attitude_age"] = sensors.star_age(now.sample, dt_before)
             inputs["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
-        after, out = self._stepped(state, row, self._told(parts))
+        after, out = self.library.called(state, row, self._told(parts))
         after = jnp.where(period.length > 0.0, after, state)
         outputs = self._trees(self.board.outputs, out, 0)
         memory = self._trees(self.board.state, after, 3)
@@ -214,19 +192,6 @@ class InTheLoop:
             value = jnp.where(jnp.any(drawn[path] != nominal[path]), jnp.ravel(drawn[path]), jnp.nan)
             told = told.at[at : at + value.size].set(value)
         return told
-
-    def _stepped(self, state: Any, given: Any, told: Any) -> tuple[Any, Any]:
-        shapes = (
-            jax.ShapeDtypeStruct(state.shape, state.dtype),
-            jax.ShapeDtypeStruct((len(self.library.columns["out"]),), state.dtype),
-        )
-
-        def step(state: Any, given: Any, told: Any) -> tuple[np.ndarray, np.ndarray]:
-            parameters = np.where(np.isnan(told), self.library.parameters, told)
-            after, out, _ = self.library.many(np.asarray(state), np.asarray(given), parameters)
-            return after, out
-
-        return jax.pure_callback(step, shapes, state, given, told, vmap_method="broadcast_all")
 
     def _with(self, state: Any, name: str, value: Any) -> Any:
         at = self.library.columns["state"].index(f"{name}[0]")

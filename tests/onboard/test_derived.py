@@ -133,7 +133,7 @@ def test_each_parameter_alone(name, tmp_path):
     known, library = exported(tables, tmp_path / "controller")
     first = library.parameters.copy()
     for key, (parameter, value) in changes.items():
-        library.parameters = first.copy()
+        library.parameters[:] = first
         other = changed(known, {key: changes[key]})
         before = off(other, library)
         put(library, parameter, value)

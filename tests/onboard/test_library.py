@@ -4,6 +4,7 @@ import shutil
 from dataclasses import dataclass, replace
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
 
@@ -245,6 +246,29 @@ def test_a_singular_attitude_gets_the_last_good_command(exported):
     assert statuses.tolist() == [OK] * 10 + [SINGULAR] + [OK] * 10  # half an angle within 1e-3 of a right one
     at = names_of(made.board)["out"].index("command[0]")
     np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", [np.float64, np.float32])
+def test_jax_calls_it_without_python(exported, precision):
+    """Many trials on two devices stood still for ever in a callback, whose arrays the busy threads were to copy."""
+    made, library = exported("wheels")
+    before = sum(library.statuses.values())
+    inputs = given(made)[:6].astype(precision)
+    states = np.repeat(library.first()[None], 6, axis=0).astype(precision)
+    told = np.full((6, library.parameters.size), np.nan, precision)
+    told[3:, library.columns["params"].index("law_eta")] = 4.0
+    program = jax.jit(jax.vmap(jax.vmap(library.called))).lower(*(v.reshape(2, 3, -1) for v in (states, inputs, told)))
+    assert library.target in program.as_text()
+    assert "callback" not in program.as_text()
+    found = program.compile()(*(v.reshape(2, 3, -1) for v in (states, inputs, told)))
+    wanted = library.many(states, inputs, told)[:2]
+    assert sum(library.statuses.values()) == before + 12
+    for one, other in zip(found, wanted, strict=True):
+        assert one.dtype == precision
+        np.testing.assert_array_equal(one, other.astype(precision).reshape(one.shape))
+    at = library.columns["out"].index("command[0]")
+    assert np.any(wanted[1][3:, at] != library.many(states, inputs)[1][3:, at])
 
 
 @needs_compiler

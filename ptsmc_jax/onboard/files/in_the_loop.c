@@ -1,0 +1,92 @@
+/* A controller's steps, a row each, for a program that flies it in the loop, and for XLA. */
+#include "ptsmc_@name@_flat.h"
+#include "xla/ffi/api/c_api.h"
+
+double ptsmc_given[PTSMC_PARAMS_SIZE]; /* parameters where none are told */
+long ptsmc_counted[@statuses@];        /* steps of each status */
+
+void ptsmc_first(double *state);
+void ptsmc_set(void);
+void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
+                int *status);
+XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame);
+
+void ptsmc_first(double *state)
+{
+    ptsmc_params p;
+    ptsmc_state x;
+    params_from(ptsmc_given, &p);
+    ptsmc_init(&p, &x);
+    state_to(&x, state);
+}
+
+void ptsmc_set(void)
+{
+    params_to(&ptsmc_parameters, ptsmc_given);
+}
+
+/* parameters (NaN: the given one), states, inputs -> states, outputs, statuses */
+void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
+                int *status)
+{
+    for (long k = 0; k < count; k++) {
+        double row[PTSMC_PARAMS_SIZE];
+        ptsmc_params p;
+        ptsmc_state x;
+        ptsmc_in given;
+        ptsmc_out found;
+        for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
+            const double told = params[k * PTSMC_PARAMS_SIZE + c];
+            row[c] = told == told ? told : ptsmc_given[c];
+        }
+        params_from(row, &p);
+        ptsmc_init(&p, &x); /* with what is derived, which is not among the columns */
+        state_from(state + k * PTSMC_STATE_SIZE, &x);
+        in_from(in + k * PTSMC_IN_SIZE, &given);
+        status[k] = ptsmc_step(&p, &x, &given, &found);
+        state_to(&x, after + k * PTSMC_STATE_SIZE);
+        out_to(&found, out + k * PTSMC_OUT_SIZE);
+        __atomic_fetch_add(&ptsmc_counted[status[k]], 1, __ATOMIC_RELAXED); /* devices fly side by side */
+    }
+}
+
+static void get(const XLA_FFI_Buffer *from, long k, long size, double *row)
+{
+    for (long c = 0; c < size; c++)
+        row[c] = from->dtype == XLA_FFI_DataType_F64 ? ((const double *)from->data)[k * size + c]
+                                                     : (double)((const float *)from->data)[k * size + c];
+}
+
+static void put(const double *row, long k, long size, XLA_FFI_Buffer *to)
+{
+    for (long c = 0; c < size; c++)
+        if (to->dtype == XLA_FFI_DataType_F64)
+            ((double *)to->data)[k * size + c] = row[c];
+        else
+            ((float *)to->data)[k * size + c] = (float)row[c];
+}
+
+/* what XLA calls: the same of its arrays, in its precision */
+XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame)
+{
+    if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
+        XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)(void *)frame->extension_start)->metadata;
+        about->api_version.major_version = XLA_FFI_API_MAJOR;
+        about->api_version.minor_version = XLA_FFI_API_MINOR;
+        about->traits = 0;
+        return NULL;
+    }
+    XLA_FFI_Buffer **given = (XLA_FFI_Buffer **)frame->args.args, **found = (XLA_FFI_Buffer **)frame->rets.rets;
+    long count = 1;
+    for (int64_t d = 0; d < found[2]->rank; d++) count *= (long)found[2]->dims[d];
+    for (long k = 0; k < count; k++) {
+        double params[PTSMC_PARAMS_SIZE], state[PTSMC_STATE_SIZE], in[PTSMC_IN_SIZE], out[PTSMC_OUT_SIZE];
+        get(given[0], k, PTSMC_STATE_SIZE, state);
+        get(given[1], k, PTSMC_IN_SIZE, in);
+        get(given[2], k, PTSMC_PARAMS_SIZE, params);
+        ptsmc_many(1, params, state, in, state, out, (int *)found[2]->data + k);
+        put(state, k, PTSMC_STATE_SIZE, found[0]);
+        put(out, k, PTSMC_OUT_SIZE, found[1]);
+    }
+    return NULL;
+}
