@@ -69,10 +69,16 @@ class Triangles(NamedTuple):
         return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
 
 
-def in_triangles(opening: Opening) -> Triangles:
-    """The loop L [-] in coordinates in which its matrix A is triangular (Schur)."""
+def triangle(a: Array) -> tuple[Array, Array]:
+    """A matrix A as a triangle, and the axes that it is one in (Schur), (n, n) each; without slopes."""
+    upper, axes = jax.scipy.linalg.schur(jax.lax.stop_gradient(a), output="complex")
+    return upper, axes
+
+
+def in_triangles(opening: Opening, known: tuple[Array, Array] | None = None) -> Triangles:
+    """The loop L [-] in coordinates in which its matrix A is a `triangle`; known: that of A."""
     fixed = jax.lax.stop_gradient(opening)
-    a, axes = jax.scipy.linalg.schur(fixed.a, output="complex")
+    a, axes = known or triangle(fixed.a)
     return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
 
 
@@ -82,7 +88,7 @@ def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -
     L = Y (z X - A X - B) - C X: what X and Y are off by, Schur's rounding, counts in the second order only, and so does
     what they change with the loop.
     """
-    x, y = quick.halves(z)
+    x, y = jax.lax.stop_gradient(quick.halves(z))
     x = jnp.einsum("ij,jmp->imp", quick.axes, x)
     y = jnp.einsum("ij,jmp->imp", jnp.conj(quick.axes), y)
     off = z[None, None] * x - jnp.einsum("ij,jmp->imp", opening.a, x) - opening.b[:, :, None]

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.actuators import ActuatorState
@@ -152,7 +152,7 @@ class Opened(NamedTuple):
 def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock.
 
-    late: for commands that act late within the period too, which `at_input` and `delayed_axis` need for a share of a
+    late: for commands that act late within the period too, which `at_input` and `late_axis` need for a share of a
     period; most of the work.
     """
     parts = quiet(parts)
@@ -281,10 +281,6 @@ class Opening(NamedTuple):
         """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
         return self.a + self.b @ (gain * self.c if np.ndim(gain) == 0 else gain @ self.c)
 
-    def response(self, z: Array) -> Complex[Array, "m m"]:
-        """L(z) [-], (m, m), what comes back by what acts."""
-        return -self.c @ jnp.linalg.solve(z * jnp.eye(self.a.shape[0]) - self.a, self.b + 0j)
-
 
 def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
     """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
@@ -314,14 +310,16 @@ def at_sensors(loop: Loop) -> Opening:
     return Opening(full, b, jnp.eye(k, n + waiting))
 
 
-def delayed_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Complex[Array, "m m"]:
-    """L(z) [-] at the plant's input, (m, m), one axis late by any number of periods more."""
+def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
+    """The loop at one z opened at the plant's input, one axis late by any number of periods more.
+
+    Its L(z) times z^-`loop.delay` is what comes back.
+    """
     a, command = loop.closed_at_sensors()
     whole = jnp.floor(extra_delay)
     new, old = acting(loop, extra_delay - whole)
     delayed = (new + old / z) * z**-whole
-    sent = jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0])
-    return -(z**-loop.delay) * (command @ jnp.linalg.solve(z * jnp.eye(a.shape[0]) - a, sent))
+    return Opening(a, jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0]), command)
 
 
 def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:

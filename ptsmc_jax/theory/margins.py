@@ -196,10 +196,14 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     j = jnp.argmin(sizes)
     known = jnp.isfinite(sizes[j])
     start = jnp.stack([jnp.log(crossed[j]), sizes[j] / loop.period])
+    # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
+    known_a = crossings.triangle(loop.closed_at_sensors()[0])
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
-        value = -crossings.one_axis(linear.delayed_axis(loop, z, at[1], axis), axis)
+        late = linear.late_axis(loop, z, at[1], axis)
+        L = crossings.response(late, crossings.in_triangles(late, known_a), z[None])[0][0]
+        value = -crossings.one_axis(z**-loop.delay * L, axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 
     def step(x: Array) -> Array:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear
@@ -116,7 +117,7 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
             return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]
 
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
-        way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
+        way = -matrices.solve(jax.jacfwd(error)(zero), error(zero))
         here, sloped = jax.jvp(commanded, (zero,), (way,))
         whole = commanded(way) - here
         return whole - sloped, whole

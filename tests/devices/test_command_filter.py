@@ -9,7 +9,7 @@ from scipy import signal
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import command_filter
-from ptsmc_jax.theory import linear
+from ptsmc_jax.theory import crossings, linear
 from tests.helpers import vector
 
 W, Z, H = 2.0, 0.4, 0.1
@@ -90,8 +90,8 @@ def test_the_loop_of_linear_theory_has_the_filter_in_it():
         parts = scenario.study(scenario.from_tables({**ALONE, **hardware})).parts
         run = linear.nominal_jit(parts)
         loops = linear.loops_in(parts, run, linear.full_periods(parts, run, hold=True)[-1:])
-        opening = linear.at_input(jax.tree.map(lambda v: np.asarray(v)[0], loops), 0.0, np)
-        found.append(jax.jit(jax.vmap(opening.response))(np.exp(1j * H * np.array(tones))))
+        opening = linear.at_input(jax.tree.map(lambda v: v[0], loops))
+        found.append(jax.jit(crossings.in_triangles(opening).response)(np.exp(1j * H * np.array(tones)))[0])
     b, a = signal.bilinear([36.0], [1.0, 2 * 0.7 * 6.0, 36.0], fs=6.0 / (2 * np.tan(6.0 * H / 2)))
     for w, without, behind in zip(tones, *found, strict=True):
         _, factor = signal.freqz(np.asarray(b), np.asarray(a), worN=np.array([w * H]))  # pyright: ignore[reportArgumentType]

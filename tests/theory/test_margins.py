@@ -11,8 +11,9 @@ from scipy import optimize, signal
 
 from ptsmc_jax import scenario
 from ptsmc_jax.plants import second_order
-from ptsmc_jax.theory import borders, crossings, linear, margins, run_margins
-from tests.helpers import fly, short
+from ptsmc_jax.theory import borders, crossings, linear, margins, rest, run_margins
+from tests.helpers import equations, fly, short
+from tests.helpers import parts as a_body
 from tuning.search.gains import with_gains
 
 CHAIN = {
@@ -405,3 +406,25 @@ def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, e
     made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
     spread = np.geomspace(ends[0], ends[1], 4)
     np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), spread, rtol=1e-12)
+
+
+LAPACK = {"lu", "triangular_solve", "cholesky", "eig", "eigh", "schur", "svd", "qr", "householder_product"}
+
+
+def test_lapack_is_given_one_matrix_at_a_time():
+    """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10)."""
+    _, loop, _ = chain(hardware={"delay": 1})
+    body = a_body(period=0.1)
+    loops = jax.tree.map(lambda v: jnp.stack([v, v]), loop)
+    sloped = jax.jacfwd(lambda x: margins.of_each(jax.tree.map(lambda v: x * v, loops)))
+    traces = {
+        "each": margins.of_each.trace(loops),
+        "their slopes": jax.make_jaxpr(sloped)(1.0),
+        "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
+        "responses": margins._responses.trace(loop),
+        "at rest": rest._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),
+    }
+    for name, trace in traces.items():
+        solved = [e for e in equations(trace.jaxpr) if e.primitive.name in LAPACK]
+        assert {e.invars[0].aval.ndim for e in solved} <= {2}, name
+        assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # it is looked at
