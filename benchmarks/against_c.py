@@ -12,6 +12,7 @@ from functools import partial  # noqa: E402
 from common import C_METRICS, Program, machine, medians, row, say, steps, study  # noqa: E402
 
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.programs import BATCHED  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
 TRIALS = 16384
@@ -32,7 +33,7 @@ def batch(metrics: bool) -> None:
             say(f"{name}: metrics differ from the library's by at most {max(off):.1e} of the largest")
             assert max(off) < 1e-9, "not the same loop"
 
-    @partial(jax.jit, static_argnames=("devices",))
+    @partial(jax.jit, static_argnames=("devices",), compiler_options=BATCHED)
     def peaks(parts, dispersion, trials, devices):
         def one(trial):
             return montecarlo.one(parts, dispersion, np.uint32(0), trial)[0].peak_torque

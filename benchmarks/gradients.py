@@ -1,11 +1,11 @@
 """What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer.
 
-And reverse mode, with the compiler options for programs that write arrays in a loop and without.
+And reverse mode, as `configure` has it and with the compiler options of batches, which are not meant for it.
 """
 
 import jax
 
-from ptsmc_jax.configure import IN_PLACE, configure
+from ptsmc_jax.configure import configure
 
 configure()
 
@@ -13,6 +13,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import machine, medians, say, study  # noqa: E402
 
+from ptsmc_jax import programs  # noqa: E402
 from ptsmc_jax.batching import lanes  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
@@ -100,12 +101,12 @@ def reverse() -> None:
     for steps, count in ((900, 1), (3600, 1), (900, 64)):
         ready = study(True, loop__period=45.0 / steps)
         error = squares(ready, np.arange(count, dtype=np.uint32) if count > 1 else None)
-        programs = {
+        ways = {
             "forward": jax.jit(error),
             "reverse": jax.jit(jax.value_and_grad(error)),
-            "in place": jax.jit(jax.value_and_grad(error), compiler_options=IN_PLACE),
+            "as batches are compiled": jax.jit(jax.value_and_grad(error), compiler_options=programs.BATCHED),
         }
-        seconds = medians({name: lambda f=f: f(AT) for name, f in programs.items()})
+        seconds = medians({name: lambda f=f: f(AT) for name, f in ways.items()})
         told = ", ".join(f"{name} {1e6 * s / steps:.2f}" for name, s in seconds.items())
         say(f"  {steps:5d} periods, {count:3d} trials, microseconds a period: {told}")
 

@@ -14,12 +14,15 @@ from typing import Any, Literal
 
 # Compiler options for loops on a CPU, no stable interface. The first lets all outputs of a loop's body share their
 # common work, the second compiles the whole loop into one kernel, the third lets that kernel's loops over the trials
-# become vectors however many arrays they touch, the fourth lets the vectors be as wide as the processor's.
+# become vectors however many arrays they touch, the fourth lets the vectors be as wide as the processor's. The last
+# leaves out a pass that the first brings in, but for `programs.BATCHED`: arrays that a loop writes into by one fusion
+# of several outputs, as reverse mode does, it copies whole in every step, and on some code it aborts.
 _FASTER = (
     "xla_cpu_use_multi_output_fusion=true",
     "xla_cpu_small_while_loop_byte_threshold=100000000",
     "-vectorize-memory-check-threshold=100000",
     "--xla_cpu_prefer_vector_width=512",
+    "--xla_disable_hlo_passes=cpu_multi_output_fusion",
 )
 # What takes a quarter of compiling such a kernel, and does not make it faster. A GPU's compiler would read these, too.
 _SOONER = (
@@ -37,10 +40,6 @@ def _flags(options: tuple[str, ...]) -> str:
     plain = [option for option in options if option.startswith("--")]
     return " ".join([*([f"--xla_backend_extra_options={extra}"] if extra else []), *plain])
 
-
-# Compiler options for a program of one's own that writes several arrays in a loop, as reverse mode does of all that it
-# needs later: the first of `_FASTER` would copy each of them whole in every step, see `numerics.stacking`.
-IN_PLACE = {"xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 
 # folder of whole compiled programs, see `ptsmc_jax.programs`; None: they are not kept
 programs: Path | None = None
@@ -67,19 +66,16 @@ def configure(
 
     devices: number of host devices, all cores that this process may use if None; cache: folder of the compile cache,
     None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
-    that make loops 2 to 15 times as fast forward. One of them is not for programs in reverse mode, which become
-    quadratic in the number of steps, nor for some code of one's own that scatters into several arrays under vmap, on
-    which the compiler (of jax 0.10.2 and 0.11.2) aborts: `jax.jit(function, compiler_options=configure.IN_PLACE)`
-    compiles these. The options are tried out in a process of its own, once for each version of JAX and processor where
-    there is a cache; those that are refused, or give other numbers, are left out with a warning.
-    XLA_FLAGS that set `xla_backend_extra_options` are left as they are. device: what runs are flown on, by default the
-    first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of every number; what 32 put out
-    of reach stands in docs/python.md. keep_programs: keep whole compiled programs too, and load them, in a process in
-    which no code is patched, see `ptsmc_jax.programs`, or looked for faults in: JAX's checks for NaN, infinity,
-    promotion and transfers, which stop runs, are off there whatever the environment says. Called before JAX is
-    imported, it also silences what XLA says to stderr by itself ("Very slow compile?" after two minutes), unless
-    TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX; later it raises RuntimeError where the backend has
-    already started with something else, and ValueError at any time for other bits and devices.
+    that make loops 2 to 15 times as fast. They are tried out in a process of its own, once for each version of JAX and
+    processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
+    XLA_FLAGS that set `xla_backend_extra_options` or `xla_disable_hlo_passes` are left as they are. device: what runs
+    are flown on, by default the first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of
+    every number; what 32 put out of reach stands in docs/python.md. keep_programs: keep whole compiled programs too,
+    and load them, in a process in which no code is patched, see `ptsmc_jax.programs`, or looked for faults in: JAX's
+    checks for NaN, infinity, promotion and transfers, which stop runs, are off there whatever the environment says.
+    Called before JAX is imported, it also silences what XLA says to stderr by itself ("Very slow compile?" after two
+    minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX; later it raises RuntimeError
+    where the backend has already started with something else, and ValueError at any time for other bits and devices.
     """
     if bits not in (32, 64):
         raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
@@ -126,7 +122,8 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
     global _added
     before = os.environ.get("XLA_FLAGS", "")
     flags = before.replace(_added, "").strip()
-    ours = _flags(_options(folder, device)) if fast and "xla_backend_extra_options" not in flags else ""
+    theirs = any(option in flags for option in ("xla_backend_extra_options", "xla_disable_hlo_passes"))
+    ours = _flags(_options(folder, device)) if fast and not theirs else ""
     wanted = f"{flags} {ours}".strip()
     if sorted(wanted.split()) == sorted(before.split()):
         return
@@ -263,9 +260,11 @@ def plain(step, carry, ks):
     return carry, None
 
 x = np.linspace(-3.0, 3.0, 64)
-got = jax.jit(lambda x: run(jnp, jax.lax.cond, jax.lax.scan, x, 100))(jnp.asarray(x))
 expected = run(np, lambda test, yes, no: yes() if test else no(), plain, x, 100)
-sys.exit(any(np.max(np.abs(np.asarray(a) - b)) > 1e-12 for a, b in zip(got, expected)))
+for options in (None, {"xla_disable_hlo_passes": ""}):
+    flown = jax.jit(lambda x: run(jnp, jax.lax.cond, jax.lax.scan, x, 100), compiler_options=options)
+    if any(np.max(np.abs(np.asarray(a) - b)) > 1e-12 for a, b in zip(flown(jnp.asarray(x)), expected)):
+        sys.exit(1)
 """
 
 

@@ -5,13 +5,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ptsmc_jax", "tuning")
-# jaxlib 0.11 has newer emitters only, which abort on some fusions of several outputs
-_SAFELY = "xla_cpu_use_fusion_emitters=false"
-if not version("jaxlib").startswith("0.10."):
-    _SAFELY = "xla_disable_hlo_passes=cpu_multi_output_fusion"
+_OLDER = "--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else ""
 # what compiles in half the time and flies at a third of the speed: for programs that fly once
 QUICKLY = (
-    f"--xla_backend_optimization_level=0 --{_SAFELY} --xla_cpu_parallel_codegen_split_count=1 "
+    f"--xla_backend_optimization_level=0 {_OLDER}--xla_cpu_parallel_codegen_split_count=1 "
     "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false"
 )
 

@@ -213,7 +213,7 @@ def prepare(parts: Parts, dispersion: Dispersion) -> None:
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel())
 
 
-@programs.jit(static_argnames=("devices", "own", "kernel"))
+@programs.jit(static_argnames=("devices", "own", "kernel"), compiler_options=programs.BATCHED)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,

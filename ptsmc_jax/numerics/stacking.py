@@ -13,7 +13,7 @@ def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **opti
     """`jax.lax.scan` of these arguments, with what a step records written as one row for each type of number.
 
     Arrays that a loop writes into are updated in place, but for those that XLA writes by one fusion of several outputs
-    (as under `configure`): they are copied whole in every step, so that the time of a run would grow with the square of
+    (`programs.BATCHED`): they are copied whole in every step, so that the time of a run would grow with the square of
     its length. Under `jax.disable_jit` it is that of JAX: nothing is compiled, and steps may differ in types.
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]

@@ -147,7 +147,7 @@ class _Rows:
         return jax.tree.map(joined, *calls)
 
 
-@programs.jit(static_argnames=("names", "devices"))
+@programs.jit(static_argnames=("names", "devices"), compiler_options=programs.BATCHED)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -173,7 +173,7 @@ def _fly(
     return montecarlo.row_by_row(flown, result, ROW, rows, needed, devices)
 
 
-@programs.jit(static_argnames=("names", "metrics", "devices"))
+@programs.jit(static_argnames=("names", "metrics", "devices"), compiler_options=programs.BATCHED)
 def _sloped(
     parts: Parts,
     dispersion: Dispersion,
