@@ -311,7 +311,7 @@ def at_sensors(loop: Loop) -> Opening:
 
 
 def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
-    """The loop at one z opened at the plant's input, one axis late by any number of periods more.
+    """The loop at one z [-] opened at the plant's input, B (n, m), one axis late by any number of periods more.
 
     Its L(z) times z^-`loop.delay` is what comes back.
     """
