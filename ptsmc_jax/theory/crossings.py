@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax.theory.linear import Opening
 
@@ -69,7 +69,7 @@ class Triangles(NamedTuple):
         return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
 
 
-def triangle(a: Array) -> tuple[Array, Array]:
+def triangle(a: ArrayLike) -> tuple[Array, Array]:
     """A matrix A as a triangle, and the axes that it is one in (Schur), (n, n) each; without slopes."""
     upper, axes = jax.scipy.linalg.schur(jax.lax.stop_gradient(a), output="complex")
     return upper, axes
