@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,12 @@ from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
+from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario import Study, parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory.error_floor import Floor
 
@@ -131,15 +134,24 @@ class Figures(dict[str, Figure]):
         return "".join(images)
 
 
-def simulate(what: Scenario | Study | str | Path, *, seed: int = 0, trial: int | None = None) -> Flight:
+def simulate(
+    what: Scenario | Study | str | Path,
+    *,
+    seed: int = 0,
+    trial: int | None = None,
+    controller: str | Path | None = None,
+) -> Flight:
     """Fly a scenario, that of a file or of a study, once: nominal, or a trial with its dispersions and noise.
+
+    controller: folder that `export` left, whose C then decides in the loop, on the flight clock.
 
     Raises ScenarioError, with one sentence, where it cannot be flown.
     """
     _check_whole_number("seed", seed)
     _check_whole_number("trial", 0 if trial is None else trial)
-    loaded = _read(what)
-    return Flight(loaded, runs.fly(scenario.study(loaded, drawn=trial is not None), seed, trial))
+    loaded = _read(what) if controller is None else folder.flown(_read(what))
+    ready = scenario.study(loaded, drawn=trial is not None)
+    return Flight(loaded, runs.fly(ready, seed, trial, _software(controller, ready)))
 
 
 def trials(
@@ -148,6 +160,7 @@ def trials(
     *,
     seed: int = 0,
     own: OwnMetrics | None = None,
+    controller: str | Path | None = None,
 ) -> pl.DataFrame:
     """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
 
@@ -159,18 +172,26 @@ def trials(
         count: how many trials, or a plan: a table with a row for each, see `plans`.
         seed: of the draws and the noise.
         own: metrics of one's own, see `montecarlo.one`.
+        controller: folder that `export` left, whose C then decides in the loop, on the flight clock; a study is flown
+            as its scenario says.
 
-    Raises RefusedError, with one sentence, where a plan cannot be flown, and ValueError where metrics of one's own are
-    no named numbers, or have the name of a column.
+    Raises RefusedError, with one sentence, where a plan cannot be flown, ScenarioError where the controller is none of
+    the scenario, and ValueError where metrics of one's own are no named numbers, or have the name of a column.
     """
     _check_whole_number("seed", seed)
-    ready = _ready(what)
-    names = campaign.Campaign(ready, seed, own).own_names()
+    ready = _ready(what if controller is None else folder.flown(_read(what)))
+    drawn = campaign.Campaign(ready, seed, own)
+    names = drawn.own_names()
     if isinstance(count, pl.DataFrame):
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
-        return campaign.of_plan(ready, seed, plan, own).fly(range(plan.count))
+        drawn, count = campaign.of_plan(ready, seed, plan, own), plan.count
     _check_whole_number("count", count, 1)
-    return campaign.Campaign(ready, seed, own).fly(range(count))
+    return replace(drawn, software=_software(controller, ready)).fly(range(count))
+
+
+def _software(controller: str | Path | None, ready: Study) -> Software:
+    """The flight computer that a folder's C is, or the parts' own code."""
+    return OURS if controller is None else InTheLoop(Library(controller), ready.parts).software
 
 
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:

@@ -363,6 +363,7 @@ _RULES: dict[str, Callable[[Any, Sequence, Alike], list[Lane] | None]] = {
     **dict.fromkeys(_CUMULATIVE, _cumulative),
     **dict.fromkeys(_INDEXING, lambda eqn, values, alike: None),
     "optimization_barrier": lambda eqn, values, alike: None,
+    "ffi_call": lambda eqn, values, alike: None,  # code that is not JAX's, which takes rows
     # on one device: itself
     "reshard": lambda eqn, values, alike: [Lane(eqn.outvars[0].aval.shape, parts_of(values[0]))],
     "bitcast_convert_type": _bitcast,

@@ -28,6 +28,7 @@ from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study, own_checks
 from ptsmc_jax.simulation import requirements, rollout
+from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -45,6 +46,7 @@ class Campaign:
     seed: int
     own: OwnMetrics | None = None  # metrics of one's own
     plan: Plan | None = None  # whose rows are flown, a trial each
+    software: Software = OURS  # the flight computer, where it is not the parts' own code
 
     @property
     def plan_given(self) -> bool:
@@ -59,7 +61,8 @@ class Campaign:
         """Rows of these trials."""
         # never so few that another program flies them: rows are then the same to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
-        flown = montecarlo.run(self.ready.parts, self.ready.dispersion, self.seed, self.rows(wanted), own=self.own)
+        parts, rows = self.ready.parts, self.rows(wanted)
+        flown = montecarlo.run(parts, self.ready.dispersion, self.seed, rows, own=self.own, software=self.software)
         statuses = [rollout.STATUS[int(code)] for code in flown.status]
         frame = pl.DataFrame({
             "trial": wanted,

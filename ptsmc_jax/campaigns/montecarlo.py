@@ -19,6 +19,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts, check_parts
+from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.metrics import Metrics
 
 FEW = 64  # fewer trials are flown at once, by a program for this many: a step of one costs nearly as much
@@ -87,6 +88,7 @@ def one(
     trial,
     coordinates: Coordinates | None = None,
     own: OwnMetrics | None = None,
+    software: Software = OURS,
 ) -> Flown:
     """Fly one trial: pure, for any transformation.
 
@@ -97,12 +99,13 @@ def one(
         trial: its number, or a `Row` of a plan, which brings its own seed.
         coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
         own: metrics besides the usual ones, for which the run's history is recorded.
+        software: the flight computer, where it is not the parts' own code.
     """
     about = planned.about(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = about.dispersion.coordinates(about.seed, about.trial)
     drawn = about.dispersion.at(about.parts, coordinates)
-    result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None)
+    result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None, software=software)
     own_metrics = {} if own is None else own(result, drawn)
     flown_with = _values(dispersion, drawn, about, coordinates)
     return Flown(result.metrics, result.status, result.bad_time, flown_with, own_metrics)
@@ -139,6 +142,7 @@ def run(
     block: int | None = None,
     own: OwnMetrics | None = None,
     kernel: bool | None = None,
+    software: Software = OURS,
 ) -> Trials:
     """Fly these trials, or rows of a plan: the same whatever the blocks, the devices and the order.
 
@@ -154,6 +158,7 @@ def run(
         own: see `one`.
         kernel: the loop over time as one kernel, see `batching.kernel`; None: `by_kernel()`. On a processor it is
             interpreted, slowly.
+        software: see `one`.
 
     Raises ValueError where the trials are no such numbers, TypeError where there are no parts.
     """
@@ -171,7 +176,7 @@ def run(
         chosen = k + places.reshape(devices, rows, block)
         numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
         needed = jnp.int32(-(-share // block))
-        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel)
+        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel, software)
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
         calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
@@ -210,10 +215,10 @@ def prepare(parts: Parts, dispersion: Dispersion) -> None:
     """Begin to compile what flies many trials of such parts, beside what is being done."""
     devices, block = len(jax.local_devices()), block_size()
     numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
-    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel())
+    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel(), OURS)
 
 
-@programs.jit(static_argnames=("devices", "own", "kernel"), compiler_options=programs.BATCHED)
+@programs.jit(static_argnames=("devices", "own", "kernel", "software"), compiler_options=programs.BATCHED)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -223,11 +228,12 @@ def _fly(
     devices: int,
     own: OwnMetrics | None,
     kernel: bool,
+    software: Software,
 ) -> Flown:
     """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
 
     def fly(trial: jax.Array | Row) -> Flown:
-        return one(parts, dispersion, seed, trial, own=own)
+        return one(parts, dispersion, seed, trial, own=own, software=software)
 
     result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]

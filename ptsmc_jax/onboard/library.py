@@ -105,9 +105,10 @@ class Library:
         out = jax.ShapeDtypeStruct((len(self.columns["out"]),), state.dtype)
         results = jax.ShapeDtypeStruct(state.shape, state.dtype), out, jax.ShapeDtypeStruct((), jnp.int32)
         # a callback waits for arrays that a CPU's threads copy: with one on each device none is left that could
-        here = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
-        there = partial(jax.pure_callback, self.many, results, vmap_method="broadcast_all")
-        after, out, _ = jax.lax.platform_dependent(state, given, parameters, cpu=here, default=there)
+        how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
+        if jax.default_backend() != "cpu":
+            how = partial(jax.pure_callback, self.many, results, vmap_method="broadcast_all")
+        after, out, _ = how(state, given, parameters)
         return after, out
 
 

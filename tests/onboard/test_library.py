@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import scenario
+from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import runs, store
 from ptsmc_jax.devices.attitude_filter import filter_gains
 from ptsmc_jax.dispersions.base import plant_of
@@ -269,6 +269,25 @@ def test_jax_calls_it_without_python(exported, precision):
         np.testing.assert_array_equal(one, other.astype(precision).reshape(one.shape))
     at = library.columns["out"].index("command[0]")
     assert np.any(wanted[1][3:, at] != library.many(states, inputs)[1][3:, at])
+
+
+@needs_compiler
+def test_many_trials_fly_by_the_compiled_controller(exported, monkeypatch):
+    """Rows of `trials` with a controller: of the trials that the simulator flies one by one, to rounding."""
+    made, library = exported("chain")
+    study, shares, compiled = scenario.from_tables(FLIGHTS["chain"]), [], []
+    monkeypatch.setattr(explore, "Library", lambda place: compiled.append(Library(place)) or compiled[-1])
+    rows = ptsmc.trials(study, 3, seed=5, controller=library.folder)
+    assert rows["status"].to_list() == ["ok"] * 3
+    for trial in range(3):
+        run = runs.fly(made.ready, 5, trial)
+        shares += [rows[name][trial] / run.metrics[name] - 1.0 for name in ("window_error", "peak_torque", "effort")]
+    assert np.max(np.abs(shares)) < 1e-9
+    assert sum(compiled[0].statuses.values()) >= 3 * (len(run.log.t) - 1)
+    with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
+        ptsmc.trials(scenario.from_tables(FLIGHTS["raw"]), 3, controller=library.folder)
+    one = ptsmc.simulate(study, seed=5, trial=1, controller=library.folder)
+    assert one.metrics["window_error"] == pytest.approx(rows["window_error"][1], rel=1e-9)
 
 
 @needs_compiler

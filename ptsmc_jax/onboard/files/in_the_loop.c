@@ -25,22 +25,35 @@ void ptsmc_set(void)
     params_to(&ptsmc_parameters, ptsmc_given);
 }
 
+static int told(const double *params)
+{
+    for (long c = 0; c < PTSMC_PARAMS_SIZE; c++)
+        if (params[c] == params[c]) return 1;
+    return 0;
+}
+
 /* parameters (NaN: the given one), states, inputs -> states, outputs, statuses */
 void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
                 int *status)
 {
+    ptsmc_params own;
+    ptsmc_state first; /* with what is derived, which is not among the columns */
+    params_from(ptsmc_given, &own);
+    ptsmc_init(&own, &first);
     for (long k = 0; k < count; k++) {
-        double row[PTSMC_PARAMS_SIZE];
-        ptsmc_params p;
-        ptsmc_state x;
+        ptsmc_params p = own;
+        ptsmc_state x = first;
         ptsmc_in given;
         ptsmc_out found;
-        for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
-            const double told = params[k * PTSMC_PARAMS_SIZE + c];
-            row[c] = told == told ? told : ptsmc_given[c];
+        if (told(params + k * PTSMC_PARAMS_SIZE)) {
+            double row[PTSMC_PARAMS_SIZE];
+            for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
+                const double one = params[k * PTSMC_PARAMS_SIZE + c];
+                row[c] = one == one ? one : ptsmc_given[c];
+            }
+            params_from(row, &p);
+            ptsmc_init(&p, &x);
         }
-        params_from(row, &p);
-        ptsmc_init(&p, &x); /* with what is derived, which is not among the columns */
         state_from(state + k * PTSMC_STATE_SIZE, &x);
         in_from(in + k * PTSMC_IN_SIZE, &given);
         status[k] = ptsmc_step(&p, &x, &given, &found);
@@ -52,21 +65,15 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
 
 static void get(const XLA_FFI_Buffer *from, long k, long size, double *row)
 {
-    for (long c = 0; c < size; c++)
-        row[c] = from->dtype == XLA_FFI_DataType_F64 ? ((const double *)from->data)[k * size + c]
-                                                     : (double)((const float *)from->data)[k * size + c];
+    for (long c = 0; c < size; c++) row[c] = (double)((const float *)from->data)[k * size + c];
 }
 
 static void put(const double *row, long k, long size, XLA_FFI_Buffer *to)
 {
-    for (long c = 0; c < size; c++)
-        if (to->dtype == XLA_FFI_DataType_F64)
-            ((double *)to->data)[k * size + c] = row[c];
-        else
-            ((float *)to->data)[k * size + c] = (float)row[c];
+    for (long c = 0; c < size; c++) ((float *)to->data)[k * size + c] = (float)row[c];
 }
 
-/* what XLA calls: the same of its arrays, in its precision */
+/* what XLA calls: the same of its arrays, of double or of float */
 XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame)
 {
     if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
@@ -79,6 +86,11 @@ XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame)
     XLA_FFI_Buffer **given = (XLA_FFI_Buffer **)frame->args.args, **found = (XLA_FFI_Buffer **)frame->rets.rets;
     long count = 1;
     for (int64_t d = 0; d < found[2]->rank; d++) count *= (long)found[2]->dims[d];
+    if (given[0]->dtype == XLA_FFI_DataType_F64) {
+        ptsmc_many(count, given[2]->data, given[0]->data, given[1]->data, found[0]->data, found[1]->data,
+                   found[2]->data);
+        return NULL;
+    }
     for (long k = 0; k < count; k++) {
         double params[PTSMC_PARAMS_SIZE], state[PTSMC_STATE_SIZE], in[PTSMC_IN_SIZE], out[PTSMC_OUT_SIZE];
         get(given[0], k, PTSMC_STATE_SIZE, state);
