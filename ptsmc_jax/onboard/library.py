@@ -133,11 +133,10 @@ class InTheLoop:
                     f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
-        period = float(parts.period)
-        if library.period != period:
+        period, wanted = np.float32(parts.period), np.float32(library.period)  # either may have been read with 32 bits
+        if period != wanted:
             raise ScenarioError(
-                f"loop.period is {period:g} s, but must be {library.period:g} s, that of the controller in "
-                f"{library.folder}"
+                f"loop.period is {period!s} s, but must be {wanted!s} s, that of the controller in {library.folder}"
             )
         columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
         firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)

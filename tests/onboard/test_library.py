@@ -361,3 +361,13 @@ def test_what_is_no_controller_is_refused(exported, tmp_path):
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
     with pytest.raises(ScenarioError, match="does not compile: "):
         Library(tmp_path / "controller")
+
+
+@needs_compiler
+def test_a_period_read_with_32_bits_is_the_same(exported):
+    """It was refused: 0.1 s, but must be 0.1 s."""
+    _, library = exported("chain")
+    with jax.enable_x64(False):
+        ready = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
+        assert float(ready.parts.period) != library.period
+        InTheLoop(library, ready.parts)
