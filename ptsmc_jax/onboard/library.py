@@ -26,14 +26,19 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
 
-OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", f"-I{jax.ffi.include_dir()}")
+# XLA's headers as the system's: what CC has compilers warn of is said of our code alone
+OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
 _loaded = itertools.count()
 
 
 def compiler() -> list[str]:
     """The command that compiles C; raises ScenarioError where there is none."""
     said = os.environ.get("CC", "")
-    found = shlex.split(said) or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
+    try:
+        named = shlex.split(said)
+    except ValueError as error:
+        raise ScenarioError(f"CC is {said}, but must be a command: {error}") from None
+    found = named or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
     if not found or shutil.which(found[0]) is None:
         raise ScenarioError(
             f"there is no C compiler{f' {said}' if said else ''}; allowed is cc, gcc or clang, or what CC names"
@@ -57,8 +62,16 @@ class Library:
                 f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
             ) from None
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
-            self._made = ctypes.CDLL(str(self._compiled(Path(place), real, options)))
-        self._made.ptsmc_set()
+            made = self._compiled(Path(place), real, options)
+            try:
+                self._made = ctypes.CDLL(str(made))
+                self._made.ptsmc_set()
+            except (OSError, AttributeError) as error:  # of another processor, or of another language
+                reason = str(error).removeprefix(f"{made}: ")
+                raise ScenarioError(
+                    f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it, which "
+                    f"must be a C compiler for this machine: {reason}"
+                ) from None
         # (columns,) in the order of columns["params"]: C's own memory
         self.parameters = np.ctypeslib.as_array((ctypes.c_double * size).in_dll(self._made, "ptsmc_given"))
         self._counted = np.ctypeslib.as_array((ctypes.c_long * len(STATUS)).in_dll(self._made, "ptsmc_counted"))
@@ -73,14 +86,16 @@ class Library:
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
         glue.write_text(filled("in_the_loop.c", name=self.name, statuses=str(len(STATUS))), encoding="utf-8")
-        sources = [self.folder / f"ptsmc_{self.name}{end}.c" for end in ("", "_parameters")]
-        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{self.folder}", *map(str, sources)]
+        folder = self.folder.absolute()  # else "-c" would be an option
+        sources = [str(folder / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
+        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{folder}", *sources]
         compiled = subprocess.run(
             [*command, str(glue), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
         )
         if compiled.returncode:
-            first = (compiled.stderr.strip().splitlines() or ["for no reason told"])[0]
-            raise ScenarioError(f"the controller in {self.folder} does not compile: {first}")
+            lines = compiled.stderr.strip().splitlines() or ["for no reason told"]
+            errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
+            raise ScenarioError(f"the controller in {self.folder} does not compile: {(errors or lines)[0]}")
         return library
 
     def first(self) -> np.ndarray:

@@ -20,7 +20,7 @@ from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.helpers import short
-from tests.onboard.compiled import needs_compiler
+from tests.onboard.compiled import CC, needs_compiler
 from tests.onboard.flights import FLIGHTS
 
 OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
@@ -359,8 +359,23 @@ def test_what_is_no_controller_is_refused(exported, tmp_path):
         InTheLoop(library, scenario.study(folder.flown(scenario.reading.complete(slower))).parts)
     shutil.copytree(library.folder, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
-    with pytest.raises(ScenarioError, match="does not compile: "):
+    with pytest.raises(ScenarioError, match=r"does not compile: .*error: "):
         Library(tmp_path / "controller")
+
+
+@needs_compiler
+def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(exported, monkeypatch, tmp_path):
+    """XLA's headers have what -pedantic warns of; what cannot be loaded ended in a traceback."""
+    _, library = exported("raw")
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(library.folder, "-c")
+    monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
+    Library("-c")
+    for cc, said in (("true", "does not load as true compiles it, which must be a C compiler for this machine: "),
+                     ("'cc", "^CC is 'cc, but must be a command: No closing quotation$")):  # fmt: skip
+        monkeypatch.setenv("CC", cc)
+        with pytest.raises(ScenarioError, match=said):
+            Library("-c")
 
 
 @needs_compiler
