@@ -386,3 +386,12 @@ def test_a_period_read_with_32_bits_is_the_same(exported):
         ready = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
         assert float(ready.parts.period) != library.period
         InTheLoop(library, ready.parts)
+
+
+@needs_compiler
+def test_a_compiler_that_knows_no_nan_tells_parameters_apart(filtered):
+    """-ffast-math: NaN, for that of the folder, was taken for a parameter that was told."""
+    library, samples = filtered
+    statuses, outputs = flown(Library(library.folder, options=("-ffinite-math-only",)), samples)
+    assert not statuses.any()
+    np.testing.assert_allclose(outputs, flown(library, samples)[1], rtol=1e-9, atol=1e-12)

@@ -1,4 +1,6 @@
 /* A controller's steps, a row each, for a program that flies it in the loop, and for XLA. */
+#include <string.h>
+
 #include "ptsmc_@name@_flat.h"
 #include "xla/ffi/api/c_api.h"
 
@@ -25,11 +27,12 @@ void ptsmc_set(void)
     params_to(&ptsmc_parameters, ptsmc_given);
 }
 
-static int told(const double *params)
+/* no NaN: by its bits, for with -ffast-math there are none to a compiler */
+static int is_told(const double *value)
 {
-    for (long c = 0; c < PTSMC_PARAMS_SIZE; c++)
-        if (params[c] == params[c]) return 1;
-    return 0;
+    uint64_t bits;
+    memcpy(&bits, value, sizeof bits);
+    return bits << 1 <= UINT64_C(0x7ff0000000000000) << 1;
 }
 
 /* parameters (NaN: the given one), states, inputs -> states, outputs, statuses */
@@ -45,12 +48,14 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
         ptsmc_state x = first;
         ptsmc_in given;
         ptsmc_out found;
-        if (told(params + k * PTSMC_PARAMS_SIZE)) {
-            double row[PTSMC_PARAMS_SIZE];
-            for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
-                const double one = params[k * PTSMC_PARAMS_SIZE + c];
-                row[c] = one == one ? one : ptsmc_given[c];
-            }
+        double row[PTSMC_PARAMS_SIZE];
+        int any = 0;
+        for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
+            const double *const one = params + k * PTSMC_PARAMS_SIZE + c;
+            row[c] = is_told(one) ? *one : ptsmc_given[c];
+            any |= is_told(one);
+        }
+        if (any) {
             params_from(row, &p);
             ptsmc_init(&p, &x);
         }
