@@ -106,8 +106,11 @@ class Library:
 
     def many(self, state: Any, given: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A step of each row (.., columns): states after it, outputs, statuses; parameters: where NaN, `parameters`."""
-        state, given = (np.ascontiguousarray(v, dtype=float) for v in (state, given))
-        shape = state.shape[:-1]
+        shape = np.shape(state)[:-1]
+        state, given = (
+            np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads no less
+            for v, kind in ((state, "state"), (given, "in"))
+        )
         each = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), (*shape, self.parameters.size)))
         after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
         status = np.empty(shape, dtype=np.int32)
@@ -116,9 +119,17 @@ class Library:
         return after, out, status
 
     def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`many` of one row, in a program of JAX: states after it, outputs; under vmap of many rows."""
-        out = jax.ShapeDtypeStruct((len(self.columns["out"]),), state.dtype)
-        results = jax.ShapeDtypeStruct(state.shape, state.dtype), out, jax.ShapeDtypeStruct((), jnp.int32)
+        """`many` of one row, in a program of JAX: states after it, outputs; under vmap of many rows.
+
+        In the state's precision: C reads and writes arrays of 32 or 64 bits, and of these sizes.
+        """
+        real = jnp.promote_types(jnp.result_type(state, float), jnp.float32)
+        state, given, parameters = (
+            jnp.asarray(v, real).reshape(len(self.columns[kind]))
+            for v, kind in ((state, "state"), (given, "in"), (parameters, "params"))
+        )
+        out = jax.ShapeDtypeStruct((len(self.columns["out"]),), real)
+        results = jax.ShapeDtypeStruct(state.shape, real), out, jax.ShapeDtypeStruct((), jnp.int32)
         # a callback waits for arrays that a CPU's threads copy: with one on each device none is left that could
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         if jax.default_backend() != "cpu":

@@ -292,6 +292,25 @@ def test_many_trials_fly_by_the_compiled_controller(exported, monkeypatch):
 
 
 @needs_compiler
+def test_rows_that_c_does_not_read_are_made_so_or_refused(filtered):
+    """Half precision and rows too short were written beyond, whole numbers were read as others."""
+    library, samples = filtered
+    state, given, told = library.first(), samples[0], np.full(library.parameters.size, np.nan)
+    whole = np.rint(given).astype(int)
+    np.testing.assert_array_equal(library.called(state, whole, told)[1], library.many(state, whole)[1])
+    half = [v.astype(np.float16) for v in (state, given, told)]
+    after, out = library.called(*half)
+    assert after.dtype == out.dtype == np.float32
+    np.testing.assert_array_equal(out, library.many(*half)[1].astype(np.float32))
+    for k in range(3):
+        short = [v[: -1 if j == k else None] for j, v in enumerate((state, given, told))]
+        with pytest.raises((TypeError, ValueError), match="reshape"):
+            library.called(*short)
+        with pytest.raises(ValueError, match=r"reshape|broadcast"):
+            library.many(*short)
+
+
+@needs_compiler
 def test_limits_are_told(exported):
     made, library = exported("delay, limit, quantised")
     run = runs.fly(made.ready, 0, 0, InTheLoop(library, made.ready.parts).software)
