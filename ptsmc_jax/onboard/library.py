@@ -130,10 +130,14 @@ class Library:
         )
         out = jax.ShapeDtypeStruct((len(self.columns["out"]),), real)
         results = jax.ShapeDtypeStruct(state.shape, real), out, jax.ShapeDtypeStruct((), jnp.int32)
+
+        def stepped(*rows: Any) -> list[np.ndarray]:
+            return [v.astype(made.dtype) for v, made in zip(self.many(*rows), results, strict=True)]
+
         # a callback waits for arrays that a CPU's threads copy: with one on each device none is left that could
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         if jax.default_backend() != "cpu":
-            how = partial(jax.pure_callback, self.many, results, vmap_method="broadcast_all")
+            how = partial(jax.pure_callback, stepped, results, vmap_method="broadcast_all")
         after, out, _ = how(state, given, parameters)
         return after, out
 
