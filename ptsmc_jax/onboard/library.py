@@ -4,6 +4,7 @@ import ctypes
 import itertools
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -52,15 +53,16 @@ class Library:
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
         """Compiles it; raises ScenarioError where it is no controller, or does not compile."""
         self.folder = Path(folder)
+        none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
             layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
-            size = len(self.columns["params"])
-        except (OSError, ValueError, KeyError, TypeError):
-            raise ScenarioError(
-                f"the controller is {self.folder}, but must be a folder that ptsmc export has written"
-            ) from None
+            sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
+            if not re.fullmatch(r"\w+", self.name, re.ASCII):
+                raise none
+        except (OSError, ValueError, RecursionError, OverflowError, KeyError, TypeError):
+            raise none from None
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
             made = self._compiled(Path(place), real, options)
             try:
@@ -72,11 +74,17 @@ class Library:
                     f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it, which "
                     f"must be a C compiler for this machine: {reason}"
                 ) from None
-        # (columns,) in the order of columns["params"]: C's own memory
-        self.parameters = np.ctypeslib.as_array((ctypes.c_double * size).in_dll(self._made, "ptsmc_given"))
+        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
+            raise none
+        self._given = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
         self._counted = np.ctypeslib.as_array((ctypes.c_long * len(STATUS)).in_dll(self._made, "ptsmc_counted"))
         self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # what XLA knows it by
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """What C flies with, (columns,) in the order of columns["params"]: its own memory."""
+        return self._given
 
     @property
     def statuses(self) -> Counter[str]:

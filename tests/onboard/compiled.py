@@ -10,10 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ptsmc_jax import scenario
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.onboard import printing, templates
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.onboard import folder, printing, templates
 from ptsmc_jax.onboard.expressions import Pool, kind_of
 from ptsmc_jax.onboard.translate import Translator
+from tests.onboard.flights import FLIGHTS
 
 CC = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(CC is None, reason="this machine has no C compiler")
@@ -74,3 +77,10 @@ def both(folder, function, *args):
     run = library(folder, source(function, *map(jnp.asarray, args))).run
     run(given.ctypes.data_as(ctypes.c_void_p), found.ctypes.data_as(ctypes.c_void_p))
     return found, expected
+
+
+def program(name, place):
+    """Writes a flight's controller, without vectors."""
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
+    store.write(place, lambda making: folder.write_program(making, made))
+    return made

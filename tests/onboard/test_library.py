@@ -1,6 +1,5 @@
 """The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
 
-import shutil
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -10,7 +9,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import explore, scenario
-from ptsmc_jax.campaigns import runs, store
+from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.attitude_filter import filter_gains
 from ptsmc_jax.dispersions.base import plant_of
 from ptsmc_jax.numerics.pytrees import pytree
@@ -18,9 +17,8 @@ from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
-from ptsmc_jax.scenario.errors import ScenarioError
 from tests.helpers import short
-from tests.onboard.compiled import CC, needs_compiler
+from tests.onboard.compiled import needs_compiler, program
 from tests.onboard.flights import FLIGHTS
 
 OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
@@ -32,10 +30,8 @@ def exported(tmp_path_factory):
 
     @cache
     def written(name):
-        made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
         place = tmp_path_factory.mktemp("exported") / "controller"
-        store.write(place, lambda making: folder.write_program(making, made))
-        return made, place
+        return program(name, place), place
 
     def compiled(name, real="double"):
         made, place = written(name)
@@ -365,48 +361,6 @@ def test_single_precision_flies_as_well(exported, name):
     ours, theirs = runs.fly(made.ready, 3, 2), runs.fly(made.ready, 3, 2, single)
     for name in ("peak_torque", "window_error", "effort"):
         np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-3, err_msg=name)
-
-
-@needs_compiler
-def test_what_is_no_controller_is_refused(exported, tmp_path):
-    with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
-        Library(tmp_path / "nothing")
-    _, library = exported("raw")
-    other = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
-    with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
-        InTheLoop(library, other.parts)
-    slower = scenario.from_tables({**FLIGHTS["raw"], "loop": {**FLIGHTS["raw"]["loop"], "period": 0.2}})
-    with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be .* s, that of the controller in "):
-        InTheLoop(library, scenario.study(folder.flown(scenario.reading.complete(slower))).parts)
-    shutil.copytree(library.folder, tmp_path / "controller")
-    (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
-    with pytest.raises(ScenarioError, match=r"does not compile: .*error: "):
-        Library(tmp_path / "controller")
-
-
-@needs_compiler
-def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(exported, monkeypatch, tmp_path):
-    """XLA's headers have what -pedantic warns of; what cannot be loaded ended in a traceback."""
-    _, library = exported("raw")
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(library.folder, "-c")
-    monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
-    Library("-c")
-    for cc, said in (("true", "does not load as true compiles it, which must be a C compiler for this machine: "),
-                     ("'cc", "^CC is 'cc, but must be a command: No closing quotation$")):  # fmt: skip
-        monkeypatch.setenv("CC", cc)
-        with pytest.raises(ScenarioError, match=said):
-            Library("-c")
-
-
-@needs_compiler
-def test_a_period_read_with_32_bits_is_the_same(exported):
-    """It was refused: 0.1 s, but must be 0.1 s."""
-    _, library = exported("chain")
-    with jax.enable_x64(False):
-        ready = scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))))
-        assert float(ready.parts.period) != library.period
-        InTheLoop(library, ready.parts)
 
 
 @needs_compiler

@@ -4,6 +4,7 @@
 #include "ptsmc_@name@_flat.h"
 #include "xla/ffi/api/c_api.h"
 
+const long ptsmc_sizes[4] = {PTSMC_IN_SIZE, PTSMC_OUT_SIZE, PTSMC_STATE_SIZE, PTSMC_PARAMS_SIZE};
 double ptsmc_given[PTSMC_PARAMS_SIZE]; /* parameters where none are told */
 long ptsmc_counted[@statuses@];        /* steps of each status */
 

@@ -1,0 +1,79 @@
+"""A controller's folder is compiled, or refused in one sentence."""
+
+import json
+import shutil
+
+import jax
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.library import InTheLoop, Library
+from ptsmc_jax.scenario.errors import ScenarioError
+from tests.onboard.compiled import CC, needs_compiler, program
+from tests.onboard.flights import FLIGHTS
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    """The folder of a controller on raw samples."""
+    place = tmp_path_factory.mktemp("exported") / "controller"
+    program("raw", place)
+    return place
+
+
+def parts(name, **loop):
+    """Those of a flight, with such a loop."""
+    tables = {**FLIGHTS[name], "loop": {**FLIGHTS[name]["loop"], **loop}}
+    return scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(tables)))).parts
+
+
+@needs_compiler
+def test_what_is_no_controller_is_refused(raw, tmp_path):
+    with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
+        Library(tmp_path / "nothing")
+    library = Library(raw)
+    with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
+        InTheLoop(library, parts("chain"))
+    with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be 0\.1 s, that of the controller in "):
+        InTheLoop(library, parts("raw", period=0.2))
+    shutil.copytree(raw, tmp_path / "controller")
+    (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
+    with pytest.raises(ScenarioError, match=r"does not compile: .*error: "):
+        Library(tmp_path / "controller")
+
+
+@needs_compiler
+def test_a_folder_of_two_controllers_is_none(raw, tmp_path):
+    """C wrote beyond the rows of a controller.json that was not its own; numbers for a name ended in a traceback."""
+    shutil.copytree(raw, tmp_path / "other")
+    layout = json.loads((raw / "controller.json").read_text())
+    fewer = {**layout["columns"], "state": layout["columns"]["state"][1:]}
+    for changed in ({"name": 5}, {"period": 10**400}, {"columns": {"params": [1]}}, {"columns": fewer}):
+        (tmp_path / "other" / "controller.json").write_text(json.dumps({**layout, **changed}))
+        with pytest.raises(ScenarioError, match=r"^the controller is .*other, but must be a folder that ptsmc export"):
+            Library(tmp_path / "other")
+
+
+@needs_compiler
+def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(raw, monkeypatch, tmp_path):
+    """XLA's headers have what -pedantic warns of; what cannot be loaded ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(raw, "-c")
+    monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
+    Library("-c")
+    for cc, said in (("true", "does not load as true compiles it, which must be a C compiler for this machine: "),
+                     ("'cc", "^CC is 'cc, but must be a command: No closing quotation$")):  # fmt: skip
+        monkeypatch.setenv("CC", cc)
+        with pytest.raises(ScenarioError, match=said):
+            Library("-c")
+
+
+@needs_compiler
+def test_a_period_read_with_32_bits_is_the_same(raw):
+    """It was refused: 0.1 s, but must be 0.1 s."""
+    library = Library(raw)
+    with jax.enable_x64(False):
+        known = parts("raw")
+        assert float(known.period) != library.period
+        InTheLoop(library, known)
