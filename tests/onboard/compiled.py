@@ -15,6 +15,7 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.onboard import folder, printing, templates
 from ptsmc_jax.onboard.expressions import Pool, kind_of
+from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.onboard.translate import Translator
 from tests.onboard.flights import FLIGHTS
 
@@ -60,9 +61,8 @@ def library(folder, text, *options):
     """A shared library of a program."""
     path = folder / "run.c"
     path.write_text(text)
-    assert CC is not None
     flags = [*STRICT, "-O1", "-shared", "-fPIC", *options, str(path), "-o", str(folder / "run.so"), "-lm"]
-    done = subprocess.run([CC, *flags], capture_output=True, text=True, check=False)
+    done = subprocess.run([*compiler(), *flags], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr + text
     return ctypes.CDLL(str(folder / "run.so"))
 

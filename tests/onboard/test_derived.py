@@ -12,11 +12,11 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.observers.base import ErrorBound
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.board import board
-from ptsmc_jax.onboard.library import Library
+from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.onboard.readme import readme
 from scenarios.own_parts import LowPass
 from tests.helpers import short
-from tests.onboard.compiled import CC, STRICT, needs_compiler
+from tests.onboard.compiled import STRICT, needs_compiler
 from tests.onboard.flights import FILTER, FLIGHTS, FULL, flight
 
 OTHER = np.diag([8.0, 13.0, 12.0]) + np.array([[0.0, 0.4, 0.3], [0.4, 0.0, -0.5], [0.3, -0.5, 0.0]])
@@ -185,8 +185,7 @@ def test_parameters_may_change_between_samples(tmp_path):
     said = [", ".join(map(repr, row)) for row in rows.tolist()]
     (tmp_path / "main.c").write_text(MAIN.replace("@first@", said[0]).replace("@second@", said[1]))
     sources = [tmp_path / name for name in ("ptsmc_flight.c", "ptsmc_flight_parameters.c", "main.c")]
-    assert CC is not None
-    subprocess.run([CC, *STRICT, *map(str, sources), "-o", str(tmp_path / "main"), "-lm"], check=True)
+    subprocess.run([*compiler(), *STRICT, *map(str, sources), "-o", str(tmp_path / "main"), "-lm"], check=True)
     assert subprocess.run([str(tmp_path / "main")], check=False).returncode == 0
 
 

@@ -13,6 +13,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from tests.helpers import SHORT, fly, short
@@ -54,7 +55,7 @@ def test_it_compiles_without_a_warning_and_replays_the_simulator(exported, tmp_p
 def test_it_compiles_in_the_compiler_s_own_language_too(exported):
     """With the names of a C library beside those of C99: `finite` is one, and stopped gcc without -std=c99."""
     sources = [str(place) for place in sorted(exported.glob("*.c"))]
-    called = [CC, "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *sources]
+    called = [*compiler(), "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *sources]
     done = subprocess.run(called, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
