@@ -123,6 +123,11 @@ def worst_of(each):
     return {name: farthest(name, v, 1) for name, v in each.items()}
 
 
+def sloped(asked, bounds, share):
+    """Rows and slopes at one point."""
+    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds, np.asarray(share)[None]).items()}
+
+
 def farthest(name, values, axis):
     return (np.max if name == "modulus_margin" else np.min)(np.asarray(values), axis=axis)
 
@@ -151,13 +156,14 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     posed = drawn
     asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
     assert asked is not None
-    found = margin_rows.sloped(asked, bounds, share)
+    found = sloped(asked, bounds, share)
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
     points = [share + k * step * along for k in (-2, -1, 1, 2)]
-    c = [np.asarray(margin_rows.sloped(asked, bounds, p)["c"]) for p in points]
+    c = margin_rows.of_points(asked, bounds, np.stack(points[:3]))["c"]  # and one more than devices
+    c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_slope"])
     assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain counts
@@ -167,7 +173,7 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     told = explore.verdicts(posed.ready.scenario, rows, seed=3)[-2:]
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # of the loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
-    np.testing.assert_allclose(margin_rows.sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
+    np.testing.assert_allclose(sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
 def test_no_product_has_an_inertia_for_each_case(drawn):
@@ -192,10 +198,10 @@ def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
         "margin_rows.hardest = lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0)\n"
         "ready = scenario.study(known); bounds = of_scenario(known, ready.parts)\n"
         "asked = margin_rows.ask(ready, bounds, 0)\n"
-        "print(margin_rows.sloped(asked, bounds, np.full(len(bounds.names), 0.5))['c_slope'].shape)"
+        "print(margin_rows.of_points(asked, bounds, np.full((1, len(bounds.names)), 0.5))['c_slope'].shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "(1, 30, 5)\n"), done.stderr[-2000:]
+    assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 5)\n"), done.stderr[-2000:]
 
 
 def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn):
@@ -218,7 +224,7 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_jud
     each = worst_of(all_of(parts, asked.dispersion, 3, 4))
     harder, near = margin_rows.hardest(asked, other)
     bounds = posed.evaluate.bounds
-    row = np.asarray(margin_rows.sloped(harder, bounds, bounds.share(other))["c"])
+    row = sloped(harder, bounds, bounds.share(other))["c"]
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
     limits = posed.ready.margins
     shares = [over(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
@@ -234,7 +240,7 @@ def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for
     margin_rows.ask(posed.ready, bounds, 3)
     known = [(jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)])
              for given in ((some, share) for some, bound, share in prepared if bound is bounds)]  # fmt: skip
-    asked = (posed.problem.margins, bounds.share(posed.own))
+    asked = (posed.problem.margins, np.stack([bounds.share(posed.own)] * len(jax.local_devices())))
     assert known == [(jax.tree.structure(asked), [programs._shape(leaf) for leaf in jax.tree.leaves(asked)])]
 
 

@@ -21,8 +21,7 @@ def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monke
     flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_slope": rng.normal(size=(2, 2, trials, 2))}
     of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_slope": rng.normal(size=(2, 1, loops, 2))}
     share = np.array([[0.0, 0.0], [1.0, 1.0]])
-    told = [{name: v[k] for name, v in of_loop.items()} for k in range(2)]
-    monkeypatch.setattr(evaluate.margin_rows, "sloped", lambda margins, bounds, one: told[int(one[0])])
+    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, share: of_loop)
     some: Any = SimpleNamespace(margins=object())
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
     rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}

@@ -88,8 +88,7 @@ class Evaluator:
         if problem.margins is None:
             return flown
         # slopes or not, by the one program: another takes longer to compile than most searches would save by it
-        each = [margin_rows.sloped(problem.margins, self.bounds, one) for one in share]
-        of_loop = {name: np.stack([np.asarray(one[name]) for one in each]) for name in each[0]}
+        of_loop = margin_rows.of_points(problem.margins, self.bounds, share)
         wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
 
         def padded(c: np.ndarray, fill: float) -> np.ndarray:  # every row as long as the longest

@@ -65,7 +65,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
         names=bounds.names,
     )
     some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
-    sloped.prepare(some, bounds, np.zeros(len(bounds.names)))
+    sloped.prepare(some, bounds, np.zeros((len(jax.local_devices()), len(bounds.names))))
     return hardest(asked, np.asarray(gain_names.own(ready.parts, bounds.names)))[0]
 
 
@@ -112,13 +112,24 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     return near / asked.limits[:, None] - 1.0
 
 
+def of_points(asked: Asked, bounds: Bounds, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
+    """The rows "c" at shares of the bounds' intervals, and "c_slope" by these, arrays over the points first."""
+    count = len(jax.local_devices())
+    padded = np.resize(share, (-(-len(share) // count) * count, share.shape[1]))
+    each = [sloped(asked, bounds, padded[k : k + count]) for k in range(0, len(padded), count)]
+    return jax.tree.map(lambda *v: np.concatenate(v)[: len(share)], *each)
+
+
 @programs.jit(static_argnames="bounds")
 def sloped(asked: Asked, bounds: Bounds, share: Array) -> dict[str, Array]:
-    """The rows "c" at shares (gains,) of the bounds' intervals, and "c_slope" by these."""
+    """See `of_points`; one point for each device."""
 
-    def twice(share: Array) -> tuple[Array, Array]:
-        c = rows(asked, bounds.gains(share))
-        return c, c
+    def on_device(share: Array) -> dict[str, Array]:
+        def twice(share: Array) -> tuple[Array, Array]:
+            c = rows(asked, bounds.gains(share))
+            return c, c
 
-    slope, c = jax.jacfwd(twice, has_aux=True)(share)
-    return {"c": c, "c_slope": jnp.nan_to_num(slope)}
+        slope, c = jax.jacfwd(twice, has_aux=True)(share[0])
+        return {"c": c[None], "c_slope": jnp.nan_to_num(slope)[None]}
+
+    return montecarlo.spread(on_device, share, share.shape[0])
