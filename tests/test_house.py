@@ -19,7 +19,7 @@ HOUSE = {
     "ptsmc_jax": {
         ".": "configure formulas | programs",
         "numerics": "elementary guards pytrees stacking statistics | attitude draws matrices | integrators",
-        "batching": "components dependence | choices packed | kernel | lanes",
+        "batching": "components dependence lapack | choices packed | kernel | lanes",
         "plants": "base | integrator_chain rigid_body second_order | flexible_body",
         "signals": "disturbances references",
         "laws": """

@@ -18,7 +18,7 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-from ptsmc_jax.batching import components
+from ptsmc_jax.batching import components, lapack
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
 from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, place, settle, used
 from ptsmc_jax.batching.packed import Packed
@@ -187,17 +187,18 @@ class _Lanes:
         return self.densely(eqn, values)
 
     def densely(self, eqn: Any, values: list) -> list[Lane]:
-        """One primitive by `jax.vmap`."""
+        """One primitive by `jax.vmap`, or one after the other, see `lapack`."""
         differs = _which(values)
         operands, every = [self._dense(*pair) for pair in zip(values, differs, strict=True)], either(differs)
 
         def one(*operands: Any) -> Any:
             return components.bind(eqn, operands)
 
-        function = one
+        count = (self.trials if every & TRIAL else 1) * (self.directions if every & DIRECTION else 1)
+        function, over = one, lapack.over(eqn, count)
         for axis in (TRIAL, DIRECTION):
             if every & axis:
-                function = jax.vmap(function, [0 if on & axis else None for on in differs])
+                function = over(function, [0 if on & axis else None for on in differs])
         dense = [out[:, None] if every == DIRECTION else out for out in function(*operands)]
         return [Lane(out.shape[len(self.leads[every]) :], dense=out, differs=every) for out in dense]
 

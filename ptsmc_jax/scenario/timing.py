@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
@@ -182,8 +183,8 @@ def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
         return law.motion(t, setup.initial, none, none, none).w_dot
 
     times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
-    steady = jax.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
-    return jax.vmap(jacobian)(*visited), steady
+    steady = lapack.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
+    return lapack.vmap(jacobian)(*visited), steady
 
 
 def _fastest_of_system(setup: Setup, visited: tuple) -> float:

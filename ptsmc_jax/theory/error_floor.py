@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import stacking
@@ -241,4 +242,4 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
         (move, push), (seen, seen_push) = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
         return _Linear(move, push, seen, seen_push)
 
-    return jax.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])
+    return lapack.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])

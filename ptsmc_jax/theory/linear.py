@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import stacking
@@ -178,7 +179,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
         return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
 
     (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
-    old, new, disturbed = jax.vmap(pushed)(jnp.asarray(NODES if late else NODES[:1]))
+    old, new, disturbed = lapack.vmap(pushed)(jnp.asarray(NODES if late else NODES[:1]))
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
     error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
     return Opened(loop, error, s_command, s_direct)
@@ -212,7 +213,7 @@ def _opened(parts: Parts, during: Nominal, widths: Array | None, late: bool) -> 
             return opened(parts, during, late=late)
         return opened(replace(parts, controller=replace(parts.controller, sign_width=width)), during, late=late)
 
-    return jax.vmap(one)(during, widths)
+    return lapack.vmap(one)(during, widths)
 
 
 def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
@@ -227,7 +228,7 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
 def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
     """As `loops_in`, h in [s], for indices (periods,) that may be traced: it composes with every transformation."""
     several = _interval(parts, indices)
-    loops = jax.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
+    loops = lapack.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
     return _means(loops, several.shape)
 
 

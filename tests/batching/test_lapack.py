@@ -1,0 +1,87 @@
+"""LAPACK is handed few small matrices at a time, or one: jaxlib 0.10 would wait for threads in one of these."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.batching import lanes, lapack
+from ptsmc_jax.plants import system
+from ptsmc_jax.scenario import timing
+from ptsmc_jax.theory import linear
+from tests.helpers import equations
+
+SOLVED = {"lu", "cholesky", "triangular_solve", *lapack.SHARED}
+pytestmark = pytest.mark.skipif(not lapack.WAITS, reason="this jaxlib does not wait")
+
+
+def handed(trace):
+    """The most operations that a call of LAPACK in a trace is handed, and whether one of `SHARED` is given several."""
+    found = [e for e in equations(trace) if e.primitive.name in SOLVED]
+    assert found  # it is looked at
+    several = any(e.primitive.name in lapack.SHARED and e.invars[0].aval.ndim > 2 for e in found)
+    return max(e.invars[-1].aval.size * e.invars[0].aval.shape[-1] for e in found), several
+
+
+def eigenvalues(a):
+    """Of a symmetric matrix."""
+    return jnp.linalg.eigh(a)[0]
+
+
+@pytest.mark.parametrize("function", [lambda a: jnp.linalg.solve(a, a[0]), jnp.linalg.cholesky, eigenvalues])
+@pytest.mark.parametrize("n", [3, 12])
+def test_lanes_hand_it_little(n, function):
+    """What of 12 rows 128 trials at once make no end of."""
+    root = np.random.default_rng(n).normal(size=(128, n, n))
+    a = jnp.asarray(root @ root.swapaxes(1, 2) + np.eye(n))
+    with pytest.warns(lanes.LanesWarning, match="have no rule"):
+        flown = jax.jit(lanes.vmap(function)).trace(a)
+    most, several = handed(flown.jaxpr)
+    assert most <= lapack.ALONE
+    assert not several
+    found = flown.lower().compile()(a)
+    np.testing.assert_allclose(found, jnp.stack([function(one) for one in a]), rtol=1e-9, atol=1e-9)
+
+
+def test_slopes_along_directions_are_no_exception():
+    """128 trials along 2 directions."""
+    a = jnp.broadcast_to(2.0 * jnp.eye(12), (128, 12, 12))
+    with pytest.warns(lanes.LanesWarning, match="have no rule"):
+        trace = jax.make_jaxpr(lanes.jvp(jnp.linalg.inv))((a,), (jnp.ones((2, 12, 12)),))
+    most, several = handed(trace)
+    assert most <= lapack.ALONE
+    assert not several
+
+
+def test_what_has_none_goes_as_ever():
+    """The same equations as `jax.vmap` makes of it."""
+    x = jnp.ones((1000, 20, 20))
+    traces = [jax.make_jaxpr(over(lambda a: jnp.sin(a) @ a))(x) for over in (lapack.vmap, jax.vmap)]
+    assert [e.primitive.name for e in equations(traces[0])] == [e.primitive.name for e in equations(traces[1])]
+
+
+def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
+    """Its integration steps, and its loop in many periods."""
+
+    def softened(t, x_1, x_2):
+        values, axes = jnp.linalg.eigh(jnp.eye(2) + 0.1 * jnp.outer(x_1, x_1))
+        return axes @ ((axes.T @ -x_1) / values)
+
+    plant = system(2, lambda t, x_1, x_2: x_2, softened, lambda t, x_1, x_2: jnp.eye(2))
+    tables = {
+        "plant": {"kind": "system", "system": plant, "x0": [1.0, 0.5, 0.0, 0.0]},
+        "controller": {"t_f": 3.0, "delta": 0.5, "eta": 3.0},
+        "observer": {"kind": "nonlinear", "gain": [2.0, 2.0]},
+        "loop": {"mode": "sampled", "period": 0.1, "t_end": 4.0},
+    }
+    ready = scenario.study(scenario.from_tables(tables)).parts
+    run = linear.nominal_jit(ready)
+    some = jax.tree.map(lambda v: jnp.asarray(v)[:4], run)
+    visited = jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4))
+    traces = {
+        "loops": linear._opened.trace(ready, some, None, late=True),
+        "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(ready, run, k))(jnp.arange(4)),
+        "steps": timing._rates_of_system.trace(ready, visited),
+    }
+    assert not any(handed(trace.jaxpr)[1] for trace in traces.values())
