@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
@@ -177,7 +178,7 @@ def _look(
         return run_margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        loops = jax.vmap(one)(trials)
+        loops = lapack.vmap(one)(trials)
         values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
 

@@ -7,6 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes, lapack
+from ptsmc_jax.campaigns import margin_verdicts
 from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import timing
 from ptsmc_jax.theory import linear
@@ -62,7 +63,7 @@ def test_what_has_none_goes_as_ever():
 
 
 def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
-    """Its integration steps, and its loop in many periods."""
+    """Its integration steps, its loop in many periods and that of many trials."""
 
     def softened(t, x_1, x_2):
         values, axes = jnp.linalg.eigh(jnp.eye(2) + 0.1 * jnp.outer(x_1, x_1))
@@ -74,14 +75,18 @@ def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
         "controller": {"t_f": 3.0, "delta": 0.5, "eta": 3.0},
         "observer": {"kind": "nonlinear", "gain": [2.0, 2.0]},
         "loop": {"mode": "sampled", "period": 0.1, "t_end": 4.0},
+        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.1, 0.1, 0.0, 0.0]}},
     }
-    ready = scenario.study(scenario.from_tables(tables)).parts
+    studied = scenario.study(scenario.from_tables(tables))
+    ready, dispersion = studied.parts, studied.dispersion
     run = linear.nominal_jit(ready)
     some = jax.tree.map(lambda v: jnp.asarray(v)[:4], run)
+    trials = jnp.arange(margin_verdicts.CALL, dtype=jnp.uint32)
     visited = jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4))
     traces = {
         "loops": linear._opened.trace(ready, some, None, late=True),
         "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(ready, run, k))(jnp.arange(4)),
+        "loops of trials": margin_verdicts._look.trace(ready, dispersion, jnp.uint32(0), trials),
         "steps": timing._rates_of_system.trace(ready, visited),
     }
     assert not any(handed(trace.jaxpr)[1] for trace in traces.values())
