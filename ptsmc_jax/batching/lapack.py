@@ -16,6 +16,7 @@ from jax.extend import core
 WAITS = jaxlib.version.__version_info__ < (0, 11)
 # operations, matrices times order^3, up to which jaxlib 0.10.2 does not share: it did from 1.8 to 2.2e5 of these on
 ALONE = 1 << 16
+COUNTED = frozenset(("lu", "cholesky", "triangular_solve"))  # primitives for which that is known
 SHARED = frozenset(
     """cholesky_update eig eigh geqp3 geqrf hessenberg householder_product ormqr qr schur svd tridiagonal
     tridiagonal_solve""".split()
@@ -61,7 +62,7 @@ def _work(trace: Any) -> float:
     name = trace.primitive.name
     if name in SHARED:
         return np.inf
-    if name in ("lu", "cholesky", "triangular_solve"):
+    if name in COUNTED:
         shapes = [v.aval.shape for v in trace.invars]
         return float(np.prod(shapes[-1]) * max(shapes[0][-2:]))
     return max(map(_work, _traces(trace)), default=0.0)

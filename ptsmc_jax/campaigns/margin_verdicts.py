@@ -182,6 +182,5 @@ def _look(
         values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
 
-    # on one device: of the batches of a plant of one's own LAPACK may make no end on two at once, see `batching.lapack`
     calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
     return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)

@@ -197,12 +197,12 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     known = jnp.isfinite(sizes[j])
     start = jnp.stack([jnp.log(crossed[j]), sizes[j] / loop.period])
     # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
-    known_a = crossings.triangle(loop.closed_at_sensors()[0])
+    of_a = crossings.triangle(loop.closed_at_sensors()[0])
 
     def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
         late = linear.late_axis(loop, z, at[1], axis)
-        L = crossings.response(late, crossings.in_triangles(late, known_a), z[None])[0][0]
+        L = crossings.response(late, crossings.in_triangles(late, of_a), z[None])[0][0]
         value = -crossings.one_axis(z**-loop.delay * L, axis)
         return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
 

@@ -13,13 +13,12 @@ from ptsmc_jax.scenario import timing
 from ptsmc_jax.theory import linear
 from tests.helpers import equations
 
-SOLVED = {"lu", "cholesky", "triangular_solve", *lapack.SHARED}
 pytestmark = pytest.mark.skipif(not lapack.WAITS, reason="this jaxlib does not wait")
 
 
 def handed(trace):
     """The most operations that a call of LAPACK in a trace is handed, and whether one of `SHARED` is given several."""
-    found = [e for e in equations(trace) if e.primitive.name in SOLVED]
+    found = [e for e in equations(trace) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
     assert found  # it is looked at
     several = any(e.primitive.name in lapack.SHARED and e.invars[0].aval.ndim > 2 for e in found)
     return max(e.invars[-1].aval.size * e.invars[0].aval.shape[-1] for e in found), several

@@ -10,6 +10,7 @@ import pytest
 from scipy import optimize, signal
 
 from ptsmc_jax import scenario
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.plants import second_order
 from ptsmc_jax.theory import borders, crossings, linear, margins, rest, run_margins
 from tests.helpers import equations, fly, short
@@ -408,9 +409,6 @@ def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, e
     np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), spread, rtol=1e-12)
 
 
-LAPACK = {"lu", "triangular_solve", "cholesky", "eig", "eigh", "schur", "svd", "qr", "householder_product"}
-
-
 def test_lapack_is_given_one_matrix_at_a_time():
     """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10)."""
     _, loop, _ = chain(hardware={"delay": 1})
@@ -425,6 +423,6 @@ def test_lapack_is_given_one_matrix_at_a_time():
         "at rest": rest._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),
     }
     for name, trace in traces.items():
-        solved = [e for e in equations(trace.jaxpr) if e.primitive.name in LAPACK]
+        solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
         assert {e.invars[0].aval.ndim for e in solved} <= {2}, name
         assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # it is looked at
