@@ -165,7 +165,7 @@ def trials(
     """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
 
     Number, status, reason, bad_time [s], the metrics in the units of `catalogues.CATALOGUE`, what each trial flew with,
-    and metrics of one's own.
+    and metrics of one's own; of a controller's C how many samples of each trial ended with which status of its own.
 
     Args:
         what: a scenario, its file, or one made ready to fly.
@@ -180,13 +180,14 @@ def trials(
     """
     _check_whole_number("seed", seed)
     ready = _ready(what if controller is None else folder.flown(_read(what)))
-    drawn = campaign.Campaign(ready, seed, own)
+    software = _software(controller, ready)
+    drawn = campaign.Campaign(ready, seed, own, software=software)
     names = drawn.own_names()
     if isinstance(count, pl.DataFrame):
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
-        drawn, count = campaign.of_plan(ready, seed, plan, own), plan.count
+        drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count
     _check_whole_number("count", count, 1)
-    return replace(drawn, software=_software(controller, ready)).fly(range(count))
+    return drawn.fly(range(count))
 
 
 def _software(controller: str | Path | None, ready: Study) -> Software:

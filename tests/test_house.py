@@ -73,7 +73,7 @@ HOUSE = {
         """,
         "campaigns": "margin_verdicts montecarlo store | plans rows runs | campaign | cluster",
         "onboard": """
-            expressions
+            expressions sources
             control derived origins rules
             board fields printing translate
             parameters
@@ -102,9 +102,9 @@ HOUSE = {
         """,
         "studies": """
             campaign_folder judging mapping reproduction single stability table
-            campaign_summary posing
-            reasons tuner
-            compare pareto tune_files
+            campaign_theory posing
+            campaign_summary tuner
+            compare pareto reasons tune_files
             robustness slew_times
             fronts
         """,

@@ -71,6 +71,7 @@ class Campaign:
             "bad_time": flown.bad_time,
             **self._origin(wanted),
             **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
+            **_counted(flown.samples),
             **flown.drawn,
             **flown.own,
         })  # fmt: skip
@@ -100,16 +101,23 @@ class Campaign:
                 file = getattr(getattr(made, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
 
-        flown = jax.eval_shape(lambda: montecarlo.one(self.ready.parts, self.ready.dispersion, self.seed, 0, own=asked))
+        about = self.ready.parts, self.ready.dispersion, self.seed, 0
+        flown = jax.eval_shape(lambda: montecarlo.one(*about, own=asked, software=self.software))
+        counted = _counted(flown.samples)
         own: Any = flown.own
         if not isinstance(own, dict) or not own or not all(isinstance(name, str) for name in own):
             raise ValueError(f"it returns {type(own).__name__}, but must return named numbers, a dict")
         for name, value in own.items():
             if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
                 raise ValueError(f"its {name} is no single number")
-            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *flown.drawn}:
+            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *counted, *flown.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
         return list(own)
+
+
+def _counted(samples: dict[str, Any]) -> dict[str, Any]:
+    """How the samples of trials ended, by the columns of their rows."""
+    return {f"{plans.COUNTED}{status}": count for status, count in samples.items()}
 
 
 def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, where: str = "the plan") -> Campaign:
@@ -249,15 +257,18 @@ def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
-    t, error, has_length = map(np.asarray, _history(ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows))
+    about = ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows, campaign.software
+    t, error, has_length = map(np.asarray, _history(*about))
     return t[0][has_length[0]], error[:, has_length[0]]
 
 
-@programs.jit
-def _history(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row) -> tuple:
+@programs.jit(static_argnames="software")
+def _history(
+    parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
+) -> tuple:
     def one(trial: jax.Array | Row) -> tuple:
         about = planned.about(parts, dispersion, seed, trial)
-        log = rollout.simulate(about.drawn, about.seed, about.trial, record=True).log
+        log = rollout.simulate(about.drawn, about.seed, about.trial, record=True, software=software).log
         assert log is not None
         return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.has_length
 

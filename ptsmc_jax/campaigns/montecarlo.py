@@ -39,6 +39,7 @@ class Trials:
     bad_time: np.ndarray  # first bad time [s], NaN if none
     drawn: dict[str, np.ndarray]  # what each flew with, by name, see `values`
     own: dict[str, np.ndarray] = field(default_factory=dict)  # metrics of one's own
+    samples: dict[str, np.ndarray] = field(default_factory=dict)  # of each, see `rollout.Result`
 
     __repr__ = listing
 
@@ -77,6 +78,7 @@ class Flown(NamedTuple):
     bad_time: jax.Array
     drawn: dict[str, jax.Array]
     own: dict[str, jax.Array]
+    samples: dict[str, jax.Array]
 
     __repr__ = listing
 
@@ -108,7 +110,7 @@ def one(
     result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None, software=software)
     own_metrics = {} if own is None else own(result, drawn)
     flown_with = _values(dispersion, drawn, about, coordinates)
-    return Flown(result.metrics, result.status, result.bad_time, flown_with, own_metrics)
+    return Flown(result.metrics, result.status, result.bad_time, flown_with, own_metrics, result.samples)
 
 
 @programs.jit

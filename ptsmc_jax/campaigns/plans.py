@@ -28,6 +28,7 @@ OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where
 ANGLE = "initial_angle"  # follows from others
 HEADING = ("status", "reason", "bad_time")  # of a row
 RESULTS = {*HEADING, *Metrics._fields}
+COUNTED = "controller_"  # and a status of flight software that is not ours: how many samples ended with it
 MOST = 2**32  # of trials and seeds
 
 
@@ -123,7 +124,8 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
     whose = [*OF_ROWS, *OF_ROWS.values()]
     for column in table.columns:
-        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *own):
+        of_rows = column in (*quantity_of, *whose, ANGLE, *RESULTS, *own) or column.startswith(COUNTED)
+        if not of_rows:
             close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
             raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
     given = {}

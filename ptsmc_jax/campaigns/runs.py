@@ -37,6 +37,7 @@ class Run:
     reason: str
     bad_time: float  # [s], NaN if none
     verdicts: list[Verdict]
+    samples: dict[str, int]  # by the status that flight software of another make ended them with
 
     @property
     def met(self) -> bool:
@@ -99,7 +100,8 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
     finished = np.asarray(int(result.status) in rollout.FINISHED)
     verdicts = requirements.verdicts(ready.requirements, metrics.__getitem__, finished)
-    return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts)
+    samples = {name: int(count) for name, count in result.samples.items()}
+    return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts, samples)
 
 
 def prepare(ready: Study) -> None:

@@ -126,8 +126,10 @@ def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, 
         return "files, but no versions.json of a run that can be read"
     new_tables = json.loads(json.dumps(_named(scenario)))
     for name, value in made_by.items():
-        if versions.get(name) != value:
-            return f"a run with {name} {versions.get(name)}, not {value}"
+        old = versions.get(name)
+        if old != value:
+            here = "which is not asked for here" if value is None else f"not {value}"
+            return f"a run without {name}" if old is None else f"a run with {name} {old}, {here}"
     for table in dict.fromkeys((*old_tables, *new_tables)):
         for key in dict.fromkeys((*old_tables.get(table, {}), *new_tables.get(table, {}))):
             old, new = (tables.get(table, {}).get(key, "absent") for tables in (old_tables, new_tables))

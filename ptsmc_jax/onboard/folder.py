@@ -15,6 +15,7 @@ from ptsmc_jax.onboard import templates, vectors
 from ptsmc_jax.onboard.board import Board, board
 from ptsmc_jax.onboard.generate import Code, generate
 from ptsmc_jax.onboard.readme import readme
+from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import About
 from ptsmc_jax.onboard.translate import NoRuleError
 from ptsmc_jax.scenario import own, parsing
@@ -143,7 +144,7 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     for name, text in texts.items():
         store.write_text(folder / name, text)
     layout = {"name": about.name, "digest": about.digest, "period": made.period, "columns": templates.columns(code)}
-    store.write_json(folder / "controller.json", layout)
+    store.write_json(folder / LAYOUT, layout)
 
 
 def export(

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections import Counter
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import named
+from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import STATUS, filled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
@@ -29,6 +29,8 @@ from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Soft
 
 # XLA's headers as the system's: what CC has compilers warn of is said of our code alone
 OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
+SAME = 1e-6  # relative: parameters that differ by less may have been read with 32 bits
+NAMED = 4  # parameters that a sentence names
 _loaded = itertools.count()
 
 
@@ -55,7 +57,7 @@ class Library:
         self.folder = Path(folder)
         none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
-            layout = json.loads((self.folder / "controller.json").read_text(encoding="utf-8"))
+            layout = json.loads((self.folder / LAYOUT).read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
@@ -77,7 +79,6 @@ class Library:
         if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
             raise none
         self._given = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
-        self._counted = np.ctypeslib.as_array((ctypes.c_long * len(STATUS)).in_dll(self._made, "ptsmc_counted"))
         self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # what XLA knows it by
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
 
@@ -86,14 +87,9 @@ class Library:
         """What C flies with, (columns,) in the order of columns["params"]: its own memory."""
         return self._given
 
-    @property
-    def statuses(self) -> Counter[str]:
-        """Number of steps by their status."""
-        return Counter({name.lower(): int(n) for name, n in zip(STATUS, self._counted, strict=True) if n})
-
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
-        glue.write_text(filled("in_the_loop.c", name=self.name, statuses=str(len(STATUS))), encoding="utf-8")
+        glue.write_text(filled("in_the_loop.c", name=self.name), encoding="utf-8")
         folder = self.folder.absolute()  # else "-c" would be an option
         sources = [str(folder / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
         command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{folder}", *sources]
@@ -126,8 +122,8 @@ class Library:
         self._made.ptsmc_many(count, *map(_at, (each, state, given, after, out, status)))
         return after, out, status
 
-    def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`many` of one row, in a program of JAX: states after it, outputs; under vmap of many rows.
+    def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
+        """`many` of one row, in a program of JAX: state after it, outputs, status; under vmap of many rows.
 
         In the state's precision: C reads and writes arrays of 32 or 64 bits, and of these sizes.
         """
@@ -146,8 +142,8 @@ class Library:
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         if jax.default_backend() != "cpu":
             how = partial(jax.pure_callback, stepped, results, vmap_method="broadcast_all")
-        after, out, _ = how(state, given, parameters)
-        return after, out
+        after, out, status = how(state, given, parameters)
+        return after, out, status
 
 
 def _at(array: np.ndarray) -> ctypes.c_void_p:
@@ -182,9 +178,28 @@ class InTheLoop:
         self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
 
     @property
+    def otherwise(self) -> str:
+        """One sentence that names the parameters that C has otherwise than the parts; empty where there are none."""
+        columns, made = self.library.columns["params"], named(self.board)
+        elements = {field.name: field.elements() for field in made.fields}
+        differing = [
+            f"{element} = {self.library.parameters[columns.index(element)]:.6g} instead of {value:.6g}"
+            for name, values in made.values.items()
+            for element, value in zip(elements[name], np.ravel(values), strict=True)
+            if element in columns and not np.isclose(self.library.parameters[columns.index(element)], value, rtol=SAME)
+        ]
+        if not differing:
+            return ""
+        more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
+        return (
+            f"the controller in {self.library.folder} flies with its own numbers, not the scenario's: "
+            f"{', '.join(differing[:NAMED])}{more}"
+        )
+
+    @property
     def software(self) -> Software:
         """What the rollout takes."""
-        return Software(self.boot, self.decide)
+        return Software(self.boot, self.decide, self.statuses)
 
     def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
         """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""
@@ -193,13 +208,13 @@ class InTheLoop:
         estimate = getattr(computer.sensors, "estimate", None)
         if estimate is not None:
             state = self._with(self._with(state, "attitude", estimate.q), "bias", estimate.bias)
-        return computer._replace(sensors=(computer.sensors, state))
+        return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(STATUS), jnp.int32)))
 
     def decide(
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
-        (now, dt_before, *_), (sensing, state) = period, computer.sensors
+        (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
         read, sensors = x, parts.sensors
         if sensors is not None:
             read, sensing = sensors.sample(sensing, x, now, dt_before, period.star_x)
@@ -212,15 +227,21 @@ class InTheLoop:
             inputs["attitude_age"] = sensors.star_age(now.sample, dt_before)
             inputs["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
-        after, out = self.library.called(state, row, self._told(parts))
-        after = jnp.where(period.length > 0.0, after, state)
+        after, out, status = self.library.called(state, row, self._told(parts))
+        has_length = period.length > 0.0
+        after = jnp.where(has_length, after, state)
+        counts = counts.at[status].add(has_length.astype(counts.dtype))
         outputs = self._trees(self.board.outputs, out, 0)
         memory = self._trees(self.board.state, after, 3)
         channels = outputs.get("wheel_torque", outputs.get("torque"))
         seen = self.board.state_of(tuple(memory[name] for name in self.board.seen))
         decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
                             parts.plant.velocity(seen), channels)  # fmt: skip
-        return decision, Computer((sensing, after), seen, memory["observer"], memory["law"], computer.applied)
+        return decision, Computer((sensing, after, counts), seen, memory["observer"], memory["law"], computer.applied)
+
+    def statuses(self, computer: Computer) -> dict[str, Any]:
+        """How many samples of a run ended with each status."""
+        return dict(zip(map(str.lower, STATUS), computer.sensors[2], strict=True))
 
     def _told(self, parts: Parts) -> Any:
         """The parameters (columns,) that a trial gives its flight computer otherwise; NaN of those of the folder."""

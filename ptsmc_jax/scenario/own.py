@@ -89,7 +89,11 @@ def digest_name(key: str) -> str:
 
     >>> digest_name("plant.system"), digest_name("controller.code"), digest_name("disturbance.terms[0].code")
     ('system_sha256', 'controller_sha256', 'disturbance_terms_0_sha256')
+    >>> digest_name("--metrics"), digest_name("--controller")  # not the name of `controller.code`
+    ('metrics_sha256', 'flight_code_sha256')
     """
+    if key == "--controller":
+        return "flight_code_sha256"
     place = key.removeprefix("plant.").removesuffix(".code").lstrip("-")
     return re.sub(r"\W+", "_", place).strip("_") + "_sha256"
 

@@ -69,6 +69,7 @@ class Software(NamedTuple):
 
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
     decide: Callable[[Parts, Bound, Period, Computer, Any, ActuatorState], tuple[Decision, Computer]]
+    statuses: Callable[[Computer], dict[str, Array]]  # of a run: how many samples ended with each; ours has none
 
 
 def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Period], Ticks]:
@@ -161,7 +162,7 @@ def decide(
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)
 
 
-OURS = Software(boot, decide)
+OURS = Software(boot, decide, lambda computer: {})
 
 
 def assumed_torque(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:

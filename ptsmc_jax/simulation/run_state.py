@@ -53,12 +53,16 @@ class Log(NamedTuple):
 
 
 class Result(NamedTuple):
-    """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history."""
+    """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history.
+
+    samples: how many of them flight software that is not ours ended with which status of its own.
+    """
 
     metrics: metrics.Metrics
     status: Array
     bad_time: Array
     log: Log | None
+    samples: dict[str, Array]
 
     __repr__ = listing
 
@@ -158,8 +162,15 @@ def history(rows: Log, last: Log) -> Log:
     return jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
 
 
-def finish(run: Run, first: Snapshot, state: RunState, log: Log | None, wheel_momentum: Array | None = None) -> Result:
-    """The result of a run in its state at t_end; first: at t = 0."""
+def finish(
+    run: Run,
+    first: Snapshot,
+    state: RunState,
+    log: Log | None,
+    wheel_momentum: Array | None = None,
+    samples: dict[str, Array] | None = None,
+) -> Result:
+    """The result of a run in its state at t_end; first: at t = 0; samples: see `Result`."""
     criteria, angle_at_t_f = run.criteria, state.running.arrival.angle
     values = metrics.finish(state.running, criteria)
     start = _start(run.parts, first, wheel_momentum)
@@ -172,7 +183,7 @@ def finish(run: Run, first: Snapshot, state: RunState, log: Log | None, wheel_mo
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
     bad_time = jnp.where(cut, run.gap, bad_time)
-    return Result(values, status, bad_time, log)
+    return Result(values, status, bad_time, log, samples or {})
 
 
 def _start(parts: Parts, snapshot: Snapshot, wheel_momentum: Array | None) -> Start:

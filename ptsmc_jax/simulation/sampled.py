@@ -183,4 +183,4 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     hardware = _Equipment(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
     (state, hardware), rows = stacking.scan(loop.fly, (state, hardware), periods)
     log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
-    return run_state.finish(run, first, state, log, hardware.actuators.h)
+    return run_state.finish(run, first, state, log, hardware.actuators.h, software.statuses(hardware.computer))

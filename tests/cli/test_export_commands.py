@@ -3,10 +3,12 @@
 import json
 import shutil
 
+import numpy as np
+import polars as pl
 import pytest
 
 from ptsmc_jax.onboard import folder
-from tests.helpers import SHORT, tree
+from tests.helpers import SHORT, SHORT_CHAIN, tree
 from tests.onboard.compiled import needs_compiler
 
 CONTINUOUS = SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
@@ -38,6 +40,54 @@ def test_simulate_flies_the_controller(command, tmp_path, exported):
     assert told["controller"] == layout["digest"]
     assert told["controller_statuses"] == {"ok": 65}
     assert told["status"] == "ok"
+
+
+@needs_compiler
+def test_what_the_controller_has_otherwise_is_said(command, tmp_path, exported):
+    (tmp_path / "s.toml").write_text(SHORT.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
+    status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
+    assert (status, err) == (0, f"ptsmc: the controller in {exported} flies with its own numbers, not the scenario's: "
+                                "law_eta = 3 instead of 2.9, law_k1 = 1 instead of 0.8\n")  # fmt: skip
+
+
+@needs_compiler
+def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
+    """Rows are those that the simulator's own code flies with the C's gains, to rounding, with how samples ended."""
+    text = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flight"')
+    (tmp_path / "of_c.toml").write_text(text)
+    (tmp_path / "s.toml").write_text(text.replace("[controller]", "[controller]\neta = 2.9"))
+    folder.export(tmp_path / "of_c.toml", tmp_path / "c", trials=1)
+    options = "--trials", 40, "--no-figures", "--quiet"
+    flight = "montecarlo", "s.toml", *options
+    code, out, err = command(*flight, "--controller", "c", "--out", "r")
+    assert (code, out, "law_eta = 3 instead of 2.9" in err) == (0, "", True)
+    assert command("montecarlo", "of_c.toml", *options, "--out", "o")[0] == 0
+    by_c, by_us = (pl.read_parquet(tmp_path / name / "trials") for name in ("r", "o"))
+    for name in ("window_error", "peak_torque", "effort"):
+        np.testing.assert_allclose(by_c[name], by_us[name], rtol=1e-9, err_msg=name)
+    counted = [name for name in by_c.columns if name.startswith("controller_")]
+    assert set(by_c.columns) - set(by_us.columns) == set(counted)
+    assert by_c["controller_ok"].to_list() == 40 * [65]
+    assert by_c.select(counted).sum_horizontal().to_list() == 40 * [65]
+    kept = {path.name.replace("ptsmc_of_c", "") for path in (tmp_path / "r" / "controller").iterdir()}
+    assert kept == {"controller.json", ".c", ".h", "_flat.h", "_parameters.c"}
+    samples = json.loads((tmp_path / "r" / "summary.json").read_text())["controller_samples"]
+    assert samples["ok"] == {"samples": 40 * 65, "trials": 40}
+    assert samples["singular"] == {"samples": 0, "trials": 0}
+
+    said = refused(command, tmp_path, *flight, "--out", "r")  # its rows are others
+    assert "holds a run with flight_code_sha256" in said
+    assert "which is not asked for here" in said
+    replay = "replay", "r", "--trial", 7, "--no-figures"
+    assert "r/controller (--controller), which this command would run; allowed is --trust" in refused(
+        command, tmp_path, *replay
+    )
+    code, out, err = command(*replay, "--trust")
+    assert (code, "equal to its row, to the last digit" in out, "same flight to round-off" in out) == (0, True, True)
+    assert err == f"ptsmc: runs {tmp_path / 'r' / 'controller'}, which --controller of r names\n"
+    with (tmp_path / "r" / "controller" / "ptsmc_of_c.c").open("a") as file:
+        file.write("/* changed */\n")
+    assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
 
 
 def refused(command, tmp_path, *args):

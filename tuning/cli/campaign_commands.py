@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from tuning.cli import searches
+from tuning.cli.flight_commands import ControllerFolder, flown, say_otherwise
 from tuning.cli.options import (
     Device,
     Figures,
@@ -81,6 +82,7 @@ def montecarlo(
     dry_run: Annotated[
         bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
     ] = False,
+    controller: ControllerFolder = None,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -112,6 +114,7 @@ def montecarlo(
             clustered and (precision, device) != ("64", "cpu"),
             "--cluster flies on its workers' processors with 64 bits, and goes with no other",
         ),
+        (controller and device != "cpu", "--controller flies on processors, and goes with no other --device"),
     ):
         if refused:
             raise UsageError(sentence)
@@ -123,7 +126,10 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning.studies import campaign_folder
 
-    folder = campaign_folder.Folder(path, loaded, seed, 10_000 if trials is None else trials, metrics, bits)
+    loaded = loaded if controller is None else flown(loaded)
+    folder = campaign_folder.Folder(
+        path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
+    )
     if plan is not None:
         from ptsmc_jax.campaigns import plans
 
@@ -133,8 +139,10 @@ def montecarlo(
     if scenario is not None:
         searches.say_seen(scenario, seed)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
+    if folder.computer is not None:
+        say_otherwise(folder.computer)
 
-    def flown() -> int:
+    def campaign() -> int:
         with _elsewhere(cluster, tls) as elsewhere:
             campaign_folder.begin(folder, force)
             with campaign_terminal.Progress(quiet) as report:
@@ -149,7 +157,7 @@ def montecarlo(
             campaign_terminal.share_done(done, share, planned=dry_run)
         return 0
 
-    return answered(flown, lambda: interrupted(force))
+    return answered(campaign, lambda: interrupted(force))
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
@@ -169,9 +177,9 @@ def _flown(
     width: float | None,
 ) -> "Folder":
     """The campaign flown, its share of it; width: until every requirement's share is known to within it."""
-    from tuning.studies import campaign_folder
+    from tuning.studies import campaign_folder, campaign_theory
 
-    campaign_folder.prepare_floor(folder)
+    campaign_theory.prepare(folder)
     if width is None:
         campaign_folder.fly(folder, share, report, elsewhere)
     else:
@@ -181,7 +189,7 @@ def _flown(
             folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
         )
         folder = campaign_folder.settle(folder, stopped)
-    campaign_folder.find_floor(folder)
+    campaign_theory.find(folder)
     return folder
 
 

@@ -1,7 +1,8 @@
 """The command that takes gains to flight, and what flies its C in the loop."""
 
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -9,7 +10,7 @@ from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_nu
 from tuning.output import terminal
 
 if TYPE_CHECKING:
-    from ptsmc_jax.campaigns.runs import Run
+    from ptsmc_jax.onboard.library import InTheLoop
     from ptsmc_jax.scenario.flyable import Study
     from ptsmc_jax.scenario.tables import Scenario
 
@@ -52,27 +53,29 @@ def export(
     return 0
 
 
-class Compiled:
-    """A controller's folder, compiled, for `ptsmc simulate --controller`."""
+def flown(scenario: "Scenario") -> "Scenario":
+    """The scenario as a controller's C flies it: on the flight clock. Raises ScenarioError of what has none."""
+    from ptsmc_jax.onboard import folder
 
-    def __init__(self, folder: Path):
-        from ptsmc_jax.onboard.library import Library
+    return folder.flown(scenario)
 
-        self._library = Library(folder)
 
-    def flown(self, scenario: "Scenario") -> "Scenario":
-        """The scenario as it flies: on the flight clock."""
-        from ptsmc_jax.onboard import folder
+def compiled(controller: Path, ready: "Study") -> "InTheLoop":
+    """The C of a folder, compiled, for the parts of a study; what it has otherwise is said.
 
-        return folder.flown(scenario)
+    Raises ScenarioError where it does not compile, or is a controller of other parts.
+    """
+    from ptsmc_jax.onboard.library import InTheLoop, Library
 
-    def fly(self, ready: "Study", seed: int, trial: int | None) -> "tuple[Run, dict[str, Any]]":
-        """A run with the controller in the loop; which one it is, and how many samples ended with each status."""
-        from ptsmc_jax.campaigns import runs
-        from ptsmc_jax.onboard.library import InTheLoop
+    computer = InTheLoop(Library(controller), ready.parts)
+    say_otherwise(computer)
+    return computer
 
-        run = runs.fly(ready, seed, trial, InTheLoop(self._library, ready.parts).software)
-        return run, {"controller": self._library.digest, "controller_statuses": dict(self._library.statuses)}
+
+def say_otherwise(computer: "InTheLoop") -> None:
+    """Say which parameters the C that decides has otherwise than the scenario."""
+    if computer.otherwise:
+        print(f"ptsmc: {computer.otherwise}", file=sys.stderr)
 
 
 COMMANDS = (export,)

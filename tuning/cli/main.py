@@ -74,16 +74,18 @@ def simulate(
     loaded, folder = prepare(scenario, "simulate", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
+    from ptsmc_jax.simulation.computer import OURS
     from tuning.studies import single
 
-    computer = None if controller is None else flight_commands.Compiled(controller)
-    loaded = loaded if computer is None else computer.flown(loaded)
+    loaded = loaded if controller is None else flight_commands.flown(loaded)
     ready = study(loaded, drawn=trial is not None)
+    computer = None if controller is None else flight_commands.compiled(controller, ready)
     steps = timing.steps(ready.parts)
     if steps > LONG and not quiet:
         terminal.say(f"flying {steps} integration steps, with their history")
-    run, decided_by = (runs.fly(ready, seed, trial), {}) if computer is None else computer.fly(ready, seed, trial)
-    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, **decided_by))
+    run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
+    decided_by = None if computer is None else computer.library.digest
+    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, decided_by))
     if not quiet:
         terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
     return 0 if run.met else 1

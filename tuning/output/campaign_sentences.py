@@ -54,6 +54,10 @@ def counts(summary: Summary) -> Iterator[str]:
     for reason in summary["reasons"]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
+    ended = {status: told for status, told in summary.get("controller_samples", {}).items() if told["samples"]}
+    if ended:
+        each = (f"{told['samples']} {status} in {told['trials']} trials" for status, told in ended.items())
+        yield f"samples of the controller: {', '.join(each)}"
     if summary.get("plan"):
         yield "shares, quantiles and intervals hold for trials drawn at random: of the plan as far as its rows are"
 

@@ -68,13 +68,15 @@ def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], kind: str) -
 
 
 def run_lines(summary: Summary) -> list[str]:
-    """Status of one run, and its error beside the floor."""
+    """Status of one run, its error beside the floor, and how the samples of a controller's C ended."""
     bad_time = summary["bad_time"]
     when = "" if bad_time is None or bad_time != bad_time else f", at {bad_time:.4g} s"
     what = f", {summary['reason']}{when}" if summary["reason"] else ""
     error = summary.get("window_error")
     told = [] if error is None or error != error else [f"window error {error:.3e}{floor(error, summary.get('floor'))}"]
-    return [f"status: {summary['status']}{what}", *told]
+    samples = [f"{count} {status}" for status, count in summary.get("controller_statuses", {}).items()]
+    decided = [f"samples of the controller: {', '.join(samples)}"] if samples else []
+    return [f"status: {summary['status']}{what}", *decided, *told]
 
 
 def run_verdicts(summary: Summary, kind: str) -> list[Summary]:

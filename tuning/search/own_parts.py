@@ -14,13 +14,27 @@ from typing import Any
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.tables import Scenario
 
+METRICS, CONTROLLER = "--metrics", "--controller"  # options that name programs
 
-def named(scenario: Scenario, metrics: str | None = None) -> dict[str, str]:
-    """What flying a scenario, and metrics of one's own, runs: where it stands, by the key that names it."""
-    return own.programs(scenario) | ({} if metrics is None else {"--metrics": metrics})
+
+def named(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
+    """What flying a scenario runs, with metrics of one's own and a controller's C: where it stands, by its key."""
+    options = {METRICS: metrics, CONTROLLER: controller}
+    return own.programs(scenario) | {key: str(where) for key, where in options.items() if where is not None}
+
+
+def location(key: str, where: str) -> str:
+    """What would be run, as one may look at it."""
+    return os.path.realpath(where) if key == CONTROLLER else systems.location(where)
+
+
+def digest(key: str, where: str) -> str | None:
+    """SHA-256 of what would be run, as it is now; None: there is none."""
+    return sources.digest(Path(where)) if key == CONTROLLER else systems.digest(where)
 
 
 def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
@@ -33,7 +47,7 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
         allow(programs, path, store.read_versions(folder), trusted)
         return
     beside = os.path.realpath(path.parent) + os.sep
-    _say({key: where for key, where in programs.items() if not systems.location(where).startswith(beside)}, path)
+    _say({key: where for key, where in programs.items() if not location(key, where).startswith(beside)}, path)
 
 
 def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], trusted: bool) -> None:
@@ -54,11 +68,11 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
 def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> None:
     """Raise RefusedError where a program is not the one that results were made with."""
     for key, where in programs.items():
-        known, now = _digests(made, key), systems.digest(where)
+        known, now = _digests(made, key), digest(key, where)
         if known and now is not None and now not in known:
             then = " or ".join(was[:12] for was in known)
             raise RefusedError(
-                f"{results} was made with another {key} than {systems.location(where)} is now "
+                f"{results} was made with another {key} than {location(key, where)} is now "
                 f"(SHA-256 {then} then, {now[:12]} now); allowed is the file as it was"
             )
 
@@ -112,7 +126,7 @@ def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
     """The keys that name each file."""
     files: dict[str, list[str]] = {}
     for key, where in programs.items():
-        files.setdefault(systems.location(where), []).append(key)
+        files.setdefault(location(key, where), []).append(key)
     return files
 
 

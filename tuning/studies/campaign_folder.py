@@ -1,7 +1,7 @@
 """Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
 
-import json
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,27 +10,28 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 import polars as pl
 from msgspec import Meta
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
-from ptsmc_jax.campaigns import margin_verdicts, plans, rows, runs, store
+from ptsmc_jax.campaigns import plans, rows, store
 from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.onboard import sources
+from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario import Study, own, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.computer import OURS, Software
 from tuning.search import own_parts
 
+C = "controller"  # the folder with the flight software's C, where it is flown
+FLOOR = "floor.json"  # what theory says, see `campaign_theory`
 TABLE = "plan.parquet"  # the plan that is flown; what `--dry-run` writes is a folder
 PLAN = "plan_sha256"  # by which it is known
-FLOOR = "floor.json"  # what no controller can beat: found when flying, so that a summary needs no plant
 OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
 
@@ -61,17 +62,20 @@ class Folder:
     trusted: bool = True  # systems and metrics of one's own may be run
     plan: str | None = None  # of the trials, what its file is called
     table: pl.DataFrame | None = None  # of that plan
+    controller: Path | None = None  # folder of the C that decides; None: the parts' own code does
 
     @cached_property
     def programs(self) -> dict[str, str]:
         """What flying it runs, by the key that names it."""
-        return own_parts.named(self.scenario, self.own)
+        return own_parts.named(self.scenario, self.own, self.controller)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
         """What `versions.json` knows a campaign by; digests of programs as the folder has them, or as they are now."""
-        names = {own.digest_name(key): where for key, where in self.programs.items()}
-        digests = {name: self.digests.get(name) if self.made else systems.digest(at) for name, at in names.items()}
+        digests = {}
+        for key, where in self.programs.items():
+            name = own.digest_name(key)
+            digests[name] = self.digests.get(name) if self.made else own_parts.digest(key, where)
         if self.table is not None:
             digests[PLAN] = self.digests.get(PLAN) if self.made else self.planned.digest
         metrics = {} if self.own is None else {"metrics": self.own}
@@ -115,12 +119,37 @@ class Folder:
     @cached_property
     def ready(self) -> Study | None:
         """What is flown, without metrics of one's own; None where that would run a system that nobody trusts."""
-        named = set(self.programs) - {"--metrics"}
+        named = set(self.programs) - {own_parts.METRICS, own_parts.CONTROLLER}
         if named and not self.trusted:
             return None
         for key in named:
             self._check_unchanged(key)
         return scenario.study(self.scenario)
+
+    @cached_property
+    def computer(self) -> InTheLoop | None:
+        """The controller's C, compiled; None: there is none. Raises RefusedError where that would take trust."""
+        if self.controller is None:
+            return None
+        if not self.flies:
+            raise self._untrusted
+        assert self.ready is not None
+        self._check_unchanged(own_parts.CONTROLLER)
+        return InTheLoop(Library(self.controller), self.ready.parts)
+
+    @property
+    def software(self) -> Software:
+        """What decides in flight."""
+        return OURS if self.computer is None else self.computer.software
+
+    @property
+    def flies(self) -> bool:
+        """Whether it can be flown without running what nobody trusts, but for metrics of one's own."""
+        return self.ready is not None and (self.controller is None or self.trusted)
+
+    @property
+    def _untrusted(self) -> RefusedError:
+        return RefusedError(f"{self.path} names code of its own, which is run with --trust only")
 
     @cached_property
     def planned(self) -> Plan:
@@ -138,10 +167,11 @@ class Folder:
     def flights(self) -> Campaign:
         """What is flown, without metrics of one's own. Raises RefusedError where that would take trust."""
         if self.ready is None:
-            raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
-        if self.table is None:
-            return Campaign(self.ready, self.seed)
-        return flying.of_plan(self.ready, self.seed, self.planned, where=f"the plan {self.plan}")
+            raise self._untrusted
+        campaign = Campaign(self.ready, self.seed)
+        if self.table is not None:
+            campaign = flying.of_plan(self.ready, self.seed, self.planned, where=f"the plan {self.plan}")
+        return replace(campaign, software=self.software)
 
     @cached_property
     def campaign(self) -> Campaign:
@@ -153,15 +183,16 @@ class Folder:
     def _own(self) -> Campaign:
         """A campaign with the metrics of one's own, whatever its trials."""
         if self.ready is None or (self.own is not None and not self.trusted):
-            raise RefusedError(f"{self.path} names code of its own, which is run with --trust only")
+            raise self._untrusted
         if self.own is None:
             return Campaign(self.ready, self.seed)
-        self._check_unchanged("--metrics")
+        self._check_unchanged(own_parts.METRICS)
+        software = self.software
         try:
             metrics: Any = systems.item(self.own, OWN)
             if not isinstance(metrics, Callable):
                 raise ValueError(f"it is a {type(metrics).__name__}; allowed is {OWN}")
-            campaign = Campaign(self.ready, self.seed, metrics)
+            campaign = Campaign(self.ready, self.seed, metrics, software=software)
             campaign.own_names()
             return campaign
         except ValueError as error:
@@ -206,6 +237,9 @@ def begin(wanted: Folder, force: bool) -> None:
         if wanted.table is not None:
             parts = wanted.campaign.ready.parts
             (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
+        if wanted.controller is not None:
+            sources.copy(wanted.controller, making / C)
+        shutil.rmtree(path / C, ignore_errors=True)  # now: what is copied may lie there
         store.forget(path)  # what was another campaign's, or that of fewer trials
 
     store.write(path, fill)
@@ -217,7 +251,8 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
     store.check(path, force=True)
     if not path.is_dir() or not any(path.iterdir()):
         return False
-    other = store.difference(path, tables, {**wanted.identity, **store.packages()})
+    programs = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
+    other = store.difference(path, tables, {**dict.fromkeys(programs), **wanted.identity, **store.packages()})
     if other is not None:
         raise RefusedError(f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew")
     before = opened(path)
@@ -259,6 +294,7 @@ def opened(path: Path) -> Folder:
         trusted=False,
         plan=made.plan,
         table=None if made.plan is None else plans.read(path / TABLE),
+        controller=path / C if own.digest_name(own_parts.CONTROLLER) in digests else None,
     )
 
 
@@ -309,60 +345,6 @@ def fly(
     flying.follow(landing, flying.tally(parts, trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
-
-
-def find_floor(folder: Folder) -> None:
-    """Write what theory says into the folder, where it is not there yet, or cannot be read.
-
-    The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
-    """
-    if _lacks_theory(folder):
-        ready, plan = folder.campaign.ready, folder.campaign.plan
-        first = [] if plan is None else [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
-        verdicts = margin_verdicts.over_trials(ready, folder.seed, _looked_at(folder))
-        floor = runs.floor(ready, folder.seed, first)
-        theory = {"window_error": floor, "margins": [verdict.in_summary() for verdict in verdicts]}
-        store.write_json(folder.path / FLOOR, theory)
-
-
-def prepare_floor(folder: Folder) -> None:
-    """Begin to compile what `find_floor` needs, beside flying."""
-    if _lacks_theory(folder):
-        margin_verdicts.prepare(folder.campaign.ready, _looked_at(folder))
-        runs.prepare(folder.campaign.ready)
-
-
-def _lacks_theory(folder: Folder) -> bool:
-    return "window_error" not in _theory(folder) or bool(unjudged(folder))
-
-
-def _looked_at(folder: Folder) -> np.ndarray | Row | None:
-    """The rows of a plan whose loops are looked at; None: there is none."""
-    plan = folder.campaign.plan
-    return None if plan is None else plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
-
-
-def floor_of(folder: Folder) -> float | None:
-    """The floor that `find_floor` wrote; None: none, as in campaigns of earlier versions."""
-    return _theory(folder).get("window_error")
-
-
-def margins_of(folder: Folder) -> list[dict[str, Any]]:
-    """The verdicts on margins that `find_floor` wrote, as `summary.json` says them."""
-    return _theory(folder).get("margins", [])
-
-
-def unjudged(folder: Folder) -> list[str]:
-    """Margins that are asked for and that no verdict is there of: flying ended before, or what it wrote is damaged."""
-    judged = {verdict["metric"] for verdict in margins_of(folder)}
-    return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
-
-
-def _theory(folder: Folder) -> dict[str, Any]:
-    try:
-        return dict(json.loads((folder.path / FLOOR).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return {}
 
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:

@@ -23,7 +23,8 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
-from tuning.studies.campaign_folder import Folder, floor_of, margins_of, unjudged
+from tuning.studies.campaign_folder import Folder
+from tuning.studies.campaign_theory import floor_of, margins_of, unjudged
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
 CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
@@ -126,8 +127,23 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_pointing(folder, parts, finished),
         "quantiles": quantiles,
         "drivers": drivers,
+        **_samples(folder, parts),
         "cautions": [*cautions.of(folder.scenario), *_alike(quantiles, done)],
     }
+
+
+def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
+    """How many samples the controller's C ended with each status, and in how many trials; nothing without one."""
+    if folder.controller is None:
+        return {}
+    named = [name for name in pl.read_parquet_schema(parts[0].path) if name.startswith(plans.COUNTED)]
+    names = [name for name in named if name not in folder.own_names]
+    counts = rows.read(parts, names).head(folder.trials)
+    told = {
+        name.removeprefix(plans.COUNTED): {"samples": int(counts[name].sum()), "trials": int((counts[name] > 0).sum())}
+        for name in names
+    }
+    return {"controller_samples": told}
 
 
 def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
@@ -256,7 +272,8 @@ def replay(folder: Folder, trial: int) -> Replay:
     """A trial's row as the campaign flies it, and its run in full."""
     campaign = folder.campaign
     flown = trial if campaign.plan is None else campaign.plan.row(trial, folder.seed)
-    run, again = runs.fly(campaign.ready, folder.seed, flown), campaign.fly([trial]).row(0, named=True)
+    run = runs.fly(campaign.ready, folder.seed, flown, campaign.software)
+    again = campaign.fly([trial]).row(0, named=True)
     rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
     if run.status != again["status"]:
         rounding = np.inf
@@ -293,7 +310,7 @@ def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
     figures: dict[str, Figure] = {}
     if finished.any():
-        if folder.ready is not None:  # its histories are not kept, but flown for it
+        if folder.flies:  # its histories are not kept, but flown for it
             figures |= _fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}

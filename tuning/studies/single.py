@@ -25,15 +25,23 @@ def summary(run: Run, scenario: Scenario) -> dict[str, Any]:
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     floor = None if run.floor is None else run.floor.window_error
-    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": cautions.of(scenario)}
+    told = {"controller_statuses": {name: count for name, count in run.samples.items() if count}} if run.samples else {}
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": cautions.of(scenario), **told}
 
 
 def write(
-    folder: Path, scenario: Scenario, run: Run, seed: int, trial: int | None, figures: bool, **computer: Any
+    folder: Path,
+    scenario: Scenario,
+    run: Run,
+    seed: int,
+    trial: int | None,
+    figures: bool,
+    controller: str | None = None,
 ) -> None:
-    """Fill a result folder; computer: what is known of the program that decided, where that is not the parts' own."""
+    """Fill a result folder; controller: digest of the export that decided, where that is not the parts' own code."""
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
-    store.record(folder, parsing.dump(scenario), made_by, {**summary(run, scenario), **computer})
+    decided_by = {} if controller is None else {"controller": controller}
+    store.record(folder, parsing.dump(scenario), made_by, {**summary(run, scenario), **decided_by})
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:

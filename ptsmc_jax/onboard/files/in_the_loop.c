@@ -6,7 +6,6 @@
 
 const long ptsmc_sizes[4] = {PTSMC_IN_SIZE, PTSMC_OUT_SIZE, PTSMC_STATE_SIZE, PTSMC_PARAMS_SIZE};
 double ptsmc_given[PTSMC_PARAMS_SIZE]; /* parameters where none are told */
-long ptsmc_counted[@statuses@];        /* steps of each status */
 
 void ptsmc_first(double *state);
 void ptsmc_set(void);
@@ -65,7 +64,6 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
         status[k] = ptsmc_step(&p, &x, &given, &found);
         state_to(&x, after + k * PTSMC_STATE_SIZE);
         out_to(&found, out + k * PTSMC_OUT_SIZE);
-        __atomic_fetch_add(&ptsmc_counted[status[k]], 1, __ATOMIC_RELAXED); /* devices fly side by side */
     }
 }
 

@@ -1,4 +1,4 @@
-"""What a campaign's folder keeps of theory."""
+"""What a campaign keeps of theory."""
 
 import json
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns import margin_verdicts, runs
-from tuning.studies import campaign_folder
+from tuning.studies import campaign_theory
 
 
 @pytest.mark.parametrize(("count", "rows", "looked"), [(None, [], None), (3, [0, 1, 2], 3), (900, [0, 1, 2, 3], 256)])
@@ -29,9 +29,9 @@ def test_theory_is_of_the_first_trials_or_rows_and_found_once(tmp_path, monkeypa
     plan = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
     flown = SimpleNamespace(ready="ready", plan=None if count is None else plan)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=flown, scenario=SimpleNamespace(requirements={}))
-    campaign_folder.find_floor(folder)
+    campaign_theory.find(folder)
     assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
     assert json.loads((tmp_path / "floor.json").read_text()) == {"window_error": 1e-6, "margins": []}
-    campaign_folder.find_floor(folder)
+    campaign_theory.find(folder)
     assert len(asked) == 2
-    assert campaign_folder.floor_of(folder) == 1e-6
+    assert campaign_theory.floor_of(folder) == 1e-6
