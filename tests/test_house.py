@@ -71,7 +71,7 @@ HOUSE = {
             build cautions own_checks reading
             flyable tuned
         """,
-        "campaigns": "margin_verdicts montecarlo store | plans rows runs | campaign | cluster",
+        "campaigns": "montecarlo store | margin_verdicts plans rows | campaign runs | cluster",
         "onboard": """
             expressions sources
             control derived origins rules

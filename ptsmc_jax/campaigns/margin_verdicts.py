@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE
 from ptsmc_jax.dispersions.misfits import OF_MISFITS
@@ -26,6 +27,7 @@ TRIALS = 256  # whose loops are looked at, where they differ
 OF_LOOPS = {INERTIA, OWN, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
 CALL = 32  # of them that are flown and linearised at once
 JUDGED = 16  # loops judged in full at a time
+DELAY = "delay_margin"  # the one margin that commands late within a period are looked at for
 # how far off what `margins.roughly` reads may be, with room: in dB, deg, periods, dB
 OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "modulus_margin": 0.01}
 # values that are not read between frequencies: of an unstable loop, or of one that no gain or phase makes unstable
@@ -62,7 +64,8 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
     """Begin to compile what `over_trials` needs, beside what is being done."""
     trials = _whose_loops_differ(ready, rows)
     if trials is not None:
-        _look.prepare(ready.parts, ready.dispersion, jnp.uint32(0), _in_calls(trials))
+        late = any(requirement.metric == DELAY for requirement in ready.margins)
+        _look.prepare(*_looked_at(ready.parts, ready.dispersion, 0, trials, late))
     elif ready.margins:
         run_margins.judged_jit.prepare(ready.parts)
 
@@ -119,11 +122,12 @@ def worst(
     from then on.
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
-    looks = _look(parts, dispersion, jnp.uint32(seed), _in_calls(trials))
+    late = DELAY in names
+    looks = _look(*_looked_at(parts, dispersion, seed, trials, late))
     loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
     values = np.stack([rough[name] for name in names])  # (names, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
-    off = np.asarray([[OFF[name] * (loops.period[0] if name == "delay_margin" else 1.0)] for name in names]) / limit
+    off = np.asarray([[OFF[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
     unsure = np.isfinite(values) & ~np.isin(values, BOUNDS)
     while True:
         near = _nearness(values, limit, names)
@@ -137,7 +141,7 @@ def worst(
             return {name: _over(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
         chosen = np.resize(chosen, JUDGED)  # one shape, one program
         some = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
-        full = margins.of_each(some, with_delay="delay_margin" in names).each()
+        full = margins.of_each(some, with_delay=late).each()
         exact = np.stack([_over(name, np.asarray(full[name])) for name in names])
         apart = np.abs(_nearness(exact, limit, names) - near[:, chosen])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
@@ -145,13 +149,16 @@ def worst(
         values[:, chosen], unsure[:, chosen] = exact, False
 
 
-def _in_calls(trials: np.ndarray | Row) -> Any:
-    """The trials, and some of them again, as many as whole calls take."""
+def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
+    """What `_look` is called with: the trials, and some of them again, as many as whole calls on every device take."""
+    devices = len(jax.local_devices())
+    together = CALL * devices
 
     def padded(v: Any) -> Array:
-        return jnp.asarray(np.resize(v, (-(-v.shape[0] // CALL) * CALL, *v.shape[1:])))
+        return jnp.asarray(np.resize(v, (-(-v.shape[0] // together) * together, *v.shape[1:])))
 
-    return jax.tree.map(padded, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
+    some = jax.tree.map(padded, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
+    return parts, dispersion, jnp.uint32(seed), some, devices, late
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -165,22 +172,28 @@ def _over(name: str, values: Any) -> Any:
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
-@programs.jit
+@programs.jit(static_argnames=("devices", "late"))
 def _look(
-    parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row
+    parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, late: bool
 ) -> tuple[linear.Loop, dict[str, Array]]:
-    """Loops of each trial, (trials, times, ..), and what is roughly their margins, the worst over the axes."""
+    """Loops of each trial, (trials, times, ..), and what is roughly their margins, the worst over the axes.
+
+    late: see `linear.opened`.
+    """
 
     def rough(loop: linear.Loop) -> dict[str, Array]:
         return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
 
     def one(trial: Array | Row) -> linear.Loop:
-        return run_margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn)[0]
+        return run_margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn, late=late)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = lapack.vmap(one)(trials)
         values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
 
-    calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
+    def on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+        calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
+        return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
+
+    return montecarlo.spread(on_device, trials, devices)

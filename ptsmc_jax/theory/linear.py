@@ -225,11 +225,14 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
     return _means(opened_in(parts, run, several.reshape(-1)).loop, several.shape)
 
 
-def loops_at(parts: Parts, run: Nominal, indices: Array) -> Loop:
+def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -> Loop:
     """As `loops_in`, h in [s], for indices (periods,) that may be traced: it composes with every transformation."""
     several = _interval(parts, indices)
-    loops = lapack.vmap(lambda index: opened(parts, jax.tree.map(lambda v: v[index], run)).loop)(several.reshape(-1))
-    return _means(loops, several.shape)
+
+    def one(index: Array) -> Loop:
+        return opened(parts, jax.tree.map(lambda v: v[index], run), late=late).loop
+
+    return _means(lapack.vmap(one)(several.reshape(-1)), several.shape)
 
 
 def averaged(parts: Parts) -> int:

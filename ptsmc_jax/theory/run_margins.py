@@ -99,11 +99,14 @@ def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None 
     return TimedMargins(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, margins.of_each(loops)))
 
 
-def judged_loops(parts: Parts, flown: linear.Nominal | None = None) -> tuple[Loop, Array]:
-    """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s]."""
+def judged_loops(parts: Parts, flown: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
+    """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s].
+
+    late: of delay too, see `linear.opened`.
+    """
     run = linear.nominal(parts) if flown is None else flown
     indices = moments(parts, run, judged_times(parts))
-    return linear.loops_at(parts, run, indices), run.period.now.hold[indices]
+    return linear.loops_at(parts, run, indices, late=late), run.period.now.hold[indices]
 
 
 def judged(parts: Parts) -> tuple[Margins, Array, History]:

@@ -85,7 +85,7 @@ def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
     traces = {
         "loops": linear._opened.trace(ready, some, None, late=True),
         "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(ready, run, k))(jnp.arange(4)),
-        "loops of trials": margin_verdicts._look.trace(ready, dispersion, jnp.uint32(0), trials),
+        "loops of trials": margin_verdicts._look.trace(ready, dispersion, jnp.uint32(0), trials, 1, True),
         "steps": timing._rates_of_system.trace(ready, visited),
     }
     assert not any(handed(trace.jaxpr)[1] for trace in traces.values())

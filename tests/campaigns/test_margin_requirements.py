@@ -286,8 +286,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
     gains = dict(zip(posed.problem.names, posed.own * np.asarray(changes), strict=True))
     parts, dispersion = with_gains(posed.problem.parts, gains), posed.ready.dispersion
     every = all_of(parts, dispersion, 3, count)
-    padded = jnp.asarray(np.resize(np.arange(count, dtype=np.uint32), margin_verdicts.CALL))
-    _, looked = margin_verdicts._look(parts, dispersion, jnp.uint32(3), padded)
+    _, looked = margin_verdicts._look(*margin_verdicts._looked_at(parts, dispersion, 3, np.arange(count), late=True))
     rough = {name: np.asarray(v)[:count] for name, v in looked.items()}
     period = BODY["loop"]["period"]
     for name, off in margin_verdicts.OFF.items():

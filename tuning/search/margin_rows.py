@@ -96,14 +96,16 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     A loop without slopes is as far beyond as one without any margin.
     """
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
+    late = margin_verdicts.DELAY in asked.metrics
 
     if asked.coordinates:
         # one after the other: XLA aborts the process on products with an inertia of each case, with some sets of gains
-        each = jax.lax.map(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c))[0], asked.coordinates)
+        drawn = asked.coordinates
+        each = jax.lax.map(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c), late=late)[0], drawn)
         loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     else:
-        loops, _ = run_margins.judged_loops(parts)
-    values = margins.of_each(loops, with_delay="delay_margin" in asked.metrics).each()
+        loops, _ = run_margins.judged_loops(parts, late=late)
+    values = margins.of_each(loops, with_delay=late).each()
     shares = [
         over(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
