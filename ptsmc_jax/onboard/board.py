@@ -5,6 +5,7 @@ A stage calls the very code that the rollout flies, of `devices`, `observers` an
 `out.` what this one makes of it.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -65,6 +66,18 @@ class Board:
     def state_of(self, values: tuple[Any, ...]) -> Any:
         """The state that the law sees, from these values of `seen`."""
         return AttitudeState(*values) if self.spacecraft else values[0]
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """What it is made of, by name: the type of each part, and what is fixed in it."""
+        made = {name: part for name, part in self.parameters.items() if dataclasses.is_dataclass(part)}
+        return {name: _kind(part) for name, part in made.items()}
+
+
+def _kind(part: Any) -> str:
+    fixed = [entry.name for entry in dataclasses.fields(part) if entry.metadata.get("static")]
+    said = ", ".join(f"{name}={getattr(part, name)!r}" for name in fixed)
+    return type(part).__name__ + (f"({said})" if said else "")
 
 
 SCALARS = ("t", "dt", "regular", "tracking")  # arguments of C's functions

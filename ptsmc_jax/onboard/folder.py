@@ -143,7 +143,8 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     }
     for name, text in texts.items():
         store.write_text(folder / name, text)
-    layout = {"name": about.name, "digest": about.digest, "period": made.period, "columns": templates.columns(code)}
+    layout = {"name": about.name, "digest": about.digest, "period": made.period, "parts": made.board.parts}
+    layout["columns"] = templates.columns(code)
     store.write_json(folder / LAYOUT, layout)
 
 

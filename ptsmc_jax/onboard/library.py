@@ -60,6 +60,7 @@ class Library:
             layout = json.loads((self.folder / LAYOUT).read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
+            self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; none of an export by an earlier version
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
                 raise none
@@ -167,6 +168,13 @@ class InTheLoop:
                     f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
+        ours, theirs = self.board.parts, library.parts
+        other = next((name for name in {**ours, **theirs} if theirs and theirs.get(name) != ours.get(name)), None)
+        if other is not None:
+            raise ScenarioError(
+                f"the controller in {library.folder} has the {other} {theirs.get(other, 'none')}, "
+                f"but must have that of the scenario, {ours.get(other, 'none')}"
+            )
         period, wanted = np.float32(parts.period), np.float32(library.period)  # either may have been read with 32 bits
         if period != wanted:
             raise ScenarioError(

@@ -1,5 +1,6 @@
 """The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -283,6 +284,24 @@ def test_many_trials_fly_by_the_compiled_controller(exported):
         ptsmc.trials(scenario.from_tables(FLIGHTS["raw"]), 3, controller=library.folder)
     one = ptsmc.simulate(study, seed=5, trial=1, controller=library.folder)
     assert one.metrics["window_error"] == pytest.approx(rows["window_error"][1], rel=1e-9)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("flight", "said"),
+    [
+        ("implicit", "has the law PrescribedTime(implicit=False), but must have that of the scenario, PrescribedTime("),
+        ("no observer", "has the observer NonlinearObserver, but must have that of the scenario, NoObserver"),
+        ("spin", "has the reference Fixed, but must have that of the scenario, Spin"),
+        ("terminal", "has the law PrescribedTime(implicit=False), but must have that of the scenario, Terminal"),
+    ],
+)
+def test_a_controller_of_other_parts_with_the_same_inputs_is_refused(exported, flight, said):
+    """It flew instead of them."""
+    _, library = exported("raw")
+    parts = scenario.study(folder.flown(scenario.from_tables(FLIGHTS[flight]))).parts
+    with pytest.raises(ptsmc.ScenarioError, match=re.escape(said)):
+        InTheLoop(library, parts)
 
 
 @needs_compiler
