@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.laws.base import Motion, PrescribedTimeLaw, Sample, SecondOrderLaw
 from ptsmc_jax.laws.closed_forms import exact_chain, expansion
 from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion, ErrorVector
@@ -120,7 +121,7 @@ class PrescribedTimeSystem(ErrorOfSystem, SecondOrderLaw):
         """|dF/dx2 D| K2, the largest over the states that are visited."""
         assert visited is not None
         times, states = visited
-        return 0.5 * jnp.max(jax.vmap(self.influence)(states, times)) * k2
+        return 0.5 * jnp.max(lapack.vmap(self.influence)(states, times)) * k2
 
 
 @pytree

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws, stacking
 from ptsmc_jax.onboard.board import Board
@@ -107,7 +108,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
 @programs.jit(compiler_options=programs.QUICKLY)
 def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
     """Trials by samples, (trials, samples, ..)."""
-    return jax.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)
+    return lapack.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)
 
 
 def known_alike(dispersion: Dispersion) -> Dispersion:

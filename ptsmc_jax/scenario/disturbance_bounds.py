@@ -104,11 +104,13 @@ def along_the_run(scenario: Any, signal: Any) -> Bounds:
     import jax
     import jax.numpy as jnp
 
+    from ptsmc_jax.batching import lapack
+
     t = np.linspace(0.0, float(scenario.loop.t_end), POINTS)
     left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
     states = left[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _attitudes(scenario, t, left)
     try:
-        acting = np.asarray(jax.vmap(signal)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
+        acting = np.asarray(lapack.vmap(signal)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
     except Exception:  # which `own_checks` refuses before a flight, in one sentence
         acting = np.zeros(0)
     inputs = scenario.inputs
@@ -122,12 +124,13 @@ def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
     import jax
     import jax.numpy as jnp
 
+    from ptsmc_jax.batching import lapack
     from ptsmc_jax.numerics import attitude
     from ptsmc_jax.plants.rigid_body import AttitudeState
     from ptsmc_jax.scenario import attitude_keys
 
     reference = scenario.reference.build()
-    target = jax.vmap(lambda time: reference(time).q)(jnp.asarray(t))
+    target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))
     off = attitude.multiply(attitude.conjugate(target[0]), start)
     off = off * jnp.where(off[3] < 0.0, -1.0, 1.0)

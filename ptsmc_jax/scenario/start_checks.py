@@ -3,12 +3,12 @@
 import typing
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import attitude_keys, errors
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -57,7 +57,7 @@ def reference(scenario: Any, parts: Parts) -> None:
 @programs.jit
 def _scalar_part(reference: Any, times: Array) -> Array:
     """q_f4 of a reference at these times (times,) [s]."""
-    return jax.vmap(lambda time: reference(time).q[3])(times)
+    return lapack.vmap(lambda time: reference(time).q[3])(times)
 
 
 def attitude(scenario: Any, parts: Parts) -> None:

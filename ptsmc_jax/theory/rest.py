@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.assembly import Parts
@@ -122,7 +123,7 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
         whole = commanded(way) - here
         return whole - sloped, whole
 
-    return jax.vmap(one)(run.period, run.carry.computer, run.after.computer.seen)
+    return lapack.vmap(one)(run.period, run.carry.computer, run.after.computer.seen)
 
 
 def none_left(margins: Any, rows: Any) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear, margins, rest
 from ptsmc_jax.theory.linear import Loop
@@ -66,7 +67,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
-    off = jax.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
+    off = lapack.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), full & ticks.hold
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.laws.closed_forms import exact_chain as exact_chain
 from ptsmc_jax.laws.closed_forms import exact_error as exact_error
 from ptsmc_jax.laws.closed_forms import from_modes, modes
@@ -102,8 +103,8 @@ def _visited(parts: Setup) -> tuple[Array, Any]:
         target = parts.reference(t)
         return target, law.motion(target, parts.initial, none, none, none).x
 
-    early = jax.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** share)
-    late = jax.vmap(at_rest)(parts.t_end * share)
+    early = lapack.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** share)
+    late = lapack.vmap(at_rest)(parts.t_end * share)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
@@ -119,7 +120,7 @@ def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
 def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
-    u, clearance = jax.vmap(lambda time: exact_input(parts, time))(t)
+    u, clearance = lapack.vmap(lambda time: exact_input(parts, time))(t)
     return t, u, clearance
 
 

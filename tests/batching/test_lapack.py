@@ -4,14 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend import core
 
+import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.onboard import vectors
 from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import timing
-from ptsmc_jax.theory import linear
+from ptsmc_jax.theory import linear, rest, run_margins, solutions
 from tests.helpers import equations
+from tuning.search import design
 
 pytestmark = pytest.mark.skipif(not lapack.WAITS, reason="this jaxlib does not wait")
 
@@ -89,3 +93,75 @@ def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
         "steps": timing._rates_of_system.trace(ready, visited),
     }
     assert not any(handed(trace.jaxpr)[1] for trace in traces.values())
+
+
+def softened(v):
+    """A vector as it is, by eigenvalues."""
+    values, axes = jnp.linalg.eigh(jnp.diag(jnp.arange(1.0, v.size + 1.0)) + 0.1 * jnp.outer(v, v))
+    return axes @ ((axes.T @ v) * values / values)
+
+
+def moved(t, x_1, x_2):
+    """x_1' where x_1 is off from what swings."""
+    return softened(x_2 - jnp.sin(t))
+
+
+class Pushed(ptsmc.Disturbance):
+    """A swinging one with eigenvalues in it."""
+
+    def __call__(self, t, x):
+        """Of as many components as the plant has inputs."""
+        return softened(0.01 * jnp.sin(t) * jnp.ones(3 if hasattr(x, "q") else 2))
+
+
+class Held(ptsmc.Reference):
+    """An attitude with eigenvalues in it."""
+
+    def attitude(self, t):
+        """The identity."""
+        return softened(jnp.stack([0.0 * t, 0.0, 0.0, 1.0]))
+
+
+@pytest.fixture
+def shared(monkeypatch):
+    """Calls of LAPACK in any trace that are handed several matrices and share them among the threads."""
+    several = []
+    for p in (p for p in vars(core.primitives).values() if getattr(p, "name", None) in lapack.SHARED):
+
+        def bind(*args, p=p, bound=p.bind, **params):
+            several.extend(f"{p.name} of {v.shape}" for v in args[:1] if v.ndim > 2)
+            return bound(*args, **params)
+
+        monkeypatch.setattr(p, "bind", bind)
+    return several
+
+
+TIMES = {"t_f": 3.0, "delta": 0.5}
+LOOP = {"mode": "sampled", "period": 0.1, "t_end": 4.0}
+
+
+def test_what_is_seen_before_and_after_a_flight_is_looked_at_one_matrix_at_a_time(shared):
+    """Bounds of a disturbance, states on the way, a law's start, where a loop is at rest, C's vectors, peaks by theory.
+
+    Of a system and of a spacecraft, whose parts have eigenvalues in them.
+    """
+    plant = system(2, moved, lambda t, x_1, x_2: -x_1, lambda t, x_1, x_2: jnp.eye(2))
+    own = {"disturbance": {"kind": "own", "code": Pushed}, "controller": TIMES, "loop": LOOP}
+    of_system = {
+        "plant": {"kind": "system", "system": plant, "x0": [1.0, 0.5, 0.0, 0.0]},
+        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.1, 0.1, 0.0, 0.0]}},
+    }
+    of_body = {"reference": {"kind": "own", "code": Held}}
+    trials, seed = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0)
+    for tables in (of_system, of_body):
+        studied = scenario.study(scenario.from_tables(own | tables))
+        parts, dispersion = studied.parts, studied.dispersion
+        run = jax.eval_shape(linear.nominal, parts)
+        if tables is of_system:
+            visited = jax.eval_shape(solutions.visited, parts)
+            timing._boundary_layer.trace(parts.controller, parts.observer, visited)
+        run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
+        rest._unexplained.trace(parts, run)
+        vectors.fly_many.trace(parts, dispersion, seed, trials)
+        design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
+    assert not shared

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs, scenario
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -93,7 +94,7 @@ def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: ja
     def peak(trial: jax.Array) -> jax.Array:
         return solutions.exact_peak(dispersion.apply(replace(parts, controller=controller), seed, trial))
 
-    return jax.vmap(peak)(trials)
+    return lapack.vmap(peak)(trials)
 
 
 def _smallest(
