@@ -189,7 +189,7 @@ def system(
     Raises:
         ValueError: a function does not take such arguments, or returns another shape; or the numbers do not fit.
     """
-    if not isinstance(n, int) or n < 1:
+    if not isinstance(n, int) or isinstance(n, bool) or n < 1:
         raise ValueError(f"n is {n}, but must be a whole number of at least 1")
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), number.dtype)
@@ -204,17 +204,8 @@ def system(
         ("Z(t, x_1, x_2, z, u)", Z, (vector, vector, z, vector), z.shape),
     ]
     for name, function, arguments, shape in signatures:
-        if function is None:
-            continue
-        try:
-            returned = jax.eval_shape(function, number, *arguments)
-        except Exception as error:
-            first_line = (str(error).splitlines() or [""])[0]
-            failure = f"{type(error).__name__}: {first_line}"
-            raise ValueError(f"{name} fails for x_1 and x_2 of shape ({n},): {failure}") from error
-        returned_shape = getattr(returned, "shape", type(returned).__name__)
-        if returned_shape != shape:
-            raise ValueError(f"{name} returns {returned_shape}, but for n = {n} must return an array {shape}")
+        if function is not None:
+            _check(name, function, (number, *arguments), shape)
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
     symmetric = scale.shape == (n, n) and np.abs(scale - scale.T).max() <= 1e-9 * np.abs(scale).max()
     if not symmetric or np.linalg.eigvalsh(scale)[0] <= 0:
@@ -222,6 +213,33 @@ def system(
     functions = as_pytree(F), as_pytree(H), as_pytree(G), as_pytree(D)
     fields = *functions, jnp.asarray(scale, dtype=float), jnp.asarray(np.linalg.inv(scale), dtype=float)
     return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
+
+
+_TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_INSTEAD = "; allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
+
+
+def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
+    """Raise ValueError where a function fails, has no slopes, or returns what is no array of this shape and type."""
+    n, exact = arguments[1].shape[0], arguments[0].dtype
+
+    def traced(what: str, of: Callable) -> Any:
+        try:
+            return jax.eval_shape(of, *arguments)
+        except Exception as error:
+            first_line = (str(error).splitlines() or [""])[0]
+            told = first_line.rstrip(".") + _INSTEAD if isinstance(error, _TRACED) else first_line
+            failure = f"{type(error).__name__}: {told}"
+            raise ValueError(f"{name} {what} for x_1 and x_2 of shape ({n},): {failure}") from error
+
+    returned = traced("fails", function)
+    returned_shape = getattr(returned, "shape", type(returned).__name__)
+    if returned_shape != shape:
+        raise ValueError(f"{name} returns {returned_shape}, but for n = {n} must return an array {shape}")
+    # F alone is differentiated before anything is added to it
+    if (returned.dtype if name[0] == "F" else jnp.result_type(returned.dtype, exact)) != exact:
+        raise ValueError(f"{name} returns {returned.dtype} numbers, but must return {exact} ones")
+    traced("cannot be differentiated", lambda *at: jax.jvp(function, at, at))
 
 
 def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:

@@ -238,6 +238,16 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         second_order.system(2, F, F, G, inertia=-np.eye(2))
     with pytest.raises(ValueError, match=r"^F\(t, x_1, x_2\) fails .*TracerBoolConversionError: [^\n]*$"):
         second_order.system(2, lambda t, a, b: b if a[0] > 0 else -b, F, G)
+    with pytest.raises(ValueError, match=r"traced array [^\n]*; allowed are jax\.numpy\.where in place of if"):
+        second_order.system(2, lambda t, a, b: float(t) * b, F, G)
+    with pytest.raises(ValueError, match="n is True"):
+        second_order.system(True, F, F, lambda t, a, b: jnp.eye(1))
+    for kind, other in (("int", int), ("float", jnp.float16), ("complex", complex)):
+        with pytest.raises(ValueError, match=rf"^F\(t, x_1, x_2\) returns {kind}\d+ numbers, but must return"):
+            second_order.system(2, lambda t, a, b, other=other: b.astype(other), F, G)
+    second_order.system(2, F, lambda t, a, b: jnp.zeros(2, int), lambda t, a, b: np.eye(2, dtype=int))
+    with pytest.raises(ValueError, match=r"^H\(t, x_1, x_2\) cannot be differentiated .*: Pure callbacks [^\n]*$"):
+        second_order.system(2, F, lambda t, a, b: jax.pure_callback(np.negative, a, a), G)
 
 
 @pytest.mark.parametrize(
