@@ -19,8 +19,11 @@ SINGULAR_CONDITION = 1e14  # of a matrix in double precision
 
 
 def system(scenario: Any, parts: Parts) -> None:
-    """Refuse a system that the law, or the observer, cannot invert where it starts."""
+    """Refuse a system that is not finite where it starts, or that the law, or the observer, cannot invert there."""
     start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
+    _finite("system", plant, *start)
+    if scenario.plant.truth is not None:
+        _finite("truth", typing.cast(System, parts.plant), *start)
     matrices = {"dF/dx2 G": plant.slope(*start) @ plant.input_gain(*start)}
     if parts.observer.estimates:
         matrices["D"] = plant.disturbance_gain(*start)
@@ -30,6 +33,19 @@ def system(scenario: Any, parts: Parts) -> None:
             raise ScenarioError(
                 f"plant.system has a singular {name} at t = 0 in plant.x0, which {user} must invert; allowed is an "
                 "invertible one" + ("" if name != "D" else ', or observer.kind = "none"')
+            )
+
+
+def _finite(key: str, plant: System, t: Array, x: Array) -> None:
+    """Refuse a system whose functions are not finite in this state."""
+    functions = {"F": plant.position_rate, "H": plant.drift, "G": plant.input_gain, "D": plant.disturbance_gain}
+    values = [(name, function(t, x)) for name, function in (*functions.items(), ("dF/dx2", plant.slope))]
+    values += [("Z", z) for z in plant.hidden_rates(t, x, jnp.zeros(plant.inputs))]
+    for name, value in values:
+        if not np.all(np.isfinite(np.asarray(value))):
+            raise ScenarioError(
+                f"plant.{key} has {name} = {errors.brief(np.asarray(value).tolist())} at t = 0 in plant.x0; allowed "
+                "are finite numbers"
             )
 
 

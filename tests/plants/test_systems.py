@@ -373,6 +373,27 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
     assert fly(study(half, [1.0, 0.0, 0.0, 0.0]).parts).status == rollout.OK
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"F": lambda t, a, b: b / t}, "F = [nan]"),
+        ({"F": lambda t, a, b: jnp.cbrt(b)}, "dF/dx2 = [[inf]]"),
+        ({"H": lambda t, a, b: jnp.log(-a)}, "H = [nan]"),
+        ({"G": lambda t, a, b: jnp.eye(1) / b[0]}, "G = [[inf]]"),
+        ({"D": lambda t, a, b: jnp.eye(1) / b[0]}, "D = [[inf]]"),
+    ],
+)
+def test_what_is_not_finite_at_the_start_is_refused_by_name(changes, said):
+    """Of the system, and of a truth, whose hidden state may be it too."""
+    with pytest.raises(ScenarioError, match=f"^{re.escape(f'plant.system has {said} at t = 0 in plant.x0; allowed')}"):
+        study(one(**changes), [1.0, 0.0])
+    late = {"H": lambda t, a, b, z: 0 * a, "Z": lambda t, a, b, z, u: u / b, "z0": [0.0]}
+    truth = second_order.system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **late)
+    tables = {"kind": "system", "system": one(), "truth": truth, "x0": [1.0, 0.0]}
+    with pytest.raises(ScenarioError, match=r"^plant\.truth has Z = \[nan\] at t = 0 in plant\.x0; allowed are finite"):
+        scenario.study(scenario.from_tables({"plant": tables}))
+
+
 FILES = {
     "future.py": "from __future__ import annotations\nfrom dataclasses import dataclass\n"
     "from pieces import F, H, G\nfrom ptsmc_jax.plants import system\n\n"
