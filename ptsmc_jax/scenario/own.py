@@ -21,6 +21,7 @@ from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.values import Table
 
 KEYS = ("system", "truth", "code")  # that name code, in any table
+DECLARED = "delta"  # what a law's class may declare anew, as a gain
 Code = Annotated[Any, Meta(description=systems.WHERE)]
 
 
@@ -139,20 +140,25 @@ def _with_keys(table: Any, found: Any) -> Any:
     base = table.base()
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
+    common = {field.name: field for field in dataclasses.fields(base)}
+    for name in _annotated(found, base):
+        known = getattr(base, name, None)
+        if name in common.keys() - {DECLARED} or callable(known) or isinstance(known, property):
+            raise _taken(found, name, "another name")
+        if hasattr(base, name):
+            raise _taken(found, name, f"{name} = .. without a type")
     for cls in reversed(found.__mro__):  # classes of one's own that it is derived from have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:
                 dataclasses.dataclass(frozen=True)(cls)
             except TypeError as error:  # such as a field without a default
                 raise ValueError(f"the class {cls.__name__} cannot have such fields: {error}") from None
-    common = {field.name: field for field in dataclasses.fields(base)}
     key_types, gains, meanings = [], {}, []
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
         if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # tables have it
-            taken = f"a field of the class {found.__name__} is called {field.name}, which has its meaning already"
-            raise ValueError(f"{taken}; allowed is another name")
+            raise _taken(found, field.name, "another name")
         gain = field.metadata.get("gain")
         key_types.append((field.name, *_key(field, gain)))
         meaning = "" if gain is None else " ".join(gain.meaning.split())
@@ -171,6 +177,18 @@ def _with_keys(table: Any, found: Any) -> Any:
             "made": found,
         },
     )  # fmt: skip
+
+
+def _annotated(found: type, base: type) -> Iterator[str]:
+    """The names that the classes of one's own under a base give a type, which makes fields of them."""
+    for cls in found.__mro__:
+        if issubclass(cls, base) and cls is not base:
+            yield from (name for name, kind in inspect.get_annotations(cls).items() if "ClassVar" not in str(kind))
+
+
+def _taken(found: type, name: str, allowed: str) -> ValueError:
+    taken = f"a field of the class {found.__name__} is called {name}, which has its meaning already"
+    return ValueError(f"{taken}; allowed is {allowed}")
 
 
 def build(table: Any, **common: Any) -> Any:

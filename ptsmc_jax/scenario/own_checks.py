@@ -70,8 +70,8 @@ class _Asked:
         got = np.asarray(value)
         if got.shape != shape:
             raise self.refused(method, f"{what} of shape {got.shape}", f"one of shape {shape}")
-        if not np.all(np.isfinite(got)):
-            raise self.refused(method, f"{what} {got.tolist()}", "finite numbers")
+        if np.iscomplexobj(got) or not np.all(np.isfinite(got)):
+            raise self.refused(method, f"{what} {got.tolist()}", "finite numbers, real ones")
 
     def same_memory(self, method: str, before: Any, after: Any) -> None:
         """Raise ScenarioError where a memory changes its shapes or types."""

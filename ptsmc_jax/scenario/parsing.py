@@ -249,7 +249,10 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
     if run or not isinstance(code, str):
         return _fields(name, raw, own.read(struct, name, code))
     own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
-    return _fields(name, {**own_keys, "rest": {k: v for k, v in raw.items() if k not in own_keys}}, own.waiting(struct))
+    rest = {key: value for key, value in raw.items() if key not in own_keys}
+    for key in (key for key, value in rest.items() if _not_finite(value) is not None):
+        raise wrong(f"{name}.{key}", rest[key], "made of finite numbers")
+    return _fields(name, {**own_keys, "rest": rest}, own.waiting(struct))
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
