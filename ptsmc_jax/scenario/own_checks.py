@@ -40,6 +40,8 @@ def what_fails(error: Exception, file: str) -> str:
     """What is wrong with code of one's own in this file that ended in an error while it was asked, or traced."""
     if isinstance(error, _TRACED):
         return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {_INSTEAD}"
+    if isinstance(error, jax.errors.UnexpectedTracerError):
+        return "keeps a number of a run where a later call finds it; allowed is what its arguments and its memory hold"
     return f"fails: {systems.failure(error, file)}"
 
 

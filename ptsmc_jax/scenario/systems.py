@@ -33,6 +33,7 @@ class _Ran(NamedTuple):
     helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
+_files: set[str] = set()  # of what was run, links followed
 _ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
 # modules that the last ones imported from beside them: path and SHA-256
 _helpers: dict[str, tuple[str, str | None]] = {}
@@ -84,6 +85,7 @@ def item(where: str, allowed: str) -> object:
             module = _run(path, content) if place.endswith(".py") else importlib.import_module(place)
     except (Exception, SystemExit) as error:
         raise ValueError(f"running {place} fails: {failure(error, place)}") from error
+    _files.add(os.path.realpath(getattr(module, "__file__", None) or place))
     if not hasattr(module, name):
         raise ValueError(f"{place} has no such name; allowed is {allowed}")
     return getattr(module, name)
@@ -92,6 +94,17 @@ def item(where: str, allowed: str) -> object:
 def failure(error: BaseException, place: str) -> str:
     """What went wrong in code of one's own, in one line: the error, and the last line of that file that led to it."""
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}{line(error, place)}"
+
+
+def at_fault(error: BaseException) -> str | None:
+    """The file of one's own by which an error came; None: it came by none.
+
+    What was kept of another trace JAX finds later, where no file of one's own is on the way: it is of one that was run.
+    """
+    if type(error).__name__ == "UnexpectedTracerError":
+        return " or ".join(sorted(_files)) or None
+    walked = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return next((file for file in reversed(walked) if file in _files), None)
 
 
 def line(error: BaseException, place: str) -> str:

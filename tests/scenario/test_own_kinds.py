@@ -2,6 +2,7 @@
 
 import dataclasses
 import tomllib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +52,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def made(file, name):
+def made(file, name) -> Any:
     """What stands in a file of ours."""
     return systems.item(f"{file}:{name}", systems.WHERE)
 
@@ -381,6 +382,24 @@ def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
         0,
         f"ptsmc: runs {here}/mine.py, which controller.code of out/simulate-s/scenario.toml names\n",
     )
+
+
+def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, monkeypatch):
+    """A law that keeps a traced number in a list, found by JAX in the flight; and what an error came by."""
+    monkeypatch.setattr(systems, "_files", set())
+    kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
+    (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
+    (here / "s.toml").write_text(SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n'))
+    code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
+    assert code == 2
+    check_sentence(error.removeprefix("ptsmc: ").strip(), f"{here}/mine.py keeps a number of a run", "its memory")
+    assert not (here / "out").exists()
+    with pytest.raises(ZeroDivisionError) as caught:
+        made("mine.py", "fails")()
+    assert systems.at_fault(caught.value) == str(here / "mine.py")
+    with pytest.raises(ZeroDivisionError) as caught:
+        raise ZeroDivisionError
+    assert systems.at_fault(caught.value) is None
 
 
 def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here):

@@ -336,12 +336,12 @@ def main() -> None:
         refused = error.__cause__  # of one of `options`' converters
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
     except ValueError as error:
-        if _expected(error):
-            _fail(str(error))
-        raise
+        _fail(str(error) if _expected(error) else _of_own_code(error))
     except OSError as error:
         name = error.filename2 or error.filename  # where it was to be moved; of a full disk it is not known
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
+    except Exception as error:
+        _fail(_of_own_code(error))
     finally:
         sys.unraisablehook = unraisable
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
@@ -382,6 +382,17 @@ def _expected(error: ValueError) -> bool:
     from ptsmc_jax.scenario.errors import ScenarioError
 
     return isinstance(error, ScenarioError | RefusedError | UsageError)
+
+
+def _of_own_code(error: Exception) -> str:
+    """What fails in code of one's own that was run; raises the error where it did not come by any."""
+    systems = sys.modules.get("ptsmc_jax.scenario.systems")
+    file = None if systems is None else systems.at_fault(error)
+    if file is None:
+        raise error
+    from ptsmc_jax.scenario.own_checks import what_fails
+
+    return f"{file} {what_fails(error, file)}"
 
 
 def _fail(sentence: str) -> None:
