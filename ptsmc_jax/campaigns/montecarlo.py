@@ -162,10 +162,10 @@ def run(
             interpreted, slowly.
         software: see `one`.
 
-    Raises ValueError where the trials are no such numbers, TypeError where there are no parts.
+    Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts.
     """
     check_parts(parts)
-    trials = trials if isinstance(trials, Row) else _numbers(trials)
+    trials, seed = trials if isinstance(trials, Row) else _numbers(trials), _seed(seed)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(jax.local_devices())
     block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
@@ -194,6 +194,14 @@ def _numbers(trials: Any) -> np.ndarray:
         said = f"between {numbers.min()} and {numbers.max()}" if whole else f"of type {numbers.dtype}"
         raise ValueError(f"trials are {said}, but must be whole numbers from 0 to {2**32 - 1}")
     return numbers.astype(np.uint32)
+
+
+def _seed(seed: Any) -> int:
+    """A seed, checked as the numbers of trials are."""
+    number = np.asarray(seed)
+    if number.ndim or not np.issubdtype(number.dtype, np.integer) or not 0 <= number < 2**32:
+        raise ValueError(f"seed is {seed!r}, but must be a whole number from 0 to {2**32 - 1}")
+    return int(number)
 
 
 def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:

@@ -73,7 +73,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """
     check_parts(parts)
     _check_names(parts, gains)
-    gains = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    gains = {name: _number(name, value) for name, value in gains.items()}
     for name, value in gains.items():
         if value.ndim and name == "observer_gain":
             raise ValueError(f"the observer's gain must be a number; {AXIS}1 and so on name those of its axes")
@@ -96,6 +96,16 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
             parts = device.write(parts, gains[name])
     _check_clock(parts)
     return parts
+
+
+def _number(name: str, value: Any) -> Array:
+    """A gain as an array. Raises ValueError where it is none: JAX reads words as numbers, too."""
+    try:
+        if isinstance(value, str | bytes | bool) or value is None:
+            raise TypeError
+        return jnp.asarray(value, float)
+    except TypeError:
+        raise ValueError(f"{name} is {value!r}, but must be a number") from None
 
 
 def _check_names(parts: Parts, names: Iterable[str]) -> None:

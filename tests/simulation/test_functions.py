@@ -119,6 +119,14 @@ REFUSED = {
         lambda: API.with_gains(RUN, {"eta": [3.0, 3.5, 4.0]}),
         r"eta must be a number, but has shape \(3,\)",
     ),
+    "a gain in words": (lambda: API.with_gains(RUN, {"eta": "3"}), "eta is '3', but must be a number"),
+    "no gain": (lambda: API.with_gains(RUN, {"eta": None}), "eta is None, but must be a number"),
+    "a gain of two parts": (lambda: API.with_gains(RUN, {"eta": 3j}), "eta is 3j, but must be a number"),
+    "half a seed": (
+        lambda: API.run(RUN, None, 0.5, [1]),
+        "seed is 0.5, but must be a whole number from 0",
+    ),
+    "a seed below zero": (lambda: API.run(RUN, None, -1, [1]), "seed is -1, but must be a whole number from 0 to"),
     "a traced value": (
         lambda: jax.eval_shape(lambda eta: ptsmc.replace(FLIGHT, controller__eta=eta).loop.t_end, 3.0),
         "controller.eta is traced by JAX, but must be known here; with_gains takes traced gains",
