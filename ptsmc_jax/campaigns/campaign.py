@@ -96,23 +96,27 @@ class Campaign:
 
         def asked(result: Any, parts: Any) -> Any:
             try:
-                return made(result, parts)
+                returned: Any = made(result, parts)
             except Exception as error:
                 file = getattr(getattr(made, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
+            if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):
+                raise ValueError(f"it returns {type(returned).__name__}, but must return named numbers, a dict")
+            for name, value in returned.items():
+                single = isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and not np.ndim(value)
+                if not single or jnp.result_type(value).kind not in "iuf":
+                    raise ValueError(f"its {name} is no single number")
+            return returned
 
         about = self.ready.parts, self.ready.dispersion, self.seed, 0
         flown = jax.eval_shape(lambda: montecarlo.one(*about, own=asked, software=self.software))
         counted = _counted(flown.samples)
-        own: Any = flown.own
-        if not isinstance(own, dict) or not own or not all(isinstance(name, str) for name in own):
-            raise ValueError(f"it returns {type(own).__name__}, but must return named numbers, a dict")
-        for name, value in own.items():
-            if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
-                raise ValueError(f"its {name} is no single number")
+        for name in flown.own:
+            if not own_checks.names_column(name):
+                raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
             if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *counted, *flown.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
-        return list(own)
+        return list(flown.own)
 
 
 def _counted(samples: dict[str, Any]) -> dict[str, Any]:

@@ -45,6 +45,11 @@ def what_fails(error: Exception, file: str) -> str:
     return f"fails: {systems.failure(error, file)}"
 
 
+def names_column(name: str) -> bool:
+    """Whether a name can stand above a column."""
+    return name.isprintable() and bool(name.strip())
+
+
 class _Asked:
     """Calls what a table's code names, and says what is wrong with it."""
 
@@ -175,6 +180,8 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
         ask.check("values", f"a number {name}", value, ())
         if name in taken:
             raise ask.refused("values", f"a number {name}", "names that no column of the rows has")
+        if not names_column(name):
+            raise ask.refused("values", f"a number {name!r}", "names that can be printed")
 
 
 def _observer(parts: Parts, ask: _Asked) -> None:

@@ -186,6 +186,12 @@ def test_metrics_of_ones_own_stand_in_the_rows():
     [
         (lambda result, parts: jnp.zeros(()), "named numbers"),
         (lambda result, parts: {"x": result.log.t}, "its x is no single number"),
+        (lambda result, parts: {"x": "no"}, "its x is no single number"),
+        (lambda result, parts: {"x": 1j * result.log.u[0, 0]}, "its x is no single number"),
+        (
+            lambda result, parts: {"x\n": result.log.u[0, 0]},
+            r"its 'x\\n' is no name of a column; allowed are names that",
+        ),
         (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
         (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),  # with a plan
         (lambda result, parts: {}, "named numbers"),

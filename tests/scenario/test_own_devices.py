@@ -255,6 +255,7 @@ DRAWS = [
     ("initial=parts.initial + 0.01 * c[1]", "initial=None", "parts with initial absent in place of an array of shape"),
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
+    ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),
