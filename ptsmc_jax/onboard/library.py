@@ -143,8 +143,7 @@ class Library:
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         if jax.default_backend() != "cpu":
             how = partial(jax.pure_callback, stepped, results, vmap_method="broadcast_all")
-        after, out, status = how(state, given, parameters)
-        return after, out, status
+        return tuple(how(state, given, parameters))
 
 
 def _at(array: np.ndarray) -> ctypes.c_void_p:
@@ -188,13 +187,13 @@ class InTheLoop:
     @property
     def otherwise(self) -> str:
         """One sentence that names the parameters that C has otherwise than the parts; empty where there are none."""
-        columns, made = self.library.columns["params"], named(self.board)
-        elements = {field.name: field.elements() for field in made.fields}
+        flown, made = dict(zip(self.library.columns["params"], self.library.parameters, strict=True)), named(self.board)
+        fields = {field.name: field.elements() for field in made.fields}
         differing = [
-            f"{element} = {self.library.parameters[columns.index(element)]:.6g} instead of {value:.6g}"
+            f"{element} = {flown[element]:.6g} instead of {value:.6g}"
             for name, values in made.values.items()
-            for element, value in zip(elements[name], np.ravel(values), strict=True)
-            if element in columns and not np.isclose(self.library.parameters[columns.index(element)], value, rtol=SAME)
+            for element, value in zip(fields[name], np.ravel(values), strict=True)
+            if element in flown and not np.isclose(flown[element], value, rtol=SAME, atol=0.0)
         ]
         if not differing:
             return ""
