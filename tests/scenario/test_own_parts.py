@@ -48,18 +48,40 @@ def fresh(monkeypatch):
     monkeypatch.setattr(systems, "_ran", {})
 
 
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """A folder, and one for a copy of what is in it."""
+    return tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("kept") / "home"
+
+
 @pytest.fixture
-def flown(command, tmp_path):
-    """A campaign whose scenario and metrics name my.py, its marker removed."""
-    (tmp_path / "my.py").write_text(PROGRAM)
-    (tmp_path / "mine.toml").write_text(SCENARIO)
-    code, _, error = command(
-        "montecarlo", "mine.toml", "--trials", 20, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
-    )
-    assert (code, error) == (0, "")  # what lies beside a scenario that its user names is run without a word
-    assert ran(tmp_path)
-    systems._ran.clear()
-    return tmp_path / FOLDER
+def home(command, places, monkeypatch):
+    """A folder with a campaign whose scenario and metrics name my.py, its marker removed; the current one.
+
+    Flown once, and put back for each test: results name their files by where they lie.
+    """
+    place, kept = places
+    if kept.exists():
+        shutil.rmtree(place)
+        shutil.copytree(kept, place)
+    monkeypatch.chdir(place)
+    if not kept.exists():
+        (place / "my.py").write_text(PROGRAM)
+        (place / "mine.toml").write_text(SCENARIO)
+        code, _, error = command(
+            "montecarlo", "mine.toml", "--trials", 20, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
+        )
+        assert (code, error) == (0, "")  # what lies beside a scenario that its user names is run without a word
+        assert ran(place)
+        systems._ran.clear()
+        shutil.copytree(place, kept)
+    return place
+
+
+@pytest.fixture
+def flown(home):
+    """The campaign's folder."""
+    return home / FOLDER
 
 
 def ran(folder):
@@ -70,7 +92,7 @@ def ran(folder):
     return found
 
 
-def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flown, tmp_path):
+def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flown, home):
     rows = pl.read_parquet(flown / "trials")
     code, said, error = command("summarize", FOLDER)
     assert (code, error) == (0, "")
@@ -84,38 +106,38 @@ def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flo
     )
     assert pl.read_csv(flown / "worst.csv")["farthest"][0] == rows["farthest"].max()
     assert command("report", FOLDER)[0] == 0
-    assert not ran(tmp_path)
+    assert not ran(home)
     page = (flown / "report.html").read_text()
     assert "farthest" in page
     assert "--metrics my.py:farthest --seed 1000 --trust" in page
 
 
-def test_rows_are_read_where_the_program_is_not(command, flown, tmp_path):
-    (tmp_path / "my.py").unlink()
+def test_rows_are_read_where_the_program_is_not(command, flown, home):
+    (home / "my.py").unlink()
     for asked in ("summarize", "worst", "report"):
         assert command(asked, FOLDER)[0] == 0, asked
 
 
-def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flown, tmp_path):
+def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flown, home):
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures")
     assert (code, out) == (2, "")
-    for said in (f"{tmp_path}/my.py (plant.system, --metrics)", "--trust"):
+    for said in (f"{home}/my.py (plant.system, --metrics)", "--trust"):
         assert said in error
     assert error.count("\n") == 1
-    assert not ran(tmp_path)
+    assert not ran(home)
     assert not (flown / "replay").exists()
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures", "--trust")
     assert (code, "equal to its row" in out) == (0, True)
-    assert f"ptsmc: runs {tmp_path}/my.py, which plant.system and --metrics of {FOLDER} name\n" in error
-    assert ran(tmp_path)
+    assert f"ptsmc: runs {home}/my.py, which plant.system and --metrics of {FOLDER} name\n" in error
+    assert ran(home)
 
 
-def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(command, flown, tmp_path):
-    shutil.copy(tmp_path / "my.py", flown)
-    text = (flown / "scenario.toml").read_text().replace(f"{tmp_path}/my.py", "my.py")
+def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(command, flown, home):
+    shutil.copy(home / "my.py", flown)
+    text = (flown / "scenario.toml").read_text().replace(f"{home}/my.py", "my.py")
     (flown / "scenario.toml").write_text(text)
     (flown / "my.py").write_text(PROGRAM + "# another\n")
-    (tmp_path / "my.py").write_text(PROGRAM + "# another\n")
+    (home / "my.py").write_text(PROGRAM + "# another\n")
     assert "--trust" in command("replay", FOLDER, "--trial", 3)[2]
     for asked in (["replay", FOLDER, "--trial", 3], ["simulate", f"{FOLDER}/scenario.toml", "--out", "new"]):
         code, out, error = command(*asked, "--trust", "--no-figures")
@@ -130,7 +152,7 @@ def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(co
     assert not ran(flown)
 
 
-def test_the_same_campaign_goes_on_without_a_flag(command, flown, tmp_path):
+def test_the_same_campaign_goes_on_without_a_flag(command, flown, home):
     code, _, error = command(
         "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
     )
@@ -139,19 +161,19 @@ def test_the_same_campaign_goes_on_without_a_flag(command, flown, tmp_path):
     assert campaign_folder.opened(flown).own_names == ["farthest"]
 
 
-def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, tmp_path, capsys):
-    shutil.copy(tmp_path / "my.py", flown)
+def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, home, capsys):
+    shutil.copy(home / "my.py", flown)
     (flown / "evil.toml").write_text(SCENARIO)
     (flown / "scenarios").mkdir()
     (flown / "scenarios" / "law.toml").write_text(SCENARIO.replace("my.py", "../my.py"))
-    (tmp_path / "link.toml").symlink_to(flown / "evil.toml")
+    (home / "link.toml").symlink_to(flown / "evil.toml")
     for path in (f"{FOLDER}/scenario.toml", f"{FOLDER}/evil.toml", f"{FOLDER}/scenarios/law.toml", "link.toml"):
         for asked in ("simulate", "tune", "montecarlo", "map", "pareto"):
             code, out, error = command(asked, path, "--out", "new")
             assert (code, out) == (2, "")
             assert "names code of its own" in error
     assert not ran(flown)
-    assert not ran(tmp_path)
+    assert not ran(home)
     loaded = scenario.read(flown / "evil.toml")
     own_parts.allow_scenario(flown / "evil.toml", loaded, True)
     assert capsys.readouterr().err == f"ptsmc: runs {flown}/my.py, which plant.system of {flown}/evil.toml names\n"
