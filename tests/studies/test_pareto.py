@@ -100,9 +100,9 @@ def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
 
 def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     small_search(monkeypatch, 60)
-    text = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0").replace("steps = 4", "steps = 20")
+    text = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0").replace("steps = 4", "steps = 6")
     (tmp_path / "s.toml").write_text(text)
-    status, told, _ = command("pareto", "s.toml", "--points", 6, "--out", "p")
+    status, told, _ = command("pareto", "s.toml", "--points", 4, "--out", "p")
     assert set(tree(tmp_path / "p")) == {
         "front.csv", "summary.json", "scenario.toml", "versions.json", "figures/front.png"
     }  # fmt: skip
@@ -134,8 +134,8 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     drawn = read.charts["front"]["layout"]["shapes"][-1]
     assert drawn["y0"] == drawn["y1"] == summary["floor"]
     assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
-    assert command("pareto", "s.toml", "--points", 6, "--out", "p")[1].startswith("front already done")
-    assert command("pareto", "s.toml", "--points", 7, "--out", "p")[0] == 2
+    assert command("pareto", "s.toml", "--points", 4, "--out", "p")[1].startswith("front already done")
+    assert command("pareto", "s.toml", "--points", 5, "--out", "p")[0] == 2
 
 
 @pytest.mark.parametrize(("change", "value"), [("objective = \"t_f\"", 'tune.objective is "t_f"'),
