@@ -36,18 +36,23 @@ NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rat
 
 
 SHORT = ("filter, slow star tracker, wheels, lag",)  # delay and random walk: tests/theory/test_spillover.py
+# from nearby a law arrives in 15 s, too
+NEAR = {
+    "dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 0.1, "max_deg": 0.5}},
+    "controller__t_f": 15.0, "loop__t_end": 18.0,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("case", "trials"),
-    [(case, 500) for case in SHORT] + [pytest.param(case, 2000, marks=pytest.mark.long) for case in CASES],
+    ("case", "trials", "start"),
+    [(case, 500, NEAR) for case in SHORT] + [pytest.param(case, 2000, {}, marks=pytest.mark.long) for case in CASES],
 )
-def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials):
+def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials, start):
     """RMS of 500 trials, 3 % of sampling error at most; the rest is what the law does beyond first order.
 
     What the law leaves without noise, in the same trials, is taken away.
     """
-    noisy = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **{**QUIET, **CASES[case]})
+    noisy = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **{**QUIET, **CASES[case], **start})
     given = {f"hardware__{k}": v for k, v in NOISES.items() if getattr(noisy.hardware, k)}
     walk = noisy.disturbance.kind == "random_walk"  # the same program, whatever is quiet
     quiet = {"kind": "random_walk", "density": [1e-16] * 3} if walk else {"kind": "none"}
