@@ -479,7 +479,7 @@ def test_every_help_is_told_without_jax(args):
 
 
 def test_a_process_exits_as_the_contract_says(tmp_path):
-    (tmp_path / "s.toml").write_text(SHORT.replace("peak_torque = 30.0", "peak_torque = 0.01"))
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.01"))
     not_met = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
     assert (not_met.returncode, not_met.stdout, not_met.stderr) == (1, "", "")
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdicts"]["peak_torque"]["met"] is False

@@ -223,7 +223,7 @@ def test_other_compiler_options_are_set_before_anything_runs_or_refused():
     begin = "from ptsmc_jax.configure import configure\nimport jax, os\n"
     run = "jax.numpy.zeros(3).block_until_ready()\n"
     tell = "print(os.environ['XLA_FLAGS'], file=__import__('sys').stderr)\n"
-    fast, plain = "configure(cache=None)\n", "configure(cache=None, fast=False)\n"
+    fast, plain = "configure()\n", "configure(fast=False)\n"
     first, again, *_, last = said(begin + fast + tell + run + fast + tell + plain).splitlines()
     assert first == again != ""
     assert "than fast=False asks for" in last
