@@ -252,10 +252,11 @@ def tree(folder):
 
 
 def small_search(monkeypatch, fresh=40):
-    """A search that looks at a few points only, judged on so many trials."""
-    from tuning.search import cma_es, confirm, descents, starts, worst
+    """A search that looks at a few points only, judged on so many trials; rows hold little more than its few trials."""
+    from tuning.search import cma_es, confirm, descents, flights, starts, worst
 
     for module, name, value in (
+        (flights, "ROW", 10),
         (worst, "SCREENED", 48),
         (confirm, "FRESH", fresh),
         (confirm, "FEWEST", 64),

@@ -19,12 +19,31 @@ from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import FIRST_FLIGHT, chain_parts, parts, vector
 from tuning.output import search_sentences
-from tuning.search import cma_es, confirm, descent, descents, gains, objective, optimise, rounds, shares, starts, worst
+from tuning.search import (
+    cma_es,
+    confirm,
+    descent,
+    descents,
+    flights,
+    gains,
+    objective,
+    optimise,
+    rounds,
+    shares,
+    starts,
+    worst,
+)
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.studies import judging, posing, tune_files
 
 TURNED = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 SPREAD = variation.Dispersion(state=numbers.Uniform(vector([20.0, 0.0])))
+
+
+@pytest.fixture(autouse=True)
+def short_rows(monkeypatch):
+    """As those of `small_search`, for what looks at points without it."""
+    monkeypatch.setattr(flights, "ROW", 10)
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,7 @@ def first_torque(inertia, theta, eta=ETA):
 @pytest.fixture(autouse=True)
 def few_screened(monkeypatch):
     monkeypatch.setattr(worst, "SCREENED", 64)
+    monkeypatch.setattr(flights, "ROW", 10)
 
 
 @pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))])
