@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import margins, run_margins
+from ptsmc_jax.theory import linear, margins, run_margins
 from tests.helpers import ROOT
 from tuning.errors import UsageError
 from tuning.studies import mapping
@@ -30,6 +30,14 @@ controller = { t_f = 5.0, delta = 0.5 }
 hardware.state_noise = [2e-5, 1e-6]
 dispersion.x0 = { kind = "uniform", half_width = [0.5, 0.1] }
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_together():
+    """A cell's loop is opened in two periods: the program is for few."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(linear, "TOGETHER", 4)
+        yield
 
 
 def asked(x, y, text=SHORT):

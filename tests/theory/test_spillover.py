@@ -22,6 +22,12 @@ SPILLS = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def few_together(monkeypatch):
+    """Most loops here are opened in one period: the program is for few."""
+    monkeypatch.setattr(linear, "TOGETHER", 8)
+
+
 def test_margins_see_the_mode_and_sensors_see_the_body_alone():
     loop = in_hold(parts_of(controller={**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}))
     assert loop.seen.shape[1] == 6
