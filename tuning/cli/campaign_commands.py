@@ -91,7 +91,8 @@ def montecarlo(
     """Fly a campaign: many trials of a scenario, every one counted, kept and replayable.
 
     Interrupted or killed, the same command goes on from there; with more trials it adds to what is there. With --plan a
-    row of a table is a trial: results are in out/montecarlo-NAME-PLAN by default.
+    row of a table is a trial. By default results are in out/montecarlo-NAME, with the names of --controller and --plan
+    behind it.
 
     Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
     input or a full disk, 130 interrupted.
@@ -134,8 +135,10 @@ def montecarlo(
         from ptsmc_jax.campaigns import plans
 
         table = plans.read(plan)
-        place = path if out is not None else path.with_name(f"{path.name}-{plan.stem}")
-        folder = replace(folder, path=place, trials=table.height, plan=plan.name, table=table)
+        folder = replace(folder, trials=table.height, plan=plan.name, table=table)
+    if out is None:
+        names = [path.name, *([controller.resolve().name] if controller else ()), *([plan.stem] if plan else ())]
+        folder = replace(folder, path=path.with_name("-".join(names)))
     if scenario is not None:
         searches.say_seen(scenario, seed)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
