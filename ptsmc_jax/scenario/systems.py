@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import re
 import sys
 import traceback
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ class _Ran(NamedTuple):
     helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
+_NO_SLOPES = re.compile("support JVP|Differentiation rule for")  # in what JAX says then
 _files: set[str] = set()  # of what was run, links followed
 _ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
 # modules that the last ones imported from beside them: path and SHA-256
@@ -99,9 +101,10 @@ def failure(error: BaseException, place: str) -> str:
 def at_fault(error: BaseException) -> str | None:
     """The file of one's own by which an error came; None: it came by none.
 
-    What was kept of another trace JAX finds later, where no file of one's own is on the way: it is of one that was run.
+    What was kept of another trace, or has no slopes, JAX finds later, where no file of one's own is on the way: it is
+    of one that was run.
     """
-    if type(error).__name__ == "UnexpectedTracerError":
+    if type(error).__name__ == "UnexpectedTracerError" or _NO_SLOPES.search(str(error)):
         return " or ".join(sorted(_files)) or None
     walked = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     return next((file for file in reversed(walked) if file in _files), None)

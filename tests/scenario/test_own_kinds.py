@@ -400,6 +400,9 @@ def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, 
     with pytest.raises(ZeroDivisionError) as caught:
         raise ZeroDivisionError
     assert systems.at_fault(caught.value) is None
+    with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: JAX alone is on the way
+        jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
+    assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
 
 
 def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here):
