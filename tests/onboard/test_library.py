@@ -1,6 +1,7 @@
 """The compiled controller in the loop flies what the simulator flies; bad input gets a status and a finite answer."""
 
 import re
+import shutil
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -243,6 +244,19 @@ def test_a_singular_attitude_gets_the_last_good_command(exported):
     assert statuses.tolist() == [OK] * 10 + [SINGULAR] + [OK] * 10  # half an angle within 1e-3 of a right one
     at = names_of(made.board)["out"].index("command[0]")
     np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
+
+
+@needs_compiler
+def test_a_status_that_no_export_has_is_counted_as_other(exported, tmp_path):
+    """Those beyond the last were not counted at all, and -1 as the gravest."""
+    made, library = exported("chain")
+    code = shutil.copytree(library.folder, tmp_path / "c") / f"ptsmc_{library.name}.c"
+    last = "    return status;\n"
+    assert code.read_text().count(last) == 1
+    code.write_text(code.read_text().replace(last, "    return in->t > 2.0 ? 7 : in->t > 1.0 ? -1 : status;\n"))
+    run = runs.fly(made.ready, 3, 2, InTheLoop(Library(code.parent), made.ready.parts).software)
+    late = int(np.sum(run.log.t[:-1] > 1.0))
+    assert run.samples == {**dict.fromkeys(run.samples, 0), "ok": len(run.log.t) - 1 - late, "other": late}
 
 
 @needs_compiler
