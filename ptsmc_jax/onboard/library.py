@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.devices.actuators import ActuatorState
+from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import named
-from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import STATUS, filled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
@@ -58,7 +58,7 @@ class Library:
         self.folder = Path(folder)
         none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
-            layout = json.loads((self.folder / LAYOUT).read_text(encoding="utf-8"))
+            layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
             self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; none of an export by an earlier version
@@ -92,16 +92,20 @@ class Library:
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
         glue.write_text(filled("in_the_loop.c", name=self.name), encoding="utf-8")
-        folder = self.folder.absolute()  # else "-c" would be an option
-        sources = [str(folder / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
-        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{folder}", *sources]
+        alone = place / "controller"  # what a campaign keeps and knows of it: what lies elsewhere does not fly
+        sources.copy(self.folder, alone)
+        files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
+        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{alone}", *files]
         compiled = subprocess.run(
             [*command, str(glue), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
         )
         if compiled.returncode:
-            lines = compiled.stderr.strip().splitlines() or ["for no reason told"]
+            said = compiled.stderr.replace(str(alone), str(self.folder))
+            lines = said.strip().splitlines() or ["for no reason told"]
             errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
-            raise ScenarioError(f"the controller in {self.folder} does not compile: {(errors or lines)[0]}")
+            raise ScenarioError(
+                f"the controller in {self.folder} does not compile from the *.c and *.h in it: {(errors or lines)[0]}"
+            )
         return library
 
     def first(self) -> np.ndarray:

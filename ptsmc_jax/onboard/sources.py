@@ -11,7 +11,7 @@ CHECKS = ("check.c", "fuzz.c")  # of a step's numbers: programs of their own
 def listed(folder: Path) -> list[Path]:
     """These files, in the order of their names; also those that a user has put beside."""
     code = {*folder.glob("*.c"), *folder.glob("*.h")} - {folder / name for name in CHECKS}
-    return sorted({*code, *folder.glob(LAYOUT)})
+    return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # no lock of an editor
 
 
 def digest(folder: Path) -> str | None:

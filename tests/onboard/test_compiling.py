@@ -7,7 +7,7 @@ import jax
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard import folder, sources
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.onboard.compiled import CC, needs_compiler, program
@@ -39,8 +39,29 @@ def test_what_is_no_controller_is_refused(raw, tmp_path):
         InTheLoop(library, parts("raw", period=0.2))
     shutil.copytree(raw, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
-    with pytest.raises(ScenarioError, match=r"does not compile: .*error: "):
+    with pytest.raises(ScenarioError, match=r"does not compile from the \*\.c and \*\.h in it: .*error: "):
         Library(tmp_path / "controller")
+
+
+@needs_compiler
+def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(raw, tmp_path):
+    """A header elsewhere flew, changed or not in the same campaign, and its replay did not compile."""
+    changed = shutil.copytree(raw, tmp_path / "changed")
+    code = changed / "ptsmc_flight.c"
+    code.write_text('#include "board.h"\n' + code.read_text())
+    (changed / ".#ptsmc_flight.c").symlink_to("somebody@elsewhere:1")  # an editor's, of nothing
+    (changed / "board.h").touch()
+    Library(changed)
+    before = sources.digest(changed)
+    (changed / "board.h").write_text("/* changed */\n")
+    assert sources.digest(changed) != before
+    sources.copy(changed, tmp_path / "kept")
+    Library(tmp_path / "kept")
+    (changed / "other").mkdir()
+    (changed / "board.h").rename(changed / "other" / "board.h")
+    code.write_text('#include "other/board.h"\n' + code.read_text())
+    with pytest.raises(ScenarioError, match=r"changed/ptsmc_flight\.c:1:.* error: .*other/board\.h"):
+        Library(changed)
 
 
 @needs_compiler
