@@ -203,10 +203,7 @@ class InTheLoop:
         if not differing:
             return ""
         more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
-        return (
-            f"the controller in {self.library.folder} flies with its own numbers, not the scenario's: "
-            f"{', '.join(differing[:NAMED])}{more}"
-        )
+        return f"the controller flies with its own numbers, not the scenario's: {', '.join(differing[:NAMED])}{more}"
 
     @property
     def software(self) -> Software:

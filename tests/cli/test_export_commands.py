@@ -10,6 +10,7 @@ import pytest
 from ptsmc_jax.onboard import folder
 from tests.helpers import SHORT, SHORT_CHAIN, tree
 from tests.onboard.compiled import needs_compiler
+from tuning.output import made_again
 
 CONTINUOUS = SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
 
@@ -46,8 +47,14 @@ def test_simulate_flies_the_controller(command, tmp_path, exported):
 def test_what_the_controller_has_otherwise_is_said(command, tmp_path, exported):
     (tmp_path / "s.toml").write_text(SHORT.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
-    assert (status, err) == (0, f"ptsmc: the controller in {exported} flies with its own numbers, not the scenario's: "
-                                "law_eta = 3 instead of 2.9, law_k1 = 1 instead of 0.8\n")  # fmt: skip
+    said = (
+        "the controller flies with its own numbers, not the scenario's: law_eta = 3 instead of 2.9, "
+        "law_k1 = 1 instead of 0.8"
+    )
+    assert (status, err) == (0, f"ptsmc: {said}\n")
+    (place,) = (tmp_path / "out").iterdir()
+    assert json.loads((place / "summary.json").read_text())["cautions"] == [said]
+    assert again(place) == f"ptsmc simulate scenario.toml --controller {exported} --seed 0"
 
 
 @needs_compiler
@@ -71,7 +78,10 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     assert by_c.select(counted).sum_horizontal().to_list() == 40 * [65]
     kept = {path.name.replace("ptsmc_of_c", "") for path in (tmp_path / "r" / "controller").iterdir()}
     assert kept == {"controller.json", ".c", ".h", "_flat.h", "_parameters.c"}
-    samples = json.loads((tmp_path / "r" / "summary.json").read_text())["controller_samples"]
+    told = json.loads((tmp_path / "r" / "summary.json").read_text())
+    assert "law_eta = 3 instead of 2.9" in told["cautions"][0]
+    assert again(tmp_path / "r") == "ptsmc montecarlo scenario.toml --trials 40 --controller controller --seed 1000"
+    samples = told["controller_samples"]
     assert samples["ok"] == {"samples": 40 * 65, "trials": 40}
     assert samples["singular"] == {"samples": 0, "trials": 0}
 
@@ -85,9 +95,20 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     code, out, err = command(*replay, "--trust")
     assert (code, "equal to its row, to the last digit" in out, "same flight to round-off" in out) == (0, True, True)
     assert err == f"ptsmc: runs {tmp_path / 'r' / 'controller'}, which --controller of r names\n"
-    with (tmp_path / "r" / "controller" / "ptsmc_of_c.c").open("a") as file:
+    assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # runs nothing, and knows it still
+    assert json.loads((tmp_path / "r" / "summary.json").read_text()) == told
+    replayed = tmp_path / "r" / "replay" / "7"
+    assert json.loads((replayed / "summary.json").read_text())["cautions"] == told["cautions"][:1]
+    kept = tmp_path / "r" / "controller"
+    assert again(replayed) == f"ptsmc simulate scenario.toml --trial 7 --controller {kept} --seed 1000"
+    with (kept / "ptsmc_of_c.c").open("a") as file:
         file.write("/* changed */\n")
     assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
+
+
+def again(place):
+    """The call that a page of these results says to make them again."""
+    return made_again.call(json.loads((place / "versions.json").read_text()), {"loop": {}})
 
 
 def refused(command, tmp_path, *args):

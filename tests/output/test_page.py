@@ -281,6 +281,8 @@ def test_a_comparison_is_made_again_with_its_laws():
         assert made_again.call({"command": "compare", **laws}, {"loop": {}}) == f"ptsmc compare scenario.toml {said}"
     own = {"controller": {"kind": "own", "code": "/at/mine.py:Growing"}}
     assert made_again.call({"command": "margins"}, own) == "ptsmc margins scenario.toml --trust"
+    bits = {"command": "montecarlo", "precision": 32}
+    assert made_again.call(bits, {"loop": {}}) == "ptsmc montecarlo scenario.toml --precision 32"
     assert made_again.call({"command": "reproduce", "seed": None}, {}) == "ptsmc reproduce"
 
 

@@ -278,9 +278,10 @@ def replay(
     own_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
     again = campaign_summary.replay(opened, trial)
-    store.write(place, lambda making: single.write(making, opened.scenario, again.run, opened.seed, trial, figures))
+    about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
+    store.write(place, lambda making: single.write(making, *about))
     if not quiet:
-        terminal.run(single.summary(again.run, opened.scenario), opened.scenario.plant.kind, place)
+        terminal.run(single.summary(again.run, opened.scenario, opened.computer), opened.scenario.plant.kind, place)
         campaign_terminal.replayed(again.off, again.rounding, campaign_summary.SAME)
     return 0 if again.off is None or again.off <= campaign_summary.SAME else 1
 

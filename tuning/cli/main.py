@@ -84,10 +84,9 @@ def simulate(
     if steps > LONG and not quiet:
         terminal.say(f"flying {steps} integration steps, with their history")
     run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
-    decided_by = None if computer is None else computer.library.digest
-    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, decided_by))
+    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
     if not quiet:
-        terminal.run(single.summary(run, loaded), loaded.plant.kind, folder)
+        terminal.run(single.summary(run, loaded, computer), loaded.plant.kind, folder)
     return 0 if run.met else 1
 
 

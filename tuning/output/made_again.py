@@ -8,7 +8,8 @@ from ptsmc_jax.scenario import own
 
 # kept in `versions.json`
 OPTIONS = (
-    "x", "y", "trials", "trial", "plan", "points", "against", "limits", "times", "metrics", "seed", "global_check",
+    "x", "y", "trials", "trial", "plan", "points", "against", "limits", "times", "metrics", "controller", "seed",
+    "global_check",
 )  # fmt: skip
 
 
@@ -21,6 +22,8 @@ def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:
         if versions["command"] != "reproduce" and versions.get(key) is not None:
             option = f"--{key.replace('_', '-')}"
             command += [option] if versions[key] is True else [option, str(versions[key])]
+    if versions.get("precision") == 32:
+        command += ["--precision", "32"]
     laws, files = versions.get("laws", ()), list(versions.get("own_laws", ()))
     for kind in laws[1 : len(laws) - len(files)]:  # the paper's is the first, those of one's own are the last
         command += ["--against", kind]

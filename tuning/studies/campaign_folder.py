@@ -45,6 +45,7 @@ class Made(msgspec.Struct, frozen=True):
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
     plan: str | None = None  # the name of its file
+    controller_otherwise: str | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,8 @@ class Folder:
         """What its `versions.json` says."""
         names = None if self.own is None else self.own_names
         entries = {**self.identity, "trials": self.trials, "metrics_names": names, "plan": self.plan}
+        if self.controller is not None:
+            entries |= {C: C, "controller_otherwise": self.otherwise or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
 
     @cached_property
@@ -136,6 +139,13 @@ class Folder:
         assert self.ready is not None
         self._check_unchanged(own_parts.CONTROLLER)
         return InTheLoop(Library(self.controller), self.ready.parts)
+
+    @property
+    def otherwise(self) -> str:
+        """What the C that decides has otherwise than the scenario, a sentence; empty: nothing, or there is none."""
+        if self.made is not None:
+            return self.made.controller_otherwise or ""
+        return "" if self.computer is None else self.computer.otherwise
 
     @property
     def software(self) -> Software:

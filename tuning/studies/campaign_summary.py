@@ -128,7 +128,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "quantiles": quantiles,
         "drivers": drivers,
         **_samples(folder, parts),
-        "cautions": [*cautions.of(folder.scenario), *_alike(quantiles, done)],
+        "cautions": [*cautions.of(folder.scenario), *filter(None, [folder.otherwise]), *_alike(quantiles, done)],
     }
 
 

@@ -7,6 +7,8 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.onboard import sources
+from ptsmc_jax.onboard.library import InTheLoop
 from ptsmc_jax.scenario import cautions, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
@@ -14,8 +16,8 @@ from ptsmc_jax.scenario.tables import Scenario
 OF_TIME = ("quantile", "confidence", "interpretation", "share_of_time", "shown")
 
 
-def summary(run: Run, scenario: Scenario) -> dict[str, Any]:
-    """What `summary.json` says."""
+def summary(run: Run, scenario: Scenario, computer: InTheLoop | None = None) -> dict[str, Any]:
+    """What `summary.json` says; computer: the C that decided, where that is not the parts' own code."""
     verdicts = {
         v.metric: {
             **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
@@ -25,8 +27,12 @@ def summary(run: Run, scenario: Scenario) -> dict[str, Any]:
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     floor = None if run.floor is None else run.floor.window_error
-    told = {"controller_statuses": {name: count for name, count in run.samples.items() if count}} if run.samples else {}
-    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": cautions.of(scenario), **told}
+    said, decided_by = cautions.of(scenario), {}
+    if computer is not None:
+        said += [computer.otherwise] if computer.otherwise else []
+        statuses = {name: count for name, count in run.samples.items() if count}
+        decided_by = {"controller_statuses": statuses, "controller": computer.library.digest}
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": said, **decided_by}
 
 
 def write(
@@ -36,12 +42,14 @@ def write(
     seed: int,
     trial: int | None,
     figures: bool,
-    controller: str | None = None,
+    computer: InTheLoop | None = None,
 ) -> None:
-    """Fill a result folder; controller: digest of the export that decided, where that is not the parts' own code."""
+    """Fill a result folder; computer: see `summary`."""
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
-    decided_by = {} if controller is None else {"controller": controller}
-    store.record(folder, parsing.dump(scenario), made_by, {**summary(run, scenario), **decided_by})
+    if computer is not None:
+        place = computer.library.folder
+        made_by |= {"controller": str(place.absolute()), own.digest_name("--controller"): sources.digest(place)}
+    store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:
