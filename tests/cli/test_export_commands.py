@@ -104,6 +104,8 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     with (kept / "ptsmc_of_c.c").open("a") as file:
         file.write("/* changed */\n")
     assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
+    assert command(*flight, "--controller", "c", "--out", "r")[:2] == (0, "")  # which has it again
+    assert command(*replay, "--trust", "--quiet")[0] == 0
 
 
 def again(place):

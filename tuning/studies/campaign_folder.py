@@ -270,7 +270,13 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
         raise RefusedError(
             f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
         )
-    return before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
+    same = before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
+    return same and (before.controller is None or _as_known(before, own_parts.CONTROLLER))
+
+
+def _as_known(folder: Folder, key: str) -> bool:
+    """Whether a program that the folder keeps is there, as the campaign was begun with it."""
+    return own_parts.digest(key, folder.programs[key]) == folder.digests.get(own.digest_name(key))
 
 
 def opened(path: Path) -> Folder:
