@@ -19,6 +19,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
 from ptsmc_jax.scenario import parsing
+from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -28,7 +29,8 @@ OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where
 ANGLE = "initial_angle"  # follows from others
 HEADING = ("status", "reason", "bad_time")  # of a row
 RESULTS = {*HEADING, *Metrics._fields}
-COUNTED = "controller_"  # and a status of flight software that is not ours: how many samples ended with it
+COUNTED = "controller_"  # and how samples of exported C end: how many of them
+SAMPLES = tuple(f"{COUNTED}{ended}" for ended in computer.SAMPLES)
 MOST = 2**32  # of trials and seeds
 
 
@@ -124,8 +126,7 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
     whose = [*OF_ROWS, *OF_ROWS.values()]
     for column in table.columns:
-        of_rows = column in (*quantity_of, *whose, ANGLE, *RESULTS, *own) or column.startswith(COUNTED)
-        if not of_rows:
+        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *SAMPLES, *own):
             close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
             raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
     given = {}

@@ -22,16 +22,15 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import named
-from ptsmc_jax.onboard.templates import STATUS, filled
+from ptsmc_jax.onboard.templates import filled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
+from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
 
 # XLA's headers as the system's: what CC has compilers warn of is said of our code alone
 OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
 SAME = 1e-6  # relative: parameters that differ by less may have been read with 32 bits
 NAMED = 4  # parameters that a sentence names
-COUNTED = (*map(str.lower, STATUS), "other")  # how samples end: other is a status that an export has not
 _loaded = itertools.count()
 
 
@@ -217,7 +216,7 @@ class InTheLoop:
         estimate = getattr(computer.sensors, "estimate", None)
         if estimate is not None:
             state = self._with(self._with(state, "attitude", estimate.q), "bias", estimate.bias)
-        return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(COUNTED), jnp.int32)))
+        return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLES), jnp.int32)))
 
     def decide(
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
@@ -239,7 +238,8 @@ class InTheLoop:
         after, out, status = self.library.called(state, row, self._told(parts))
         has_length = period.length > 0.0
         after = jnp.where(has_length, after, state)
-        ended = jnp.where((status >= 0) & (status < len(STATUS)), status, len(STATUS))
+        other = SAMPLES.index("other")
+        ended = jnp.where((status >= 0) & (status < other), status, other)
         counts = counts.at[ended].add(has_length.astype(counts.dtype))
         outputs = self._trees(self.board.outputs, out, 0)
         memory = self._trees(self.board.state, after, 3)
@@ -251,7 +251,7 @@ class InTheLoop:
 
     def statuses(self, computer: Computer) -> dict[str, Any]:
         """How many samples of a run ended with each status."""
-        return dict(zip(COUNTED, computer.sensors[2], strict=True))
+        return dict(zip(SAMPLES, computer.sensors[2], strict=True))
 
     def _told(self, parts: Parts) -> Any:
         """The parameters (columns,) that a trial gives its flight computer otherwise; NaN of those of the folder."""

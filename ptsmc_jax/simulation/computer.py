@@ -64,6 +64,10 @@ class Period(NamedTuple):
         return jnp.where(self.length > 0.0, starts, 0.0)
 
 
+# how samples by exported C end, the gravest of its statuses last; other: with one that an export has not
+SAMPLES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
+
+
 class Software(NamedTuple):
     """A flight computer, as the rollout flies it: `boot` and `decide`, or other software in their place."""
 

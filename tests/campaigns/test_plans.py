@@ -255,6 +255,8 @@ BAD = [
     ({}, "the plan has no rows, but must have one for each trial"),
     ({"inital_w1": [0.0]}, "the plan has the column inital_w1, with which no trial of this scenario flies; the nearest "
      "known one is initial_w1"),
+    ({"controller_ok": [65], "controller_eta": [3.0]},  # of a row by exported C, and what no C has said
+     "the plan has the column controller_eta, with which no trial of this scenario flies"),
     ({"initial_x1": [0.0]}, "the column initial_x1, with which no trial of this scenario flies"),
     ({"initial_w1": [0.0], "initial_w2": [0.0]},
      "has the column initial_w1, but not initial_w3: initial_w1 to initial_w3 come together"),

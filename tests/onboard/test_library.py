@@ -19,6 +19,7 @@ from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
+from ptsmc_jax.simulation import computer
 from tests.helpers import short
 from tests.onboard.compiled import needs_compiler, program
 from tests.onboard.flights import FLIGHTS
@@ -256,6 +257,7 @@ def test_a_status_that_no_export_has_is_counted_as_other(exported, tmp_path):
     code.write_text(code.read_text().replace(last, "    return in->t > 2.0 ? 7 : in->t > 1.0 ? -1 : status;\n"))
     run = runs.fly(made.ready, 3, 2, InTheLoop(Library(code.parent), made.ready.parts).software)
     late = int(np.sum(run.log.t[:-1] > 1.0))
+    assert (*map(str.lower, STATUS), "other") == computer.SAMPLES
     assert run.samples == {**dict.fromkeys(run.samples, 0), "ok": len(run.log.t) - 1 - late, "other": late}
 
 

@@ -136,8 +136,8 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
     """How many samples the controller's C ended with each status, and in how many trials; nothing without one."""
     if folder.controller is None:
         return {}
-    named = [name for name in pl.read_parquet_schema(parts[0].path) if name.startswith(plans.COUNTED)]
-    names = [name for name in named if name not in folder.own_names]
+    kept = pl.read_parquet_schema(parts[0].path)
+    names = [name for name in plans.SAMPLES if name in kept]  # the gravest last
     counts = rows.read(parts, names).head(folder.trials)
     told = {
         name.removeprefix(plans.COUNTED): {"samples": int(counts[name].sum()), "trials": int((counts[name] > 0).sum())}
