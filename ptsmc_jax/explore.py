@@ -1,6 +1,7 @@
 """For notebooks: a scenario flown, looked at and plotted in a line each. The pure core is `rollout.simulate`."""
 
 import html
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -191,8 +192,13 @@ def trials(
 
 
 def _software(controller: str | Path | None, ready: Study) -> Software:
-    """The flight computer that a folder's C is, or the parts' own code."""
-    return OURS if controller is None else InTheLoop(Library(controller), ready.parts).software
+    """The flight computer that a folder's C is, or the parts' own code; what C has otherwise is warned of."""
+    if controller is None:
+        return OURS
+    computer = InTheLoop(Library(controller), ready.parts)
+    if computer.otherwise:
+        warnings.warn(computer.otherwise, RuntimeWarning, stacklevel=3)
+    return computer.software
 
 
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:

@@ -298,7 +298,9 @@ def test_many_trials_fly_by_the_compiled_controller(exported):
     assert np.max(np.abs(shares)) < 1e-9
     with pytest.raises(ptsmc.ScenarioError, match="has other inputs than the scenario"):
         ptsmc.trials(scenario.from_tables(FLIGHTS["raw"]), 3, controller=library.folder)
-    one = ptsmc.simulate(study, seed=5, trial=1, controller=library.folder)
+    otherwise = scenario.from_tables({**FLIGHTS["chain"], "controller": {**FLIGHTS["chain"]["controller"], "eta": 2.9}})
+    with pytest.warns(RuntimeWarning, match=r"its own numbers, not the scenario's: law_eta = 3 instead of 2\.9$"):
+        one = ptsmc.simulate(otherwise, seed=5, trial=1, controller=library.folder)
     assert one.metrics["window_error"] == pytest.approx(rows["window_error"][1], rel=1e-9)
 
 
