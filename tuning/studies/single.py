@@ -1,22 +1,24 @@
 """What `ptsmc simulate` leaves: the history of one run as CSV, its metrics and verdicts, figures."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.onboard.library import InTheLoop
 from ptsmc_jax.scenario import cautions, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
+
+if TYPE_CHECKING:  # what flies C is imported where C flies
+    from ptsmc_jax.onboard.library import InTheLoop
 
 # of a verdict on a share of the time
 OF_TIME = ("quantile", "confidence", "interpretation", "share_of_time", "shown")
 
 
-def summary(run: Run, scenario: Scenario, computer: InTheLoop | None = None) -> dict[str, Any]:
+def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, Any]:
     """What `summary.json` says; computer: the C that decided, where that is not the parts' own code."""
     verdicts = {
         v.metric: {
@@ -42,7 +44,7 @@ def write(
     seed: int,
     trial: int | None,
     figures: bool,
-    computer: InTheLoop | None = None,
+    computer: "InTheLoop | None" = None,
 ) -> None:
     """Fill a result folder; computer: see `summary`."""
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
