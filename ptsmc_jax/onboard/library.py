@@ -29,7 +29,7 @@ from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Per
 
 # XLA's headers as the system's: what CC has compilers warn of is said of our code alone
 OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
-SAME = 1e-6  # relative: parameters that differ by less may have been read with 32 bits
+SAME = 1e-6  # of a parameter's largest element: what differs by less may have been read with 32 bits
 NAMED = 4  # parameters that a sentence names
 _loaded = itertools.count()
 
@@ -192,13 +192,12 @@ class InTheLoop:
     def otherwise(self) -> str:
         """One sentence that names the parameters that C has otherwise than the parts; empty where there are none."""
         flown, made = dict(zip(self.library.columns["params"], self.library.parameters, strict=True)), named(self.board)
-        fields = {field.name: field.elements() for field in made.fields}
-        differing = [
-            f"{element} = {flown[element]:.6g} instead of {value:.6g}"
-            for name, values in made.values.items()
-            for element, value in zip(fields[name], np.ravel(values), strict=True)
-            if element in flown and not np.isclose(flown[element], value, rtol=SAME, atol=0.0)
-        ]
+        fields, differing = {field.name: field.elements() for field in made.fields}, list[str]()
+        for name, values in made.values.items():
+            off = SAME * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+            for element, value in zip(fields[name], np.ravel(values), strict=True):
+                if element in flown and not np.isclose(flown[element], value, rtol=0.0, atol=off):
+                    differing.append(f"{element} = {flown[element]:.6g} instead of {value:.6g}")
         if not differing:
             return ""
         more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""

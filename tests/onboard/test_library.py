@@ -323,6 +323,18 @@ def test_a_controller_of_other_parts_with_the_same_inputs_is_refused(exported, f
 
 
 @needs_compiler
+def test_small_parameters_that_c_has_otherwise_are_said_too(exported):
+    """Those that differ by less than 1e-8 in their unit flew unsaid: the disturbance of a small satellite."""
+    made, library = exported("chain")
+    parts = replace(made.ready.parts, controller=replace(made.ready.parts.controller, sign_width=2e-9))
+    at = library.columns["params"].index("law_sign_width")
+    for width, said in ((1e-9, "law_sign_width = 1e-09 instead of 2e-09"), (2e-9 * (1.0 + 1e-7), "")):
+        library.parameters[at] = width
+        assert InTheLoop(library, parts).otherwise.endswith(said)
+        assert bool(InTheLoop(library, parts).otherwise) == bool(said)
+
+
+@needs_compiler
 def test_rows_that_c_does_not_read_are_made_so_or_refused(filtered):
     """Half precision and rows too short were written beyond, whole numbers were read as others."""
     library, samples = filtered
