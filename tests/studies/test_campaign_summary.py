@@ -74,3 +74,9 @@ def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch
     folder: Any = SimpleNamespace(flights=None, scenario=tables)
     assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == {"fan": ([100, 250], 250)}
     assert campaign_summary._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes
+
+
+def test_the_worst_by_samples_that_ended_well_have_the_fewest():
+    counts, none = np.array([65, 31, 40]), np.zeros(3, bool)
+    assert campaign_summary.most_extreme("controller_ok", counts, none, 2).tolist() == [1, 2]
+    assert campaign_summary.most_extreme("controller_other", counts, none, 2).tolist() == [0, 2]

@@ -213,7 +213,10 @@ def worst(
     /,
     *,
     by: Annotated[
-        str, Parameter(help="Column of the rows: a metric; the largest are the worst, of `within_*` the smallest.")
+        str,
+        Parameter(
+            help="A column of the rows: the largest are the worst, of `within_*` and `controller_ok` the smallest."
+        ),
     ] = "window_error",
     n: Annotated[
         int, whole_number("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))

@@ -255,7 +255,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
 
 def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
     """Indices of the worst of trials (trials,) by a metric, failed ones first; see `statistics.most_extreme`."""
-    better = metric in catalogues.LARGER_IS_BETTER
+    better = metric in (*catalogues.LARGER_IS_BETTER, plans.SAMPLES[0])  # as of samples that ended well
     return statistics.most_extreme(values, failed, count, larger_is_better=better)
 
 
