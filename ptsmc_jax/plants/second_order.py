@@ -215,8 +215,9 @@ def system(
     return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
 
 
-_TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
-_INSTEAD = "; allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
+# what JAX raises where a traced number is asked for its value, and what stands in place of that
+TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+INSTEAD = "allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
 
 
 def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
@@ -228,7 +229,7 @@ def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ..
             return jax.eval_shape(of, *arguments)
         except Exception as error:
             first_line = (str(error).splitlines() or [""])[0]
-            told = first_line.rstrip(".") + _INSTEAD if isinstance(error, _TRACED) else first_line
+            told = f"{first_line.rstrip('.')}; {INSTEAD}" if isinstance(error, TRACED) else first_line
             failure = f"{type(error).__name__}: {told}"
             raise ValueError(f"{name} {what} for x_1 and x_2 of shape ({n},): {failure}") from error
 

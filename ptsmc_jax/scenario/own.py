@@ -21,6 +21,7 @@ from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.values import Table
 
 KEYS = ("system", "truth", "code")  # that name code, in any table
+CONTROLLER = "--controller"  # an option that names code: C that export left, not `controller.code`
 DECLARED = "delta"  # what a law's class may declare anew, as a gain
 Code = Annotated[Any, Meta(description=systems.WHERE)]
 
@@ -93,7 +94,7 @@ def digest_name(key: str) -> str:
     >>> digest_name("--metrics"), digest_name("--controller")  # not the name of `controller.code`
     ('metrics_sha256', 'flight_code_sha256')
     """
-    if key == "--controller":
+    if key == CONTROLLER:
         return "flight_code_sha256"
     place = key.removeprefix("plant.").removesuffix(".code").lstrip("-")
     return re.sub(r"\W+", "_", place).strip("_") + "_sha256"

@@ -12,6 +12,7 @@ import numpy as np
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.plants.second_order import INSTEAD, TRACED
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own
@@ -38,8 +39,8 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
 
 def what_fails(error: Exception, file: str) -> str:
     """What is wrong with code of one's own in this file that ended in an error while it was asked, or traced."""
-    if isinstance(error, _TRACED):
-        return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {_INSTEAD}"
+    if isinstance(error, TRACED):
+        return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {INSTEAD}"
     if isinstance(error, jax.errors.UnexpectedTracerError):
         return "keeps a number of a run where a later call finds it; allowed is what its arguments and its memory hold"
     return f"fails: {systems.failure(error, file)}"
@@ -85,10 +86,6 @@ class _Asked:
         was, now = (jax.tree.map(_kind, tree) for tree in (before, after))
         if was != now:
             raise self.refused(method, f"a memory {now}", f"one as begin does, {was}")
-
-
-_TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
-_INSTEAD = "allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
 
 
 def _trace(function: Callable, args: tuple) -> None:

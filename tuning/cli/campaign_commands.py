@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from tuning.cli import searches
-from tuning.cli.flight_commands import ControllerFolder, flown, say_otherwise
+from tuning.cli import flight_commands, searches
 from tuning.cli.options import (
     Device,
     Figures,
@@ -82,7 +81,7 @@ def montecarlo(
     dry_run: Annotated[
         bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
     ] = False,
-    controller: ControllerFolder = None,
+    controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -127,7 +126,7 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
     from tuning.studies import campaign_folder
 
-    loaded = loaded if controller is None else flown(loaded)
+    loaded = loaded if controller is None else flight_commands.flown(loaded)
     folder = campaign_folder.Folder(
         path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
     )
@@ -143,9 +142,9 @@ def montecarlo(
         searches.say_seen(scenario, seed)
     _ = folder.campaign  # what it refuses, it refuses before anything is written
     if folder.computer is not None:
-        say_otherwise(folder.computer)
+        flight_commands.say_otherwise(folder.computer)
 
-    def campaign() -> int:
+    def flown() -> int:
         with _elsewhere(cluster, tls) as elsewhere:
             campaign_folder.begin(folder, force)
             with campaign_terminal.Progress(quiet) as report:
@@ -160,7 +159,7 @@ def montecarlo(
             campaign_terminal.share_done(done, share, planned=dry_run)
         return 0
 
-    return answered(campaign, lambda: interrupted(force))
+    return answered(flown, lambda: interrupted(force))
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":

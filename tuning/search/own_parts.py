@@ -18,7 +18,7 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.tables import Scenario
 
-METRICS, CONTROLLER = "--metrics", "--controller"  # options that name programs
+METRICS, CONTROLLER = "--metrics", own.CONTROLLER  # options that name programs
 
 
 def named(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:

@@ -50,7 +50,7 @@ def write(
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
     if computer is not None:
         place = computer.library.folder
-        made_by |= {"controller": str(place.absolute()), own.digest_name("--controller"): sources.digest(place)}
+        made_by |= {"controller": str(place.absolute()), own.digest_name(own.CONTROLLER): sources.digest(place)}
     store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
