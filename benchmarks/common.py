@@ -136,7 +136,7 @@ class Program:
         nodes = np.ascontiguousarray(np.concatenate([ticks.t, ticks.t_next[-1:]]))
         k2 = watch.error_bound()
         target = np.asarray(parts.reference(jnp.zeros(())).q)
-        first = jnp.sum(jnp.where(ticks.noise_weight < 1.0, ticks.t_next - ticks.t, 0.0))
+        first = jnp.sum(jnp.where(ticks.partial, ticks.t_next - ticks.t, 0.0))
         assert isinstance(clock, Anchored)
         values = [
             parts.plant.inertia, parts.plant.inertia_inverse, target,

@@ -15,3 +15,4 @@ class Ticks(NamedTuple):
     noise_weight: (
         Array  # share of this sample's own noise, the rest is the next one's; below 1 in a partial first period
     )
+    partial: Array  # bool: the first period of an anchored clock, whose length moves with the hand-over

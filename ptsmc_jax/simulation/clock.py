@@ -19,9 +19,14 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
 
-def _not_above(t: Array, limit: Scalar) -> Array:
-    """min(t, limit), with the derivative of `limit` where they are equal."""
-    return jnp.where(t < limit, t, limit)
+def _not_above(t: Array, limit: Scalar, rounding: Scalar = 0.0) -> Array:
+    """min(t, limit), with the derivative of `limit` where they are equal; rounding: what counts as equal."""
+    return jnp.where(t < limit - rounding, t, limit)
+
+
+def _whole(t: Array, t_next: Array, hold: Array) -> Ticks:
+    """Intervals counted from the first, none of them a partial one."""
+    return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t), jnp.zeros_like(hold))
 
 
 @pytree
@@ -57,10 +62,12 @@ class Anchored:
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
         # a sample that rounding alone puts after t = 0 is the one there: else two of them, and slopes between their two
         begun = nominal > guards.rounding(self.period, t_f)
-        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end)
+        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.rounding(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
-        partial = jnp.where(begun[:-1], 1.0, (t_next - t) / self.period)
-        return Ticks(t, t_next, sample >= 0, sample, partial)
+        # told by where it starts: its share of a whole one may be 1 or more by rounding, and has slopes there, too
+        partial = ~begun[:-1]
+        share = jnp.where(partial, (t_next - t) / self.period, 1.0)
+        return Ticks(t, t_next, sample >= 0, sample, share, partial)
 
 
 @pytree
@@ -80,10 +87,11 @@ class Flight:
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
-        nodes = _not_above(jnp.arange(self.count + 1).astype(float) * self.period, self.t_end)
+        nominal = jnp.arange(self.count + 1).astype(float) * self.period
+        nodes = _not_above(nominal, self.t_end, guards.rounding(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
         hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # which must not cost a period
-        return Ticks(t, t_next, hold, jnp.arange(self.count, dtype=jnp.int32), jnp.ones_like(t))
+        return _whole(t, t_next, hold)
 
 
 @pytree
@@ -123,7 +131,7 @@ class Graded:
         late = jnp.sort(jnp.concatenate([late, extra, jnp.clip(self.saves, t_s, self.t_end)]))
         t, t_next = jnp.concatenate([early[:-1], late[:-1]]), jnp.concatenate([early[1:], late[1:]])
         hold = jnp.arange(t.size) >= early.size - 1
-        return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t))
+        return _whole(t, t_next, hold)
 
     def _graded(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
         """Nodes from 0 to the hand-over [s]."""

@@ -60,7 +60,7 @@ class Period(NamedTuple):
     @property
     def assumed_length(self) -> Scalar:
         """The length that flight software assumes [s]: it does not know that the run ends within its last period."""
-        starts = jnp.where(self.now.noise_weight < 1.0, self.length, self.full_length)
+        starts = jnp.where(self.now.partial, self.length, self.full_length)
         return jnp.where(self.length > 0.0, starts, 0.0)
 
 
@@ -80,9 +80,9 @@ def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Perio
     """Control periods as a scan takes them, the function that makes a `Period` of one, and the first with a length."""
     lengths = ticks.t_next - ticks.t
     length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
-    partial_before = jnp.concatenate([jnp.zeros(1), ticks.noise_weight[:-1]]) < 1.0
+    partial_before = jnp.concatenate([jnp.ones(1, bool), ticks.partial[:-1]])
     # the observer's matrix for a whole period and for the partial first one, outside the loop, by one piece of code
-    first_length = jnp.sum(jnp.where(ticks.noise_weight < 1.0, lengths, 0.0))
+    first_length = jnp.sum(jnp.where(ticks.partial, lengths, 0.0))
     matrix, first_matrix = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
 
     def period_of(tick: tuple) -> Period:

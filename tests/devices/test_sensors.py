@@ -28,7 +28,7 @@ STATE = rigid_body.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2,
 def tick(sample, weight=1.0):
     """A control period's number and weight: what sensors look at."""
     zero = vector(0.0)
-    return ticks.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight))
+    return ticks.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight), jnp.asarray(weight < 1.0))
 
 
 def seen_by(sensor, x, seed, trial, sample):

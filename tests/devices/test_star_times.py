@@ -165,7 +165,7 @@ def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sampl
     rest = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0] * 3))
 
     def tick(k):
-        return Ticks(0.25 * k, 0.25 * (k + 1), jnp.asarray(True), k, jnp.asarray(1.0))
+        return Ticks(0.25 * k, 0.25 * (k + 1), jnp.asarray(True), k, jnp.asarray(1.0), jnp.asarray(False))
 
     @jax.jit
     @jax.vmap
@@ -195,7 +195,7 @@ def test_in_an_outage_a_period_is_what_the_gyro_says_of_it(run):
     parts, _ = run
     seen = dataclasses.replace(parts.sensors, outage=vector([0.0, 9.0]))
     x = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, -0.2, 0.1]))
-    now = Ticks(vector(0.8), vector(0.9), jnp.asarray(True), jnp.int32(8), vector(1.0))
+    now = Ticks(vector(0.8), vector(0.9), jnp.asarray(True), jnp.int32(8), vector(1.0), jnp.asarray(False))
     memory = seen.begin(7, 0, x, now)._replace(rate=vector([-0.2, 0.3, 0.25]))
     assert seen.own_times.due(8)  # at 0.75 s
     found, after = seen.measure(memory, x, now, vector(0.1), x)

@@ -116,7 +116,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
 def test_a_period_without_a_length_leaves_their_memory():
     """Clocks have such periods; what is seen in them is not flown with."""
     own = parts_of(sensors=NOISY, disturbance={"kind": "none"}).sensors
-    now = Ticks(*(jnp.asarray(v) for v in (0.5, 0.5, False, 3, 1.0)))
+    now = Ticks(*(jnp.asarray(v) for v in (0.5, 0.5, False, 3, 1.0, False)))
     _, (_, _, kept) = own.measure(own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now, vector(0.1))
     assert kept.tolist() == [1.0]
     _, (_, _, new) = own.measure(

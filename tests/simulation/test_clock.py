@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ptsmc_jax import scenario
 from ptsmc_jax.simulation import clock, rollout
+from ptsmc_jax.simulation.computer import schedule
 from tests.helpers import ticks_of, vector
 
 
@@ -73,6 +75,46 @@ def test_rounding_makes_no_sample_just_after_the_first_one(t_f, delta):
     np.testing.assert_allclose(flown, [0.1] * round((t_f + 4.0) / 0.1) + [0.03], atol=1e-12)
     for function in (starts, lengths):  # slopes are those of a slightly larger delta
         np.testing.assert_array_equal(jax.jacfwd(function)(at), jax.jacfwd(function)(at + 1e-6))
+
+
+@pytest.mark.parametrize(("delta", "t_end"), [(0.6, 8.3), (0.9, 8.3), (0.6, 10.3), (0.8, 8.3)])
+def test_rounding_makes_no_sample_just_before_the_end(delta, t_end):
+    """7.3 - 0.6 s and 16 periods are 2e-15 s before 8.3: a sample more, and slopes of the effort those of another."""
+    anchored = clock.anchored(0.1, t_end, 7.3, 5.0)
+
+    @jax.jit
+    def lengths(delta):
+        ticks = ticks_of(anchored, vector(7.3), delta)
+        return ticks.t_next - ticks.t
+
+    at = vector(delta)
+    for function in (lengths, lengths.__wrapped__):  # whose rounding is another one
+        flown = np.asarray(function(at))
+        np.testing.assert_allclose(flown[flown > 0.0], [0.1] * round(t_end / 0.1), atol=1e-12)
+        np.testing.assert_array_equal(
+            jax.jacfwd(function)(at)[flown > 0.0], [-1.0, *[0.0] * (sum(flown > 0.0) - 2), 1.0]
+        )
+
+
+@pytest.mark.parametrize(("t_f", "delta"), [(35.0, 1.0), (35.0, 0.6), (30.0, 0.7), (12.0, 0.8)])
+def test_what_is_computed_in_a_first_period_that_is_a_whole_one_has_the_slopes_of_a_slightly_larger_delta(t_f, delta):
+    """35 - 1 s are 340 periods and 1e-14 s: observer and law were told of a whole period, whose length is constant."""
+    tables = {"controller": {"t_f": t_f, "delta": delta}, "loop": {"mode": "sampled", "period": 0.1}}
+    parts = scenario.study(scenario.from_tables(tables)).parts
+
+    @jax.jit
+    def computed(delta):
+        listed, period_of, _ = schedule(parts, parts.clock.ticks(parts.controller.t_f, delta))
+        first, second = (jax.tree.map(lambda v, k=k: v[k], listed) for k in starts)
+        return period_of(first).assumed_length, period_of(second).matrix
+
+    at = vector(delta)
+    starts = np.flatnonzero(np.asarray(ticks_of(parts.clock, vector(t_f), at).t_next) > 0.0)[:2]
+    slopes = [jax.jacfwd(computed)(delta) for delta in (at, at + 1e-6)]
+    assert float(slopes[0][0]) == -1.0
+    for one, other in zip(*slopes, strict=True):
+        assert np.any(np.asarray(one) != 0.0)
+        np.testing.assert_allclose(one, other, rtol=1e-4)
 
 
 def test_a_partial_first_period_takes_part_of_its_noise_from_the_next_sample():
