@@ -173,6 +173,24 @@ def _tell_of_rejected_once(folder: Path) -> None:
     warnings.filterwarnings("always", _REJECTED)
 
 
+def devices() -> list:
+    """The devices that code runs on that is called, or traced, here: of the kind that `jax.default_device` says."""
+    import jax
+
+    chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.local_devices(backend=getattr(chosen, "platform", chosen))
+
+
+def processors() -> list:
+    """The processor's devices; where JAX is kept from it (JAX_PLATFORMS), the others."""
+    import jax
+
+    try:
+        return jax.local_devices(backend="cpu")
+    except RuntimeError:
+        return jax.local_devices()
+
+
 def warn_if_forgotten() -> None:
     """Say once that numbers have 32 bits where nobody asked for that."""
     import jax

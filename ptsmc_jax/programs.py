@@ -5,6 +5,7 @@ in which code may be patched should not ask: a program is told from another by t
 file cut short among them, falls back to compiling.
 """
 
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -47,11 +48,22 @@ class _UnknownError(Exception):
 
 
 class Program:
-    """A function compiled once for each structure of its arguments, here or by an earlier process."""
+    """A function compiled once for each structure of its arguments, here or by an earlier process.
 
-    def __init__(self, function: Callable, static: tuple[str, ...] = (), options: dict[str, Any] | None = None):
+    It runs on a processor, also where JAX has a GPU, which knows no Schur decomposition and takes a single run in many
+    launches; a batch runs where JAX would run it.
+    """
+
+    def __init__(
+        self,
+        function: Callable,
+        static: tuple[str, ...] = (),
+        options: dict[str, Any] | None = None,
+        *,
+        batch: bool = False,
+    ):
         functools.update_wrapper(self, function)
-        self._function, self._static, self._options = function, static, options
+        self._function, self._static, self._options, self._batch = function, static, options, batch
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self._signature = inspect.signature(function)
         self._ready: dict[Any, Any] = {}  # programs, or futures of them
@@ -61,6 +73,14 @@ class Program:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as the jitted function is called."""
+        where = self._where(args, kwargs)
+        if where is None:
+            return self._called(*args, **kwargs)
+        args, kwargs = jax.tree.map(_brought, (args, kwargs))
+        with jax.default_device(where):
+            return self._called(*args, **kwargs)
+
+    def _called(self, *args: Any, **kwargs: Any) -> Any:
         known = self._known(args, kwargs)
         if known is None:
             return self._jitted(*args, **kwargs)
@@ -82,9 +102,18 @@ class Program:
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Begin to load or compile what such a call will need, beside what is done; nothing where nothing is kept."""
-        known = self._known(args, kwargs)
-        if known is not None and known[0] not in self._ready:
-            self._ready[known[0]] = _beside().submit(self._begun, *known)
+        where = self._where(args, kwargs)
+        with contextlib.nullcontext() if where is None else jax.default_device(where):
+            known = self._known(*((args, kwargs) if where is None else jax.tree.map(_brought, (args, kwargs))))
+            if known is not None and known[0] not in self._ready:
+                self._ready[known[0]] = _beside().submit(_on(_default(), self._begun), *known)
+
+    def _where(self, args: tuple, kwargs: dict) -> Any:
+        """The processor, where JAX would run something else that is not a batch; None where nothing is to be done."""
+        if self._batch or configure.devices()[0].platform == "cpu":
+            return None
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return None if traced else configure.processors()[0]
 
     def _begun(self, key: tuple, said: str, given: dict) -> tuple[Callable, bool]:
         """The program, and whether it was loaded."""
@@ -140,12 +169,21 @@ def jit(
     *,
     static_argnames: str | tuple[str, ...] = (),
     compiler_options: dict | None = None,
+    batch: bool = False,
 ) -> Any:
-    """`jax.jit` of a function at the top of a module of this project, see above."""
+    """`jax.jit` of a function at the top of a module of this project, see above; batch: see `Program`."""
     if function is None:
-        return functools.partial(jit, static_argnames=static_argnames, compiler_options=compiler_options)
+        options = {"static_argnames": static_argnames, "compiler_options": compiler_options, "batch": batch}
+        return functools.partial(jit, **options)
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
-    return Program(function, static, compiler_options)
+    return Program(function, static, compiler_options, batch=batch)
+
+
+def _brought(leaf: Any) -> Any:
+    """An array of a device's as one that any other takes."""
+    if not isinstance(leaf, jax.Array) or jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended):
+        return leaf
+    return np.asarray(leaf)
 
 
 def _shape(leaf: Any) -> tuple:
@@ -153,7 +191,7 @@ def _shape(leaf: Any) -> tuple:
     if isinstance(leaf, Tracer):
         raise _UnknownError
     if isinstance(leaf, jax.Array):
-        if leaf.devices() != {jax.local_devices()[0]}:
+        if leaf.devices() != {configure.devices()[0]}:
             raise _UnknownError
         return leaf.shape, leaf.dtype.name, leaf.weak_type
     if isinstance(leaf, np.ndarray | np.generic):
@@ -196,7 +234,7 @@ def _plain(value: Any) -> Any:
 @functools.cache
 def _beside() -> ThreadPoolExecutor:
     """Threads that compile beside the one that goes on."""
-    return ThreadPoolExecutor(max(1, len(jax.local_devices()) - 1), "compiling")
+    return ThreadPoolExecutor(max(1, len(configure.processors()) - 1), "compiling")
 
 
 def _apart(function: Callable, *args: Any) -> Future:
@@ -206,9 +244,24 @@ def _apart(function: Callable, *args: Any) -> Future:
     segmentation fault. An exit waits for threads.
     """
     alone = ThreadPoolExecutor(1, "compiling")
-    future = alone.submit(function, *args)
+    future = alone.submit(_on(_default(), function), *args)
     alone.shutdown(wait=False)
     return future
+
+
+def _default() -> Any:
+    """What `jax.default_device` says in this thread."""
+    return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _on(device: Any, function: Callable) -> Callable:
+    """The function as it runs in a thread whose default device is this one."""
+
+    def called(*args: Any) -> Any:
+        with jax.default_device(device):
+            return function(*args)
+
+    return called
 
 
 def stop() -> None:
@@ -237,7 +290,7 @@ def _surroundings() -> tuple:
     """What else a program hangs on; the cache's folder is one processor's own."""
     settings = {k: repr(v) for k, v in jax.config.values.items() if not any(word in k for word in _ELSEWHERE)}
     versions = jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__
-    devices = [f"{d.platform} {d.device_kind} {d.id}" for d in jax.local_devices()]
+    devices = [f"{d.platform} {d.device_kind} {d.id}" for d in configure.devices()]
     return versions, devices, os.environ.get("XLA_FLAGS", ""), sorted(settings.items())
 
 
@@ -262,7 +315,7 @@ def _read(path: Path, said: str, inside: Any) -> Callable | None:
         if b"lapack" in payload:
             _lapack()
         program = serialize_executable.deserialize_and_load(
-            payload, inside, jax.tree.structure(skeleton), execution_devices=jax.local_devices()[:count]
+            payload, inside, jax.tree.structure(skeleton), execution_devices=configure.devices()[:count]
         )
         os.utime(path)  # used
     except Exception:  # whatever is wrong with it, it can be compiled again

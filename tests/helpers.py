@@ -5,6 +5,7 @@ import json
 import math
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -273,6 +274,11 @@ def same(one, other):
     assert_frame_equal(one.select(pl.exclude(pl.Float64)), other.select(pl.exclude(pl.Float64)))
     for name in one.select(pl.col(pl.Float64)).columns:
         np.testing.assert_allclose(one[name].to_numpy(), other[name].to_numpy(), rtol=1e-12, atol=1e-300, err_msg=name)
+
+
+def gpus() -> list[Any]:
+    """What `configure.devices` says where JAX has a GPU, and is not kept from it."""
+    return [jax.config.jax_default_device or SimpleNamespace(platform="gpu")]
 
 
 def equations(trace: Any) -> Any:

@@ -17,6 +17,7 @@ import pytest
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.numerics import pytrees
+from tests.helpers import gpus
 from tests.tree import ROOT, modules
 
 
@@ -54,6 +55,33 @@ def test_a_program_is_compiled_once_and_loaded_by_the_next_process(folder):
         np.testing.assert_array_equal(ours["both"], theirs["both"])
     assert not traced
     np.testing.assert_allclose(first[1]["both"], np.sin(4 * X) + 5.0, rtol=1e-15)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_where_jax_has_a_gpu_all_but_batches_run_on_the_processor(tmp_path, monkeypatch, kept):
+    """A second device of the processor's stands for the GPU; whose Schur decomposition JAX does not have."""
+    if kept:
+        monkeypatch.setattr(configure, "programs", tmp_path)
+    processor, gpu = jax.local_devices()[:2]
+    monkeypatch.setattr(configure, "devices", gpus)
+    seen = []
+
+    def function(x):
+        seen.append(jax.config.jax_default_device)
+        return 2.0 * x
+
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "where", "where"
+    x = jax.device_put(jnp.asarray(X), gpu)
+    single, batch = programs.jit(function), programs.jit(function, batch=True)
+    single.prepare(x)
+    for result in (single(x), single(X), single(x=x), single(jnp.stack([x, x]))[1]):
+        assert result.devices() == {processor}
+        np.testing.assert_array_equal(result, 2.0 * X)
+    assert set(seen) == {processor}
+    assert batch(x).devices() == {gpu}
+    assert seen[-1] is None
+    assert jax.jit(lambda x: single(x))(x).devices() == {gpu}  # part of a program of the caller's own
+    assert seen[-1] is None
 
 
 def test_compiling_is_out_of_reach_of_a_ctrl_c(folder, monkeypatch):

@@ -18,6 +18,7 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
+from ptsmc_jax import configure
 from ptsmc_jax.batching import components, lapack
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
 from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, place, settle, used
@@ -254,7 +255,7 @@ class _Lanes:
         from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
 
         lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
-        varies, interpret = [own & TRIAL for own in state.differs], jax.default_backend() == "cpu"
+        varies, interpret = [own & TRIAL for own in state.differs], configure.devices()[0].platform == "cpu"
         try:
             last = kernel.scan(params, values, varies, lead, interpret)
         except NotImplementedError as error:

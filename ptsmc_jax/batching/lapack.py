@@ -13,6 +13,8 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
+from ptsmc_jax import configure
+
 WAITS = jaxlib.version.__version_info__ < (0, 11)
 # operations, matrices times order^3, up to which jaxlib 0.10.2 does not share: it did from 1.8 to 2.2e5 of these on
 ALONE = 1 << 16
@@ -38,7 +40,7 @@ def vmap(function: Callable) -> Callable:
 
 def over(trace: Any, count: int) -> Callable:
     """What takes a trace, or an equation, over so many: `jax.vmap`, or `in_turn` where LAPACK would wait."""
-    waits = WAITS and jax.default_backend() == "cpu" and count * _work(trace) > ALONE
+    waits = WAITS and configure.devices()[0].platform == "cpu" and count * _work(trace) > ALONE
     return in_turn if waits else jax.vmap
 
 

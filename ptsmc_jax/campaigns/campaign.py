@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import polars as pl
 
-from ptsmc_jax import programs
+from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo, plans
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
@@ -210,7 +210,7 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
     Yields each part that is on the disk, and how many of its trials did not end well. make: numbers of trials -> rows.
     Accelerators, which fly more than a part at a time, make several in one go.
     """
-    together = max(1, montecarlo.block_size() * len(jax.local_devices()) // PART)
+    together = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
     writing: deque[tuple[Future[Part], int]] = deque()
     with ThreadPoolExecutor(1) as writer:
         for group, frame in _frames(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):

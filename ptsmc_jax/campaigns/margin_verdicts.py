@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ptsmc_jax import programs
+from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import planned
@@ -151,7 +151,7 @@ def worst(
 
 def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
     """What `_look` is called with: the trials, and some of them again, as many as whole calls on every device take."""
-    devices = len(jax.local_devices())
+    devices = len(configure.processors())
     together = CALL * devices
 
     def padded(v: Any) -> Array:

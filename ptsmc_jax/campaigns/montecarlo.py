@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from ptsmc_jax import programs
+from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
@@ -164,10 +164,13 @@ def run(
 
     Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts.
     """
+    if software.on_processor and configure.devices()[0].platform != "cpu":
+        with jax.default_device(configure.processors()[0]):
+            return run(parts, dispersion, seed, trials, block, own=own, kernel=kernel, software=software)
     check_parts(parts)
     trials, seed = trials if isinstance(trials, Row) else _numbers(trials), _seed(seed)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
-    count, devices = number.shape[0], len(jax.local_devices())
+    count, devices = number.shape[0], len(configure.devices())
     block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
     rows = max(1, CAPACITY // (devices * block)) if count >= FEW else 1
     size = devices * rows * block
@@ -223,12 +226,12 @@ def gathered(results: np.ndarray, share: int) -> np.ndarray:
 
 def prepare(parts: Parts, dispersion: Dispersion) -> None:
     """Begin to compile what flies many trials of such parts, beside what is being done."""
-    devices, block = len(jax.local_devices()), block_size()
+    devices, block = len(configure.devices()), block_size()
     numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel(), OURS)
 
 
-@programs.jit(static_argnames=("devices", "own", "kernel", "software"), compiler_options=programs.BATCHED)
+@programs.jit(static_argnames=("devices", "own", "kernel", "software"), compiler_options=programs.BATCHED, batch=True)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -278,12 +281,12 @@ def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.
 
 def block_size() -> int:
     """How many trials a device flies at a time, where a caller does not say."""
-    return BLOCK if jax.default_backend() == "cpu" else BLOCK_ON_GPU
+    return BLOCK if configure.devices()[0].platform == "cpu" else BLOCK_ON_GPU
 
 
 def by_kernel() -> bool:
     """Whether loops over time are flown as one kernel each: on a GPU, where every step would cost launches."""
-    return jax.default_backend() == "gpu"
+    return configure.devices()[0].platform == "gpu"
 
 
 def blocks(fly: Callable, trials: Any) -> Any:
@@ -308,6 +311,6 @@ def spread(function: Callable, shared: Any, devices: int) -> Any:
     """function(shared) with the first axes of `shared`, and of the results, shared out over that many devices."""
     if devices == 1:
         return function(shared)
-    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("device",))
+    mesh = Mesh(np.asarray(configure.devices()[:devices]), ("device",))
     axis = PartitionSpec("device")
     return jax.shard_map(function, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)(shared)

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +139,8 @@ class Library:
         out = jax.ShapeDtypeStruct((len(self.columns["out"]),), real)
         results = jax.ShapeDtypeStruct(state.shape, real), out, jax.ShapeDtypeStruct((), jnp.int32)
 
-        def stepped(*rows: Any) -> list[np.ndarray]:
-            return [v.astype(made.dtype) for v, made in zip(self.many(*rows), results, strict=True)]
-
-        # a callback waits for arrays that a CPU's threads copy: with one on each device none is left that could
+        # no callback, which waits for arrays that a CPU's threads copy: with one on each device none is left that could
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
-        if jax.default_backend() != "cpu":
-            how = partial(jax.pure_callback, stepped, results, vmap_method="broadcast_all")
         return tuple(how(state, given, parameters))
 
 
@@ -206,7 +200,7 @@ class InTheLoop:
     @property
     def software(self) -> Software:
         """What the rollout takes."""
-        return Software(self.boot, self.decide, self.statuses)
+        return Software(self.boot, self.decide, self.statuses, on_processor=True)
 
     def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
         """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""

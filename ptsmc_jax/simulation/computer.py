@@ -74,6 +74,7 @@ class Software(NamedTuple):
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
     decide: Callable[[Parts, Bound, Period, Computer, Any, ActuatorState], tuple[Decision, Computer]]
     statuses: Callable[[Computer], dict[str, Array]]  # of a run: how many samples ended with each; ours has none
+    on_processor: bool = False  # it runs nowhere else
 
 
 def schedule(parts: Parts, ticks: Ticks) -> tuple[tuple, Callable[[tuple], Period], Ticks]:

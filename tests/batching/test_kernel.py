@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import configure, scenario
 from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import equations, short
+from tests.helpers import equations, gpus, short
 from tuning.search.gains import with_gains
 
 SEED = 3
@@ -159,7 +159,7 @@ def test_in_single_precision_it_is_the_scan_of_single_precision():
 
 def lowered(function, arguments, monkeypatch):
     """Its trace, and the text of what it becomes for CUDA."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(configure, "devices", gpus)
     monkeypatch.setattr(kernel, "BLOCK", 128)
     with on_a_gpu():
         trace = jax.jit(lanes.vmap(function, whole=True)).trace(arguments)
@@ -363,7 +363,7 @@ def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
     ids="while stacked backward erf inverse told type key sort large".split(),
 )
 def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kernels, monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # interpreted there would be an error function
+    monkeypatch.setattr(configure, "devices", gpus)  # interpreted there would be an error function
     function = forward(step)
     with pytest.warns(lanes.LanesWarning, match=f"step by step, which may be slow: .*{said}"):
         got = lanes.vmap(function, whole=True)(NUMBERS)

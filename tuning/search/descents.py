@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax import configure
 from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest
 from tuning.search.evaluate import Evaluator, Measured, Sloped
@@ -216,7 +216,7 @@ class Descents:
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(race, k) for k in racers], fly, len(jax.local_devices()))
+            in_step([partial(race, k) for k in racers], fly, len(configure.devices()))
             tell()
         finally:  # interrupted too
             for k in racers:

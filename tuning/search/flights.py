@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax import programs
+from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.montecarlo import Flown, Trials
@@ -115,7 +115,7 @@ class _Rows:
     """So many trials at so many points as rows of `ROW` trials each, at most `most` of them a device in one call."""
 
     def __init__(self, points: int, trials: int, most: int):
-        self.devices = len(jax.local_devices())
+        self.devices = len(configure.devices())
         self._points, self._count, self._most = points, trials, most
         self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))  # of the rows at each point
         self._rows = points * len(self._trials)
@@ -147,7 +147,7 @@ class _Rows:
         return jax.tree.map(joined, *calls)
 
 
-@programs.jit(static_argnames=("names", "devices"), compiler_options=programs.BATCHED)
+@programs.jit(static_argnames=("names", "devices"), compiler_options=programs.BATCHED, batch=True)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -173,7 +173,7 @@ def _fly(
     return montecarlo.row_by_row(flown, result, ROW, rows, needed, devices)
 
 
-@programs.jit(static_argnames=("names", "metrics", "devices"), compiler_options=programs.BATCHED)
+@programs.jit(static_argnames=("names", "metrics", "devices"), compiler_options=programs.BATCHED, batch=True)
 def _sloped(
     parts: Parts,
     dispersion: Dispersion,

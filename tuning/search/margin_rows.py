@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax import programs
+from ptsmc_jax import configure, programs
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -65,7 +65,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
         names=bounds.names,
     )
     some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
-    sloped.prepare(some, bounds, np.zeros((len(jax.local_devices()), len(bounds.names))))
+    sloped.prepare(some, bounds, np.zeros((len(configure.processors()), len(bounds.names))))
     return hardest(asked, np.asarray(gain_names.own(ready.parts, bounds.names)))[0]
 
 
@@ -116,7 +116,7 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
 
 def of_points(asked: Asked, bounds: Bounds, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
     """The rows "c" at shares of the bounds' intervals, and "c_slope" by these, arrays over the points first."""
-    count = len(jax.local_devices())
+    count = len(configure.processors())
     padded = np.resize(share, (-(-len(share) // count) * count, share.shape[1]))
     each = [sloped(asked, bounds, padded[k : k + count]) for k in range(0, len(padded), count)]
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(share)], *each)
