@@ -173,11 +173,18 @@ def _tell_of_rejected_once(folder: Path) -> None:
     warnings.filterwarnings("always", _REJECTED)
 
 
+def default_device() -> Any:
+    """What `jax.default_device` says in this thread: a device, the name of a kind, or None."""
+    import jax
+
+    return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def devices() -> list:
     """The devices that code runs on that is called, or traced, here: of the kind that `jax.default_device` says."""
     import jax
 
-    chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    chosen = default_device()
     return jax.local_devices(backend=getattr(chosen, "platform", chosen))
 
 

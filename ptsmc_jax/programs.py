@@ -5,7 +5,6 @@ in which code may be patched should not ask: a program is told from another by t
 file cut short among them, falls back to compiling.
 """
 
-import contextlib
 import functools
 import hashlib
 import inspect
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import jaxlib.version
 import numpy as np
 import scipy
@@ -73,12 +73,7 @@ class Program:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as the jitted function is called."""
-        where = self._where(args, kwargs)
-        if where is None:
-            return self._called(*args, **kwargs)
-        args, kwargs = jax.tree.map(_brought, (args, kwargs))
-        with jax.default_device(where):
-            return self._called(*args, **kwargs)
+        return self._placed(self._called, args, kwargs)
 
     def _called(self, *args: Any, **kwargs: Any) -> Any:
         known = self._known(args, kwargs)
@@ -102,18 +97,21 @@ class Program:
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Begin to load or compile what such a call will need, beside what is done; nothing where nothing is kept."""
-        where = self._where(args, kwargs)
-        with contextlib.nullcontext() if where is None else jax.default_device(where):
-            known = self._known(*((args, kwargs) if where is None else jax.tree.map(_brought, (args, kwargs))))
-            if known is not None and known[0] not in self._ready:
-                self._ready[known[0]] = _beside().submit(_on(_default(), self._begun), *known)
+        self._placed(self._prepared, args, kwargs)
 
-    def _where(self, args: tuple, kwargs: dict) -> Any:
-        """The processor, where JAX would run something else that is not a batch; None where nothing is to be done."""
-        if self._batch or configure.devices()[0].platform == "cpu":
-            return None
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return None if traced else configure.processors()[0]
+    def _prepared(self, *args: Any, **kwargs: Any) -> None:
+        known = self._known(args, kwargs)
+        if known is not None and known[0] not in self._ready:
+            self._ready[known[0]] = _beside().submit(_on(configure.default_device(), self._begun), *known)
+
+    def _placed(self, method: Callable, args: tuple, kwargs: dict) -> Any:
+        """What the method returns, on the processor, where JAX would run something else that is not a batch."""
+        elsewhere = not self._batch and configure.devices()[0].platform != "cpu"
+        if not elsewhere or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return method(*args, **kwargs)
+        args, kwargs = [jax.tree.map(_brought, given) for given in (args, kwargs)]
+        with jax.default_device(configure.processors()[0]):
+            return method(*args, **kwargs)
 
     def _begun(self, key: tuple, said: str, given: dict) -> tuple[Callable, bool]:
         """The program, and whether it was loaded."""
@@ -181,9 +179,8 @@ def jit(
 
 def _brought(leaf: Any) -> Any:
     """An array of a device's as one that any other takes."""
-    if not isinstance(leaf, jax.Array) or jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended):
-        return leaf
-    return np.asarray(leaf)
+    kept = not isinstance(leaf, jax.Array) or jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
+    return leaf if kept else np.asarray(leaf)
 
 
 def _shape(leaf: Any) -> tuple:
@@ -244,14 +241,9 @@ def _apart(function: Callable, *args: Any) -> Future:
     segmentation fault. An exit waits for threads.
     """
     alone = ThreadPoolExecutor(1, "compiling")
-    future = alone.submit(_on(_default(), function), *args)
+    future = alone.submit(_on(configure.default_device(), function), *args)
     alone.shutdown(wait=False)
     return future
-
-
-def _default() -> Any:
-    """What `jax.default_device` says in this thread."""
-    return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _on(device: Any, function: Callable) -> Callable:

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from polars.testing import assert_frame_equal
 
+from ptsmc_jax import configure
 from ptsmc_jax.devices import sensors
 from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.observers import none, nonlinear
@@ -278,7 +279,7 @@ def same(one, other):
 
 def gpus() -> list[Any]:
     """What `configure.devices` says where JAX has a GPU, and is not kept from it."""
-    return [jax.config.jax_default_device or SimpleNamespace(platform="gpu")]
+    return [configure.default_device() or SimpleNamespace(platform="gpu")]
 
 
 def equations(trace: Any) -> Any:

@@ -67,7 +67,7 @@ def test_where_jax_has_a_gpu_all_but_batches_run_on_the_processor(tmp_path, monk
     seen = []
 
     def function(x):
-        seen.append(jax.config.jax_default_device)
+        seen.append(configure.default_device())
         return 2.0 * x
 
     function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "where", "where"

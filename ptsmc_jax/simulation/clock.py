@@ -19,7 +19,7 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
 
-def _not_above(t: Array, limit: Scalar, rounding: Scalar = 0.0) -> Array:
+def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
     """min(t, limit), with the derivative of `limit` where they are equal; rounding: what counts as equal."""
     return jnp.where(t < limit - rounding, t, limit)
 
