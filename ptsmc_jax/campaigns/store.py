@@ -22,6 +22,7 @@ JOURNAL = "journal.bin"  # of a run that is not finished
 SUMMARY = "summary.json"  # of one that is
 MAKING = ".making-"  # how the name of a file begins that is being written
 MADE_OF_RESULTS = ("figures/*.png", "report.html", "worst.csv", "why.csv")  # they would pass for those of the next one
+FIGURE = b"Creator\0ptsmc"  # by which a figure of theirs is known from a user's own, see `style.save`
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
@@ -87,10 +88,20 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
 
 
 def forget(folder: Path) -> None:
-    """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's."""
-    made = (path for pattern in MADE_OF_RESULTS for path in folder.glob(pattern))
+    """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's.
+
+    Of figures only those that came from here, and nothing where no result is.
+    """
+    if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
+        return
+    made = (path for pattern in MADE_OF_RESULTS for path in folder.glob(pattern) if _ours(path))
     for path in (folder / SUMMARY, *made, *_of_laws(folder)):
         path.unlink(missing_ok=True)
+
+
+def _ours(made: Path) -> bool:
+    """Whether it came from here, as far as its name leaves that open."""
+    return made.suffix != ".png" or FIGURE in made.read_bytes()[:1024]
 
 
 def _of_laws(folder: Path) -> list[Path]:
@@ -167,8 +178,8 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place.
 
     Where nothing may stand beside it, or on another disk only, the new one is inside it. Of another result that was
-    there, known by its summary, figures and tables go; the new summary is moved last, since it says that the result is
-    whole.
+    there, known by its summary, figures and tables go; what says whose the files are is moved first, the new summary
+    last, since it says that the result is whole.
     """
     asked, folder = folder, Path(os.path.realpath(folder))  # of a link, what it leads to
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -186,10 +197,11 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
                 return
             except OSError:  # another process was first, with the same run: shards begin at once
                 pass
-        files = sorted((path for path in making.rglob("*") if path.is_file()), key=lambda path: path.name == SUMMARY)
+        order = {"versions.json": -1, SUMMARY: 1}
+        files = (path for path in making.rglob("*") if path.is_file())
         if (making / SUMMARY).exists() and not _alike(making / SUMMARY, folder / SUMMARY):
             forget(folder)
-        for path in files:
+        for path in sorted(files, key=lambda path: order.get(path.name, 0)):
             target = folder / path.relative_to(making)
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(path, target)

@@ -31,10 +31,10 @@ MANY = 1e4  # times, that an axis spans, from which on the numbers between its p
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write NAME.png for each figure into a folder."""
+    """Write NAME.png for each figure into a folder, known as ours, see `store.forget`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png")
+        figure.savefig(folder / f"{name}.png", metadata={"Creator": "ptsmc"})
     return [folder / f"{name}.png" for name in figures]
 
 

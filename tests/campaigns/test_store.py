@@ -55,12 +55,12 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
         def fill(folder):
             (folder / "figures").mkdir()
             for name in names:
-                (folder / name).write_text(summary)
+                (folder / name).write_bytes(store.FIGURE + summary.encode())
             (folder / "summary.json").write_text(summary)
 
         return fill
 
-    out, others = tmp_path / "out", ("mine.txt", "report.html", "figures/mine.csv")
+    out, others = tmp_path / "out", ("mine.txt", "report.html", "figures/mine.csv", "figures/mine.png")
     store.write(out, result("first", "tuned.toml", "figures/a.png", "figures/b.png"))
     for name in others:
         (out / name).write_text("kept")
@@ -70,9 +70,14 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
     moved.clear()
     store.write(out, result("second", "versions.json", "tuned.toml", "figures/b.png"))
     assert set(tree(out)) == {
-        "mine.txt", "figures/mine.csv", "figures/b.png", "tuned.toml", "versions.json", "summary.json"
+        "mine.txt", "figures/mine.csv", "figures/mine.png", "figures/b.png", "tuned.toml", "versions.json",
+        "summary.json",
     }  # fmt: skip
-    assert moved[-1] == "summary.json"
+    assert (moved[0], moved[-1]) == ("versions.json", "summary.json")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "report.html").write_text("of no result")
+    store.write(tmp_path / "mine", result("third"))
+    assert (tmp_path / "mine" / "report.html").exists()
 
 
 @pytest.mark.parametrize("laws", ['{"pd": {}, "../other": {}, "prescribed_time": {}}', "5", None])

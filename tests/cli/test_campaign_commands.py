@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import campaign
+from ptsmc_jax.campaigns import campaign, store
 from tests.helpers import SHORT_CHAIN, same, short
 from tests.output.pages import checked
 from tuning.output import sentences
@@ -61,6 +61,7 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     ]  # fmt: skip
     figures = {path.name for path in (folder / "figures").iterdir()}
     assert figures == {"fan.png", "distributions.png", "torque_by_angle.png", "inputs.png"}
+    assert all(store.FIGURE in (folder / "figures" / name).read_bytes()[:1024] for name in figures)
     read = checked(folder)
     assert "Every requirement is met 250 trials of seed 3: 250 ok" in read.text
     assert "ptsmc montecarlo scenario.toml --trials 250 --seed 3" in read.text
@@ -154,7 +155,12 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
     same(rows_of(flown), before)
     if "--metrics" not in options:  # with these it is another program
         again = ("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")
+        mine = "plan/mine.parquet", "plan.parquet", "controller/mine.c", "figures/mine.png"  # a user's own
+        for name in mine:
+            (flown / name).parent.mkdir(exist_ok=True)
+            (flown / name).write_text("mine")
         assert command(*again, "--shard", "1/2")[0] == 0
+        assert [(flown / name).read_text() for name in mine] == ["mine"] * 4
         assert not (flown / "summary.json").exists()  # that of the campaign before, which would pass for this one's
         assert command(*again)[0] == 0
         assert rows_of(flown)["trial"].to_list() == list(range(110))

@@ -68,6 +68,10 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     flight = "montecarlo", "s.toml", *options
     code, out, err = command(*flight, "--controller", "c", "--out", "r")
     assert (code, out, "law_eta = 3 instead of 2.9" in err) == (0, "", True)
+    (tmp_path / "mine" / "controller").mkdir(parents=True)
+    (tmp_path / "mine" / "controller" / "mine.c").write_text("")
+    code, _, err = command(*flight, "--controller", "c", "--out", "mine", "--force")
+    assert (code, "whose controller holds C that no campaign left there" in err) == (2, True)
     assert command("montecarlo", "of_c.toml", *options, "--out", "o")[0] == 0
     by_c, by_us = (pl.read_parquet(tmp_path / name / "trials") for name in ("r", "o"))
     for name in ("window_error", "peak_torque", "effort"):

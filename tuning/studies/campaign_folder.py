@@ -1,7 +1,6 @@
 """Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
 
 import os
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -232,11 +231,14 @@ class Folder:
 def begin(wanted: Folder, force: bool) -> None:
     """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
     tables, path = parsing.dump(wanted.scenario), wanted.path
+    made = store.read_versions(path)  # what no campaign left there is a user's
+    kept = sources.listed(path / C) if own.digest_name(own_parts.CONTROLLER) in made else []
+    if wanted.controller is not None and kept != sources.listed(path / C):
+        raise RefusedError(f"--out is {path}, whose {C} holds C that no campaign left there; allowed is another folder")
     if force and path.is_dir():
         for rows_of in (wanted.rows, wanted.dry):
-            for file in rows_of.folder.glob("*.parquet"):
-                file.unlink()
-        for name in (FLOOR, TABLE):
+            rows_of.tidy(())
+        for name in (FLOOR, *([TABLE] if PLAN in made else [])):
             (path / name).unlink(missing_ok=True)
     elif _begun(wanted, tables):
         return
@@ -249,7 +251,8 @@ def begin(wanted: Folder, force: bool) -> None:
             (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
         if wanted.controller is not None:
             sources.copy(wanted.controller, making / C)
-        shutil.rmtree(path / C, ignore_errors=True)  # now: what is copied may lie there
+        for file in kept:  # now: what is copied may lie there
+            file.unlink(missing_ok=True)
         store.forget(path)  # what was another campaign's, or that of fewer trials
 
     store.write(path, fill)
