@@ -10,6 +10,7 @@ import platform
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -157,12 +158,23 @@ def check(folder: Path, force: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
     there = next(one for one in (folder, *folder.parents) if one.exists())
-    if not os.access(there, os.W_OK):
+    if not _takes(there):
         raise RefusedError(f"--out is {folder}, but nothing may be written into {there}; allowed is a folder elsewhere")
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
         )
+
+
+def _takes(folder: Path) -> bool:
+    """Whether a folder can be made in it: /proc says that it may be written to, to one who may all, and takes none."""
+    try:
+        if os.access(folder, os.W_OK):
+            Path(tempfile.mkdtemp(prefix=MAKING, dir=folder)).rmdir()
+            return True
+    except (FileNotFoundError, PermissionError):
+        pass
+    return False
 
 
 def check_file(file: Path, force: bool, way: str = "--force") -> None:

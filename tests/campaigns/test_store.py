@@ -207,9 +207,20 @@ def test_a_folder_is_written_where_nothing_may_stand_beside_it(tmp_path, monkeyp
     store.check(tmp_path / "out", force=False)
     store.write(tmp_path / "out", lambda folder: fill(folder) if folder.parent == tmp_path / "out" else None)
     assert tree(tmp_path / "out") == {"figures/a.png": b"new", "summary.json": b"new"}
-    with pytest.raises(
+    refused = pytest.raises(
         store.RefusedError, match=f"--out is .*new, but nothing may be written into {tmp_path}; allowed"
-    ):
+    )
+    with refused:
+        store.check(tmp_path / "new", force=False)
+    monkeypatch.undo()
+    store.check(tmp_path / "new", force=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def none(**_):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(store.tempfile, "mkdtemp", none)  # as in /proc, where root finds that it may write
+    with refused:
         store.check(tmp_path / "new", force=False)
 
 
