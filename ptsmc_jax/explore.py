@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
@@ -15,6 +14,7 @@ from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario import Study, parsing, reading
@@ -148,8 +148,8 @@ def simulate(
 
     Raises ScenarioError, with one sentence, where it cannot be flown.
     """
-    _check_whole_number("seed", seed)
-    _check_whole_number("trial", 0 if trial is None else trial)
+    draws.check_whole_number("seed", seed)
+    draws.check_whole_number("trial", 0 if trial is None else trial)
     loaded = _read(what) if controller is None else folder.flown(_read(what))
     ready = scenario.study(loaded, drawn=trial is not None)
     return Flight(loaded, runs.fly(ready, seed, trial, _software(controller, ready)))
@@ -179,7 +179,7 @@ def trials(
     Raises RefusedError, with one sentence, where a plan cannot be flown, ScenarioError where the controller is none of
     the scenario, and ValueError where metrics of one's own are no named numbers, or have the name of a column.
     """
-    _check_whole_number("seed", seed)
+    draws.check_whole_number("seed", seed)
     ready = _ready(what if controller is None else folder.flown(_read(what)))
     software = _software(controller, ready)
     drawn = campaign.Campaign(ready, seed, own, software=software)
@@ -187,7 +187,7 @@ def trials(
     if isinstance(count, pl.DataFrame):
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
         drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count
-    _check_whole_number("count", count, 1)
+    draws.check_whole_number("count", count, 1)
     return drawn.fly(range(count))
 
 
@@ -206,7 +206,7 @@ def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None
 
     Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies.
     """
-    _check_whole_number("seed", seed)
+    draws.check_whole_number("seed", seed)
     return runs.floor(_ready(what), seed)
 
 
@@ -225,7 +225,7 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
 
     Raises ValueError where there are no rows, or a column that is asked for is missing.
     """
-    _check_whole_number("seed", seed)
+    draws.check_whole_number("seed", seed)
     loaded = _read(what)
     asked = scenario.requirements(loaded)
     needed = ["status", *(name for r in asked for name in (r.metric, r.timed) if name is not None)]
@@ -241,9 +241,3 @@ def units(kind: str = "spacecraft") -> dict[str, str]:
     if kind not in catalogues.CATALOGUES:
         raise ValueError(f"there is no kind of plant {kind!r}; allowed are {', '.join(catalogues.CATALOGUES)}")
     return catalogues.units(kind)
-
-
-def _check_whole_number(name: str, value: object, least: int = 0) -> None:
-    """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards."""
-    if not isinstance(value, int | np.integer) or not least <= value < 2**32:
-        raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")

@@ -16,6 +16,7 @@ from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.draws import check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts, check_parts
@@ -168,7 +169,8 @@ def run(
         with jax.default_device(configure.processors()[0]):
             return run(parts, dispersion, seed, trials, block, own=own, kernel=kernel, software=software)
     check_parts(parts)
-    trials, seed = trials if isinstance(trials, Row) else _numbers(trials), _seed(seed)
+    check_whole_number("seed", seed)
+    trials = trials if isinstance(trials, Row) else _numbers(trials)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(configure.devices())
     block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
@@ -197,14 +199,6 @@ def _numbers(trials: Any) -> np.ndarray:
         said = f"between {numbers.min()} and {numbers.max()}" if whole else f"of type {numbers.dtype}"
         raise ValueError(f"trials are {said}, but must be whole numbers from 0 to {2**32 - 1}")
     return numbers.astype(np.uint32)
-
-
-def _seed(seed: Any) -> int:
-    """A seed, checked as the numbers of trials are."""
-    number = np.asarray(seed)
-    if number.ndim or not np.issubdtype(number.dtype, np.integer) or not 0 <= number < 2**32:
-        raise ValueError(f"seed is {seed!r}, but must be a whole number from 0 to {2**32 - 1}")
-    return int(number)
 
 
 def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:

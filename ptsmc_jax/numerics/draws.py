@@ -34,7 +34,17 @@ class Key(NamedTuple):
 def _word(value: WholeNumber) -> Array:
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
-    return jnp.asarray(value).astype(jnp.uint32)
+    number = jnp.asarray(value)
+    if not jnp.issubdtype(number.dtype, jnp.integer):  # a cast would cut fractions off
+        raise ValueError(f"a seed, trial or sample is of type {number.dtype}, but must be a whole number")
+    return number.astype(jnp.uint32)
+
+
+def check_whole_number(name: str, value: object, least: int = 0) -> None:
+    """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards; value: a known one."""
+    number = np.asarray(value)
+    if number.ndim or not np.issubdtype(number.dtype, np.integer) or not least <= number < 2**32:
+        raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
 
 
 @jax.jit

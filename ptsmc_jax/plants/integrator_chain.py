@@ -75,6 +75,6 @@ class Chain(Plant):
 
 def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> Chain:
     """Integrator chain of an order n; f, g: functions of the state (n,), see `Chain`. Raises ValueError for n < 2."""
-    if order < 2:
-        raise ValueError(f"order is {order}, but must be at least 2")
+    if not isinstance(order, int) or isinstance(order, bool) or order < 2:
+        raise ValueError(f"order is {order!r}, but must be a whole number of at least 2")
     return Chain(order, as_pytree(f), as_pytree(g))

@@ -190,7 +190,7 @@ def system(
         ValueError: a function does not take such arguments, or returns another shape; or the numbers do not fit.
     """
     if not isinstance(n, int) or isinstance(n, bool) or n < 1:
-        raise ValueError(f"n is {n}, but must be a whole number of at least 1")
+        raise ValueError(f"n is {n!r}, but must be a whole number of at least 1")
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), number.dtype)
     z = _hidden(z0, Z)

@@ -50,15 +50,18 @@ class Reach:
 def reach_of(scenario: Scenario, **farther: float) -> Reach:
     """The reach of a scenario's own gains, none beyond them; farther: fields of `Reach` that are to be others.
 
-    Raises ValueError where one of these is negative, or not finite.
+    Raises ValueError where there is no such field, or one of these is no finite number, or negative.
 
     >>> from ptsmc_jax.scenario import from_tables
     >>> reach = reach_of(from_tables({}), delta=2.0)
     >>> reach.t_f, reach.smallest_delta, reach.delta
     (30.0, 0.05, 2.0)
     """
+    names = [field.name for field in dataclasses.fields(Reach)]
     for name, value in farther.items():
-        if not 0.0 <= value < math.inf:
+        if name not in names:
+            raise ValueError(f"there is no {name} in a reach; allowed are {', '.join(names)}")
+        if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or not 0.0 <= value < math.inf:
             raise ValueError(f"{name} is {value!r}, but must be a finite number of at least 0")
     table = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)

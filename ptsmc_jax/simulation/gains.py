@@ -67,7 +67,9 @@ def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
 
-    Raises ValueError where there is no such gain, where one is no single number, and where the parts' anchored clock
+    Which numbers a law has theorems for is not asked here, as eta > 2; scenarios ask it, see `in_scenario`.
+
+    Raises ValueError where there is no such gain, where one is no finite number, and where the parts' anchored clock
     has too few samples for them, as far as they are known: under a transformation such a run comes back as
     `unfinished`; TypeError where there are no parts.
     """
@@ -99,13 +101,16 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
 
 def _number(name: str, value: Any) -> Array:
-    """A gain as an array. Raises ValueError where it is none: JAX reads words as numbers, too."""
+    """A gain as an array. Raises ValueError where it is known to be none: JAX reads words as numbers, too."""
     try:
         if isinstance(value, str | bytes | bool) or value is None:
             raise TypeError
-        return jnp.asarray(value, float)
+        number = jnp.asarray(value, float)
     except TypeError:
         raise ValueError(f"{name} is {value!r}, but must be a number") from None
+    if not (isinstance(number, core.Tracer) or np.isfinite(number).all()):
+        raise ValueError(f"{name} is {value!r}, but must be a finite number")
+    return number
 
 
 def _check_names(parts: Parts, names: Iterable[str]) -> None:

@@ -331,7 +331,7 @@ def test_batches_of_chains_and_their_gradients():
 
 
 def test_chain_is_built_with_an_order_and_functions():
-    with pytest.raises(ValueError, match="order is 1, but must be at least 2"):
+    with pytest.raises(ValueError, match="order is 1, but must be a whole number of at least 2"):
         integrator_chain.chain(1)
     stiff = jax.tree_util.Partial(lambda k, x: -k * x[0], vector(2.0))
     found = integrator_chain.chain(3, stiff)

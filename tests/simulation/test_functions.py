@@ -13,6 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants import system
 from ptsmc_jax.signals.disturbances import Sinusoid
@@ -122,6 +123,19 @@ REFUSED = {
     "a gain in words": (lambda: API.with_gains(RUN, {"eta": "3"}), "eta is '3', but must be a number"),
     "no gain": (lambda: API.with_gains(RUN, {"eta": None}), "eta is None, but must be a number"),
     "a gain of two parts": (lambda: API.with_gains(RUN, {"eta": 3j}), "eta is 3j, but must be a number"),
+    "a gain that is none": (
+        lambda: API.with_gains(RUN, {"eta": jnp.nan}),
+        "eta is nan, but must be a finite number",
+    ),
+    "no order": (lambda: API.chain(True), "order is True, but must be a whole number of at least 2"),
+    "a reach of what it has not": (
+        lambda: API.reach_of(FLIGHT, dlta=2.0),
+        "there is no dlta in a reach; allowed are smallest_t_f, t_f, delta",
+    ),
+    "half a seed of one run": (
+        lambda: jax.eval_shape(lambda seed: draws.stream(seed, 0, "noise"), 0.5),
+        "a seed, trial or sample is of type float64, but must be a whole number",
+    ),
     "half a seed": (
         lambda: API.run(RUN, None, 0.5, [1]),
         "seed is 0.5, but must be a whole number from 0",
