@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import configure, programs
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics import pytrees
 from tests.helpers import gpus
 from tests.tree import ROOT, modules
@@ -55,6 +56,21 @@ def test_a_program_is_compiled_once_and_loaded_by_the_next_process(folder):
         np.testing.assert_array_equal(ours["both"], theirs["both"])
     assert not traced
     np.testing.assert_allclose(first[1]["both"], np.sin(4 * X) + 5.0, rtol=1e-15)
+
+
+def test_what_only_tells_of_our_own_lapack_calls_none(folder, monkeypatch):
+    """LAPACK takes 0.1 s to import, and what went through `batching.lapack` names that file."""
+
+    def function(x):
+        return lapack.in_turn(jnp.sin, [0])(x)
+
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "turns", "turns"
+    wanted = programs.jit(function)(X)
+    (kept,) = folder.iterdir()
+    assert b"batching/lapack.py" in kept.read_bytes()
+    monkeypatch.setattr(programs, "_lapack", None)
+    monkeypatch.setattr(programs.Program, "_compiled", None)
+    np.testing.assert_array_equal(programs.jit(function)(X), wanted)
 
 
 @pytest.mark.parametrize("kept", [False, True])
