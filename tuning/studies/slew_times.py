@@ -127,7 +127,7 @@ def trace(
         with_time = {**named, "t_f": times[k]}
         parts = gains.with_gains(ready.parts, with_time)
         trials = montecarlo.run(parts, ready.dispersion, fresh_seed, np.arange(count))
-        tuned = gains.in_scenario(scenario, with_time)
+        tuned = gains.in_scenario(_at(scenario, times[k]), named)  # whose bounds are those of that time
         costs = {name: judging.largest(name, tuned, trials) for name in _costs(tuned)}
         slews.append(Slew(times[k], named, costs=costs, **judging.figures(tuned, trials, fresh_seed)))
     without = [t_f for k, t_f in enumerate(times) if k not in best]
