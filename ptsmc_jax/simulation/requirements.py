@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.simulation.catalogues import CATALOGUE, WITHIN, percent
+from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, percent
 
 
 def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
@@ -122,6 +122,7 @@ class Verdict:
 
     def _of_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
+        each = "loops" if self.metric in MARGINS else "trials"  # of which more may be looked at than are flown
         wanted = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
         wanted += _in_degrees(self.limit, self.unit)
         if self.quantile is not None:
@@ -138,9 +139,9 @@ class Verdict:
             few = fewest_trials(self.quantile, self.confidence)
             return f"{wanted}: {seen}: NOT shown, which takes at least {few} trials"
         if self.met:
-            return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} trials" if failures else "")
+            return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} {each}" if failures else "")
         allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
-        return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} trials{allowed}" if trials > 1 else "")
+        return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} {each}{allowed}" if trials > 1 else "")
 
 
 def _in_degrees(value: float, unit: str) -> str:
