@@ -112,7 +112,7 @@ def drivers(
     ranked: dict[str, tuple] | None = None,
     categories: Collection[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """How each input drives a metric: Spearman's rank correlation, and the first-order share of its variance.
+    """How each input drives a metric: Spearman's rank correlation, and the first-order share of its ranks' variance.
 
     The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
     Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,

@@ -158,6 +158,7 @@ def test_what_chance_shows_is_not_said_to_drive_a_metric():
     summary["drivers"] = {"window_error": statistics.drivers({"y": metric + rng.normal(size=300)}, metric)}
     (said,) = campaign_sentences.drivers(summary)
     assert said.startswith("window_error hangs on y +0.")
+    assert said.endswith("%): rank correlation (share of the variance of its ranks)")
 
 
 @pytest.mark.parametrize(

@@ -104,4 +104,4 @@ def drivers(summary: Summary) -> Iterator[str]:
             ranks = {key: known[key]["rank_correlation"] for key in strongest}  # None of a number of a wheel, say
             each = {key: key if rank is None else f"{key} {rank:+.2f}" for key, rank in ranks.items()}
             texts = (f"{text} ({100 * known[key]['first_order']:.0f} %)" for key, text in each.items())
-            yield f"{name} hangs on {', '.join(texts)}: rank correlation (share of its variance)"
+            yield f"{name} hangs on {', '.join(texts)}: rank correlation (share of the variance of its ranks)"
