@@ -331,9 +331,11 @@ class _Told(NamedTuple):
     period: Any
 
 
-@pytest.mark.parametrize(("period", "judged"), [(0.1, {0}), (1.9, {0, 1, 2, 3, 4, 5, 6, 7})])
-def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatch, period, judged):
-    """Delay margins of 1, 1.1, .. s: 0.2 periods to either side, 0.02 or 0.38 s, so many may be the least."""
+@pytest.mark.parametrize(
+    ("period", "limit", "judged"), [(0.1, 0.25, {0}), (1.9, 0.25, {0, 1, 2, 3, 4, 5, 6, 7}), (0.1, 2.01, {0, 10})]
+)
+def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatch, period, limit, judged):
+    """Delay margins of 1, 1.1, .. s: 0.2 periods to either side, 0.02 or 0.38 s, so many may be the least, or 2.01."""
     delays, seen = 1.0 + 0.1 * np.arange(32), set[int]()
 
     def looked(*_):
@@ -347,7 +349,7 @@ def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatc
     monkeypatch.setattr(margin_verdicts, "JUDGED", 16)
     monkeypatch.setattr(margin_verdicts.margins, "of_each", of_each)
     nothing: Any = None
-    found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": 0.25})
+    found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
     np.testing.assert_array_equal(found["delay_margin"], delays)
     assert seen == judged
 
