@@ -77,7 +77,8 @@ def check(scenario: Scenario) -> None:
     if scenario.motion != "spacecraft":
         kind = errors.show(scenario.plant.kind)
         raise ScenarioError(
-            f'plant.kind is {kind}, but must be "spacecraft": laws are compared with a wrong inertia, too'
+            f'plant.kind is {kind}, but must be "spacecraft": laws are compared with a wrong inertia, too; for another '
+            "plant ptsmc tune finds the gains of one law at a time"
         )
     if not scenario.sampled:
         mode = errors.show(scenario.loop.mode)
