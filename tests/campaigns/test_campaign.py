@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
 from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
@@ -53,7 +53,7 @@ def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, cap
     monkeypatch.setattr(montecarlo, "CAPACITY", capacity)
     monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=block))
     found = jax.local_devices()[:devices]
-    monkeypatch.setattr(jax, "local_devices", lambda: found)
+    monkeypatch.setattr(configure, "devices", lambda: found)
     same(made.fly(range(300)), frame)
 
 
@@ -121,7 +121,7 @@ def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, togethe
     made, frame = flown
     monkeypatch.setattr(campaign, "PART", 40)
     monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # the program of `flown`
-    monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(jax.local_devices()))
+    monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(configure.devices()))
     flights = []
 
     def make(trials):
