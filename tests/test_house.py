@@ -93,7 +93,7 @@ HOUSE = {
             design flights shares
             margin_rows
             objective
-            confirm evaluate worst
+            confirm evaluate hand_overs worst
             descent starts trust
             cma_es rounds work
             descents

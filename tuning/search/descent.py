@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, nnls
 
 from tuning.search.evaluate import Measured, Sloped
 from tuning.search.objective import ended, failures
 
+ACTIVE = 1e-3  # of a limit, nearer to which it is active
 SLACK = 1e-4  # of a limit that an admissible point may use
 BROKEN = 1e3  # metric / limit by which a trial that fails is over, as progress tells it, beside those that end
 CLOSE = 1e-5  # change of F at which a descent ends
@@ -137,6 +138,20 @@ def descend(
             callback=passed,
             options={"maxiter": steps, "ftol": close},
         )
+
+
+def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
+    """(rows,) what F pays for each limit at an optimum (gains,), over c; none for those that are not active.
+
+    Lagrange multipliers, by least squares over the gains that are not on a bound.
+    """
+    c, inside = ended(at.c[0]), (share > 0.0) & (share < 1.0)
+    active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)
+    slopes = at.c_slope[0, active, c[active].argmax(axis=1)]
+    paid = np.zeros(len(c))
+    if active.size and inside.any():
+        paid[active] = nnls(_usable(slopes)[:, inside].T, -_usable(at.f_slope)[0, inside])[0]
+    return paid
 
 
 def _usable(slopes: np.ndarray) -> np.ndarray:

@@ -3,24 +3,23 @@
 Sequential quadratic programming on the slopes of what flies, see `descend`; where there are none, evolution.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import configure
+from tuning.search import hand_overs
 from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
-from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest
+from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest, prices
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.lockstep import Ask, in_step
-from tuning.search.objective import FAILED, Problem, failures, fewer_trials
+from tuning.search.objective import FAILED, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
 from tuning.search.shares import TIMES
-from tuning.search.starts import CHOOSING, STEEP, SWEPT, charged, promising, spread, starting_points
+from tuning.search.starts import CHOOSING, NEARLY, STEEP, SWEPT, charged, promising, spread, starting_points
 from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # starts from whose best points a further round goes on
@@ -28,7 +27,7 @@ EXPLORED, AVERAGED = 32, 16  # trials on which most starts are given up; at leas
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
-LATER = 4  # samples from the one before the hand-over on, to which it is moved with t_f
+LOOKS = 3  # at other hand-overs, at most
 MANY = 512  # points swept where there are no slopes
 
 SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
@@ -61,14 +60,15 @@ def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple
         evolving = {EVOLVING: GENERATIONS * WIDELY[0] * trials}
         return {CHOOSING: MANY * trials, **evolving}, {ROUND: 0.0, **evolving}
     one, few = SLOPED * steps, _few_trials(problem).trials.size
+    finishing = (hand_overs.LOOKED + one) * trials
     exploring = {SETTING_OUT: one * few, CHOOSING: max(SWEPT, starts) * few, SEARCHING: starts * one * 3 / 8 * few}
     return (
         {
             **(exploring if starts > 1 else {}),
             FOLLOWING: (min(starts, FOLLOWED) + 1) / 2 * one * trials,
-            FINISHING: one * trials,
+            FINISHING: finishing,
         },
-        {ROUND: AGAIN * one * trials, FINISHING: one * trials},
+        {ROUND: AGAIN * one * trials, FINISHING: finishing},
     )
 
 
@@ -272,13 +272,16 @@ class Descents:
                    partial(self._keep, 0), size)  # fmt: skip
         finally:  # interrupted too
             self._take(best, tightened, 0, afresh=True)
-        on_samples = np.asarray(self._on_samples(problem, self.share))
+        on_samples = np.asarray(hand_overs.on_samples(problem, self._evaluate.bounds, self.share))
         if on_samples.size:
             best, _ = self._best_of(tightened, on_samples)
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
 
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.so_far)
+        for _ in range(LOOKS):
+            if not self._hand_over_elsewhere(problem):
+                break
         self._descend(problem, self._from, Start(self.share, CAREFUL), self._steps, close=FINISH * CLOSE)
         self._hand_over_on_a_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
@@ -307,6 +310,27 @@ class Descents:
     def _as_good(self, best: Best) -> bool:
         return best.beyond <= self.best.beyond and best.f <= self.best.f + SAME
 
+    def _hand_over_elsewhere(self, problem: Problem) -> bool:
+        """Whether the best of other hand-overs leads to a better point, the other gains at first as they are.
+
+        Noise moves along with the hand-over: by delta other noise falls into the window, and F of a few hundred trials
+        has ripples of a per cent, in which descents end.
+        """
+        found, share = self.best, hand_overs.elsewhere(problem, self._evaluate.bounds, self.share)
+        if found.over > 0.0 or not share:
+            return False
+        tightened = self.tightened(problem)
+        flown = self._evaluate.fly(tightened, np.stack(share))
+        price = prices(self._evaluate.slopes(tightened, found.share[None]), found.share)
+        # a little beyond a limit: the other gains come back from there, at its price
+        paid = flown.f + np.maximum(ended(flown.c).max(axis=2, initial=-1.0), 0.0) @ price
+        known = np.isfinite(paid) & (failures(flown.c) == 0) & (flown.beyond <= NEARLY)
+        paid = np.where(known, paid, np.inf)
+        first = int(paid.argmin())
+        if paid[first] < found.f - SAME:
+            self._descend(problem, self._from, Start(share[first], CAREFUL), self._steps)
+        return self.best is not found
+
     def _hand_over_on_a_sample(self, problem: Problem) -> None:
         """The best point whose hand-over is flown as it is trained, the other gains anew, in place of the best so far.
 
@@ -316,39 +340,11 @@ class Descents:
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [(k, end) for k, end in _ranked(self._ends) if k != self._from]
         for number, end in [(self._from, self.best), *others]:
-            for share in self._on_samples(problem, end.share):
+            for share in hand_overs.on_samples(problem, self._evaluate.bounds, end.share):
                 self._descend(problem, number, Start(share, CAREFUL, times), self._steps, afresh=not moved)
                 moved = True
             if not admissible or self.best.over == 0.0:
                 return
-
-    def _on_samples(self, problem: Problem, share: np.ndarray) -> list[np.ndarray]:
-        """Shares, (gains,), with the nearest hand-overs that are flown as they are trained; none where all are.
-
-        A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
-        """
-        clock: Any = problem.parts.clock
-        bounds, law, moves = self._evaluate.bounds, problem.parts.controller, list[tuple[int, float]]()
-        at = {name: k for k, name in enumerate(problem.names) if name in TIMES}
-        if not at or not clock.anchored or "delta" not in law.tunable:  # a law without it does not hand over
-            return []
-        own = np.asarray(bounds.gains(jnp.asarray(share)))
-        t_f, delta = (float(own[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
-        period = float(clock.period)
-        samples = (t_f - delta) / period
-        before, behind = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
-        if "delta" in at:
-            moves += [(at["delta"], t_f - sample * period) for sample in sorted({before, behind})]
-        if "t_f" in at:  # where it is as short as limits allow, another delta may break one
-            moves += [(at["t_f"], sample * period + delta) for sample in range(before, before + LATER)]
-        shares = []
-        for k, time in moves:
-            if bounds.lower[k] * (1 - 1e-9) <= time <= bounds.upper[k]:
-                gains, there = own.copy(), share.copy()
-                gains[k] = time
-                there[k] = bounds.share(gains)[k]
-                shares.append(there)
-        return shares
 
     def _descend(
         self, problem: Problem, number: int, start: Start, steps: int, close: float = CLOSE, *, afresh: bool = False
