@@ -68,8 +68,8 @@ def configure(
     None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
     that make loops 2 to 15 times as fast. They are tried out in a process of its own, once for each version of JAX and
     processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
-    XLA_FLAGS that set `xla_backend_extra_options` or `xla_disable_hlo_passes` are left as they are. device: what runs
-    are flown on, by default the first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of
+    XLA_FLAGS that set `xla_backend_extra_options` or `xla_disable_hlo_passes` are left as they are. device: what
+    batches fly on, by default the first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of
     every number; what 32 put out of reach stands in docs/python.md. keep_programs: keep whole compiled programs too,
     and load them, in a process in which no code is patched, see `ptsmc_jax.programs`, or looked for faults in: JAX's
     checks for NaN, infinity, promotion and transfers, which stop runs, are off there whatever the environment says.

@@ -74,7 +74,7 @@ Against = Annotated[
 Laws = Annotated[
     tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a law of your own beside them, several times.")
 ]
-Device = Annotated[str, Parameter(help="What it is flown on: cpu or gpu.")]
+Device = Annotated[str, Parameter(help="What batches are flown on: cpu or gpu.")]
 Trust = Annotated[
     bool,
     Parameter(
