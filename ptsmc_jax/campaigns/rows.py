@@ -22,6 +22,11 @@ FOLDER = "trials"
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
+def named(path: Path) -> bool:
+    """Whether a file has the name of a part, of this campaign or of another."""
+    return _NAME.fullmatch(path.name) is not None
+
+
 @dataclass(frozen=True, order=True)
 class Part:
     """A part of a campaign's rows, whole and on the disk."""
@@ -79,7 +84,7 @@ class Rows:
             path.unlink(missing_ok=True)
         whole = {part.path for part in parts}
         for path in self.folder.glob("*.parquet"):
-            if path not in whole and _NAME.fullmatch(path.name):
+            if path not in whole and named(path):
                 path.unlink(missing_ok=True)
 
     def _digest(self, first: int, count: int, content: bytes) -> str:

@@ -162,7 +162,9 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
         assert command(*again, "--shard", "1/2")[0] == 0
         assert [(flown / name).read_text() for name in mine] == ["mine"] * 4
         assert not (flown / "summary.json").exists()  # that of the campaign before, which would pass for this one's
-        assert command(*again)[0] == 0
+        (flown / "trials" / "mine.parquet").write_text("mine")
+        code, _, error = command(*again)
+        assert (code, "mine.parquet is no part of a campaign; it is kept as mine.parquet.damaged" in error) == (0, True)
         assert rows_of(flown)["trial"].to_list() == list(range(110))
 
 

@@ -355,7 +355,8 @@ def fly(
     for path in broken:
         aside = path.with_name(path.name + ".damaged")
         os.replace(path, aside)
-        print(f"ptsmc: {path} is damaged and is flown again; it is kept as {aside.name}", file=sys.stderr)
+        what = "is damaged and is flown again" if rows.named(path) else "is no part of a campaign"
+        print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None
     if alone:  # others may be writing otherwise
         folder.rows.tidy(parts)
