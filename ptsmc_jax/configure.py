@@ -188,6 +188,11 @@ def devices() -> list:
     return jax.local_devices(backend=getattr(chosen, "platform", chosen))
 
 
+def backend() -> str:
+    """Their kind, "cpu" or "gpu": `jax.default_backend()`, which does not know of `jax.default_device`."""
+    return devices()[0].platform
+
+
 def processors() -> list:
     """The processor's devices; where JAX is kept from it (JAX_PLATFORMS), the others."""
     import jax

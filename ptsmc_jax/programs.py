@@ -107,7 +107,7 @@ class Program:
 
     def _placed(self, method: Callable, args: tuple, kwargs: dict) -> Any:
         """What the method returns, on the processor, where JAX would run something else that is not a batch."""
-        elsewhere = not self._batch and configure.devices()[0].platform != "cpu"
+        elsewhere = not self._batch and configure.backend() != "cpu"
         if not elsewhere or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
             return method(*args, **kwargs)
         args, kwargs = [jax.tree.map(_brought, given) for given in (args, kwargs)]

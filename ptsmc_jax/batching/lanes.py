@@ -255,7 +255,7 @@ class _Lanes:
         from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
 
         lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
-        varies, interpret = [own & TRIAL for own in state.differs], configure.devices()[0].platform == "cpu"
+        varies, interpret = [own & TRIAL for own in state.differs], configure.backend() == "cpu"
         try:
             last = kernel.scan(params, values, varies, lead, interpret)
         except NotImplementedError as error:

@@ -40,7 +40,7 @@ def vmap(function: Callable) -> Callable:
 
 def over(trace: Any, count: int) -> Callable:
     """What takes a trace, or an equation, over so many: `jax.vmap`, or `in_turn` where LAPACK would wait."""
-    waits = WAITS and configure.devices()[0].platform == "cpu" and count * _work(trace) > ALONE
+    waits = WAITS and configure.backend() == "cpu" and count * _work(trace) > ALONE
     return in_turn if waits else jax.vmap
 
 

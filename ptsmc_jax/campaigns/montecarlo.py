@@ -165,7 +165,7 @@ def run(
 
     Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts.
     """
-    if software.on_processor and configure.devices()[0].platform != "cpu":
+    if software.on_processor and configure.backend() != "cpu":
         with jax.default_device(configure.processors()[0]):
             return run(parts, dispersion, seed, trials, block, own=own, kernel=kernel, software=software)
     check_parts(parts)
@@ -275,12 +275,12 @@ def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.
 
 def block_size() -> int:
     """How many trials a device flies at a time, where a caller does not say."""
-    return BLOCK if configure.devices()[0].platform == "cpu" else BLOCK_ON_GPU
+    return BLOCK if configure.backend() == "cpu" else BLOCK_ON_GPU
 
 
 def by_kernel() -> bool:
     """Whether loops over time are flown as one kernel each: on a GPU, where every step would cost launches."""
-    return configure.devices()[0].platform == "gpu"
+    return configure.backend() == "gpu"
 
 
 def blocks(fly: Callable, trials: Any) -> Any:
