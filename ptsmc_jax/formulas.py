@@ -79,7 +79,7 @@ def free_modes(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray
 
 def surface_roots(a: Any) -> np.ndarray:
     """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
-    return np.roots([1.0, *reversed([float(v) for v in a])])
+    return np.roots([1.0, *np.asarray(a, dtype=float)[::-1]])
 
 
 def hurwitz(a: Any) -> bool:

@@ -221,7 +221,7 @@ def gathered(results: np.ndarray, share: int) -> np.ndarray:
 def prepare(parts: Parts, dispersion: Dispersion) -> None:
     """Begin to compile what flies many trials of such parts, beside what is being done."""
     devices, block = len(configure.devices()), block_size()
-    numbers = jnp.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=jnp.uint32)
+    numbers = np.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=np.uint32)
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel(), OURS)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ptsmc_jax import formulas
+from ptsmc_jax import formulas, programs
 from ptsmc_jax.laws.closed_forms import exact_error
 from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.numerics import guards
@@ -179,8 +179,13 @@ class PrescribedTimeLaw(Law):
 
     def hold_rates(self) -> dict[str, float]:
         """Fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
-        fastest_root = float(np.max(np.abs(formulas.surface_roots(self.surface()))))
-        return {"k1": float(self.reaching_rate()), "surface_rate": fastest_root}
+        reaching, surface = _rates_of_hold(self)
+        return {"k1": float(reaching), "surface_rate": float(np.max(np.abs(formulas.surface_roots(surface))))}
+
+
+@programs.jit  # one program, where each of its operations would be one
+def _rates_of_hold(law: PrescribedTimeLaw) -> tuple[Scalar, Float[Array, " roots"]]:
+    return law.reaching_rate(), law.surface()
 
 
 @dataclass(frozen=True)

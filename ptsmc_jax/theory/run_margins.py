@@ -125,22 +125,29 @@ def along(parts: Parts, times: int = 24) -> Course:
 
     None is left in hold where the run does not come to rest, see `rest`.
     """
-    judged, run = judged_times(parts), linear.nominal_jit(parts)
-    besides = jnp.geomspace(float(parts.period), float(parts.controller.t_f), times)
-    at_times = at(parts, jnp.append(judged, besides), run)
+    run = linear.nominal_jit(parts)
+    looked_at, commands = _along(parts, run, times)
+    at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
     t, _, loops, at_input = jax.tree.map(lambda v: v[order], at_times)
-    counts = (order < judged.size) | (order == order[-1])
+    counts = (order < TIMES) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
     at_sensors = margins.of_each(last, sensors=True)
-    swing = rest.swing(parts, history(parts, run))
+    swing = rest.swing(parts, commands)
     if swing is None:
         at_once = margins.together(jax.tree.map(lambda v: v[0], last))
     else:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
     return Course(t, counts, loops, at_input, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
+
+
+@programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
+def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History]:
+    """The times to go that `along` looks at, (TIMES + times,) [s], those that are judged first; the commands."""
+    besides = jnp.geomspace(parts.period, parts.controller.t_f, times)
+    return jnp.append(judged_times(parts), besides), history(parts, run)
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import configure
@@ -126,7 +125,7 @@ class Descents:
     @property
     def gains(self) -> np.ndarray:
         """(gains,) of the best point."""
-        return np.asarray(self._evaluate.bounds.gains(jnp.asarray(self.share)))
+        return self._evaluate.bounds.gains(self.share)
 
     @property
     def history(self) -> list[Step]:

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from tuning.search.objective import Problem
@@ -44,7 +43,7 @@ def _of(problem: Problem, bounds: Bounds, share: np.ndarray) -> _HandOver | None
     law, at = problem.parts.controller, {name: k for k, name in enumerate(problem.names) if name in TIMES}
     if not at or not clock.anchored or "delta" not in law.tunable:  # a law without it does not hand over
         return None
-    own = np.asarray(bounds.gains(jnp.asarray(share)))
+    own = bounds.gains(share)
     t_f, delta = (float(own[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
     return _HandOver(share, bounds, own, at, t_f, delta, float(clock.period))
 

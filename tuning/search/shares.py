@@ -1,10 +1,9 @@
 """Intervals of the free gains; shares of them, from 0 to 1, <-> gains."""
 
 from dataclasses import dataclass
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ptsmc_jax.scenario import free_gains
 from ptsmc_jax.scenario.gain_record import wide
@@ -44,15 +43,15 @@ class Bounds:
         low, high = (np.where(log, inner, bound) for inner, bound in zip(logarithms, (lower, upper), strict=True))
         return low, high
 
-    def gains(self, share: Float[Array, " gains"]) -> Float[Array, " gains"]:
-        """Gains of shares of the intervals: 0 is the lower bound, 1 the upper one."""
-        low, high = self._scaled()
+    def gains(self, share: Any) -> Any:
+        """Gains of shares of the intervals, (gains,), NumPy's or JAX's: 0 is the lower bound, 1 the upper one."""
+        xp, (low, high) = share.__array_namespace__(), self._scaled()
         inner = low + (high - low) * share
-        gains = jnp.where(self.logarithmic, jnp.exp(inner), inner)
+        gains = xp.where(self.logarithmic, xp.exp(inner), inner)
         if not self.hop:
             return gains
         k, least = self._width, self._least_width(gains)
-        return gains.at[k].set(least * (self.upper[k] / least) ** share[k])
+        return xp.where(np.arange(len(self.names)) == k, least * (self.upper[k] / least) ** share[k], gains)
 
     def share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
@@ -66,10 +65,10 @@ class Bounds:
     def _width(self) -> int:
         return self.names.index("sign_width")
 
-    def _least_width(self, gains: Array | np.ndarray) -> Array:
+    def _least_width(self, gains: Any) -> Any:
         observers = [k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain"]
         least = self.hop / gains[np.asarray(observers)].min()
-        return jnp.clip(least, self.lower[self._width], HALF * self.upper[self._width])
+        return gains.__array_namespace__().clip(least, self.lower[self._width], HALF * self.upper[self._width])
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
         """Gains that ended within the share `NEAR` of their interval from a bound: name to "lower" or "upper"."""

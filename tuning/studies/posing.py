@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.scenario import Study, replace, study, tables
@@ -56,8 +55,7 @@ class Posed:
 
     def named(self, share: np.ndarray) -> dict[str, float]:
         """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
-        gains = np.asarray(self.evaluate.bounds.gains(jnp.asarray(share)))
-        return self.evaluate.bounds.rounded(gains, DIGITS)
+        return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(share), DIGITS)
 
 
 def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
