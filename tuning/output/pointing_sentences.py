@@ -76,7 +76,7 @@ def compliance(summary: Summary) -> Table | None:
     if not rows:
         return None
     head = ("index", "about", "at most", "probability", "interpretation", "confidence", "shown", "runs", "beyond")
-    return Table((*head, "needed without", "verdict"), rows)
+    return Table((*head, "enough if none", "verdict"), rows)
 
 
 def _row(verdict: Summary) -> tuple[str, ...]:
