@@ -22,7 +22,7 @@ from pathlib import Path
 
 import ptsmc_jax as ptsmc
 from tuning.output import campaign_terminal
-from tuning.studies import campaign_folder, campaign_summary
+from tuning.studies import campaign_figures, campaign_folder, campaign_summary
 
 # %% [markdown]
 # The gains of `ptsmc tune scenarios/first_flight.toml` (its `tuned.toml`, so with the flight clock on which they were
@@ -71,7 +71,7 @@ campaign_terminal.campaign(found, Path("campaign"))
 # %%
 from ptsmc_jax.explore import Figures
 
-figures = campaign_summary.figures_of(folder, found)
+figures = campaign_figures.of(folder, found)
 Figures({name: figures[name] for name in ("fan", "distributions")})
 
 # %% [markdown]

@@ -102,7 +102,7 @@ HOUSE = {
         """,
         "studies": """
             campaign_folder judging mapping reproduction single stability table
-            campaign_theory posing
+            campaign_figures campaign_theory posing
             campaign_summary tuner
             compare pareto reasons tune_files
             robustness slew_times

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import special  # `scipy.stats` takes half a second to import
 
 STEEPEST = 60.0  # tilt of a mean towards its largest values or its smallest, at which nothing else is left
 SOBOL_BINS = 32  # of an input, with equally many trials each
@@ -25,7 +25,7 @@ def share_interval(successes: int, trials: int, confidence: float) -> tuple[floa
 
 def share_bound(successes: int, trials: int, confidence: float) -> float:
     """One-sided lower bound of a share, beta(1 - confidence; k, trials - k + 1): Clopper and Pearson."""
-    return float(stats.beta.ppf(1.0 - confidence, successes, trials - successes + 1)) if successes > 0 else 0.0
+    return float(special.betaincinv(successes, trials - successes + 1, 1.0 - confidence)) if successes > 0 else 0.0
 
 
 def mean_bound(shares: np.ndarray, confidence: float) -> float:
@@ -42,6 +42,8 @@ def mean_bound(shares: np.ndarray, confidence: float) -> float:
     >>> f"{mean_bound(np.append(np.zeros(990), np.full(10, 0.3)), confidence=0.95):.4f}"
     '0.0065'
     """
+    from scipy import optimize
+
     shares = np.clip(shares, 0.0, 1.0)  # a share of time may be a rounding error off
     low = float(shares.min())
     if low == 1.0:
@@ -80,7 +82,8 @@ def percentile(values: np.ndarray, value: float) -> float:
     >>> percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0), percentile(np.array([10.0, 10.0, 10.0, 10.0, 20.0]), 10.0)
     (100.0, 50.0)
     """
-    return float(stats.percentileofscore(values, value, kind="rank"))
+    below, equal = np.count_nonzero(values < value), np.count_nonzero(values == value)
+    return (below + (equal + 1) / 2 * (equal > 0)) / values.size * 100.0
 
 
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:
@@ -91,8 +94,9 @@ def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -
     Infinite ends where so few trials bound it on that side by nothing.
     """
     n, outside = ordered.size, (1.0 - confidence) / 2.0
-    low = int(stats.binom.ppf(outside, n, quantile))  # the largest l with P(B < l) < outside
-    high = int(stats.binom.isf(outside, n, quantile)) + 1  # the smallest u with P(B >= u) <= outside
+    # the largest l with P(B < l) < outside, and the smallest u with P(B >= u) <= outside
+    low = bisect.bisect_left(range(n), outside, key=lambda k: special.bdtr(k, n, quantile))
+    high = bisect.bisect_left(range(n), True, key=lambda k: special.bdtrc(k, n, quantile) <= outside) + 1
     below = float(ordered[low - 1]) if low >= 1 else -np.inf
     return below, float(ordered[high - 1]) if high <= n else np.inf
 
@@ -177,7 +181,8 @@ def _first_order(bins: Sequence[np.ndarray], count: int) -> float:
 
 def _ranks(values: np.ndarray) -> np.ndarray:
     """Ranks of values (trials,), of mean 0 and variance 1: the mean of their products is Spearman's correlation."""
-    rank = stats.rankdata(values)
+    _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
+    rank = (np.cumsum(counts) - (counts - 1) / 2)[which]  # of equal ones the mean of theirs
     return (rank - rank.mean()) / rank.std()
 
 

@@ -26,7 +26,7 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
         return max(1, math.ceil(quantile * trials - 1e-9))
     if trials < fewest_trials(quantile, confidence):
         return None
-    from ptsmc_jax.numerics.statistics import share_bound  # imports SciPy's statistics, which takes a while
+    from ptsmc_jax.numerics.statistics import share_bound  # imports SciPy, which takes a while
 
     def shown(within: int) -> bool:
         return share_bound(within, trials, confidence) >= quantile

@@ -186,3 +186,25 @@ def test_one_of_equal_numbers_stands_in_their_middle():
     """In a plan that says 10 in nearly each row, 10 was named as the reason, "at 80 %"."""
     assert statistics.percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0) == 100.0
     assert statistics.percentile(np.array([10.0, 10.0, 10.0, 10.0, np.inf]), 10.0) == 50.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_they_are_those_of_scipys_statistics(seed):
+    """Which take half a second to import."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 3000))
+    k, quantile, confidence = int(rng.integers(1, n + 1)), rng.uniform(), rng.uniform(0.5, 0.9999)
+    bound = stats.beta.ppf(1.0 - confidence, k, n - k + 1)
+    np.testing.assert_allclose(statistics.share_bound(k, n, confidence), bound, rtol=1e-12)
+    low, high = (
+        stats.binom.ppf((1.0 - confidence) / 2.0, n, quantile),
+        stats.binom.isf((1.0 - confidence) / 2.0, n, quantile),
+    )
+    ends = np.concatenate([[-np.inf], np.arange(1.0, n + 1.0), [np.inf]])  # the l-th smallest is l
+    assert statistics.quantile_interval(ends[1:-1], quantile, confidence) == (ends[int(low)], ends[int(high) + 1])
+    values = rng.integers(0, 20, n).astype(float)
+    for value in (-1.0, 3.0, 3.5, 30.0):
+        expected = stats.percentileofscore(values, value, kind="rank")
+        np.testing.assert_allclose(statistics.percentile(values, value), expected, rtol=1e-12)
+    if np.ptp(values) > 0.0:
+        np.testing.assert_allclose(statistics._ranks(values), stats.zscore(stats.rankdata(values)), atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 
 from ptsmc_jax.figures.campaign_plots import AT_TIMES, BEYOND
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.studies import campaign_summary
+from tuning.studies import campaign_figures, campaign_summary
 
 # a run that keeps the limit, two that leave it for a tenth and for half of the time, one without an end
 FRAME = pl.DataFrame({
@@ -26,13 +26,13 @@ FRAME = pl.DataFrame({
 ])  # fmt: skip
 def test_a_limit_that_may_be_left_at_times_is_told_apart(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
-    assert campaign_summary._outcomes(FRAME, [asked]).tolist() == outcomes
+    assert campaign_figures._outcomes(FRAME, [asked]).tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")
     for both in ([asked, torque], [torque, asked]):  # what a trial breaks is said whatever else it leaves
-        assert campaign_summary._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
+        assert campaign_figures._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
     values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
     verdict = asked.verdict(values, np.array([True, True, True, False]), within)
-    assert campaign_summary._of_time(verdict) == said
+    assert campaign_figures._of_time(verdict) == said
 
 
 def test_the_share_of_the_time_of_all_runs_is_their_mean_and_a_run_without_one_keeps_the_limit_at_no_time():
@@ -68,12 +68,12 @@ def test_a_failed_trial_has_no_share_of_time():
 def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch):
     """As of one shard alone: its rows are not those of the first trials."""
     frame = pl.DataFrame({"trial": [100, 101, 250], "window_error": [1.0, None, 3.0]})
-    monkeypatch.setattr(campaign_summary.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
-    monkeypatch.setattr(campaign_summary.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
+    monkeypatch.setattr(campaign_figures.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
+    monkeypatch.setattr(campaign_figures.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
     tables = SimpleNamespace(controller=SimpleNamespace(t_f=1.0), plant=SimpleNamespace(kind="spacecraft"))
     folder: Any = SimpleNamespace(flights=None, scenario=tables)
-    assert campaign_summary._fan(folder, frame, np.array([True, False, True])) == {"fan": ([100, 250], 250)}
-    assert campaign_summary._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes
+    assert campaign_figures._fan(folder, frame, np.array([True, False, True])) == {"fan": ([100, 250], 250)}
+    assert campaign_figures._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes
 
 
 def test_the_worst_by_samples_that_ended_well_have_the_fewest():

@@ -185,7 +185,7 @@ def _flown(
     if width is None:
         campaign_folder.fly(folder, share, report, elsewhere)
     else:
-        from tuning.studies import campaign_summary  # takes a second to import, which flying need not wait for
+        from tuning.studies import campaign_summary  # whose imports flying need not wait for
 
         stopped = campaign_summary.until_confident(
             folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)

@@ -19,11 +19,13 @@ from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
 from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario import Study, own, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import OURS, Software
 from tuning.search import own_parts
 
@@ -103,6 +105,12 @@ class Folder:
                 f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
             )
         return list(self.made.metrics_names)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of its metrics and of what was drawn, as far as they are known, by column."""
+        drawn = {} if self.ready is None else quantities.units(self.ready.parts)
+        return catalogues.units(self.scenario.plant.kind) | drawn
 
     @cached_property
     def rows(self) -> Rows:

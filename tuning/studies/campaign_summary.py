@@ -1,27 +1,22 @@
 """What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
 from ptsmc_jax.campaigns import plans, rows, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.dispersions.quantities import CATEGORIES
-from ptsmc_jax.figures import campaign_plots as plots
-from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.catalogues import percent
-from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict, must_keep
+from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder
 from tuning.studies.campaign_theory import floor_of, margins_of, unjudged
@@ -31,8 +26,6 @@ CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
 SHOWN = 0.9973  # share of the runs that a pointing budget holds for: three sigma of a normal number
 SEARCHED = 100_000  # trials by which it is judged what drives a metric
-DRAWN = 1000  # trials whose histories are drawn
-POINTS = 5000  # trials in a figure of points
 
 
 def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
@@ -152,13 +145,6 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
 
 
-def units(folder: Folder) -> dict[str, str]:
-    """Units of a campaign's metrics and of what was drawn, as far as they are known, by column."""
-    return catalogues.units(folder.scenario.plant.kind) | (
-        {} if folder.ready is None else quantities.units(folder.ready.parts)
-    )
-
-
 def _alike(quantiles: dict[str, Any], trials: int) -> list[str]:
     """Whether every trial is the same flight, to round-off."""
     known = [metric for metric in quantiles.values() if "max" in metric]
@@ -234,7 +220,10 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
     def fill(making: Path) -> None:
         store.write_json(making / store.SUMMARY, summary)
         if figures:
-            style.save(figures_of(folder, summary), making / "figures")
+            from ptsmc_jax.figures import style  # takes half a second, which no other reader of rows need wait for
+            from tuning.studies import campaign_figures
+
+            style.save(campaign_figures.of(folder, summary), making / "figures")
 
     store.write(folder.path, fill)
 
@@ -291,88 +280,3 @@ def _off(a: Any, b: Any) -> float:
         return 0.0 if a == b else abs(a - b) / max(abs(a), abs(b))
     missing = [v is None or v != v for v in (a, b)]
     return 0.0 if a == b or all(missing) else np.inf
-
-
-def figures_of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
-    """Figures of a campaign by name."""
-    parts, kind = folder.whole_parts(), folder.scenario.plant.kind
-    wanted = scenario.requirements(folder.scenario)
-    limits = {r.metric: r.limit for r in wanted}
-    names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
-    timed = [r.timed for r in wanted if r.timed is not None]
-    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
-    finished = flying.finished(frame)
-    of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
-    unit_of = units(folder)
-
-    def column(name: str, values: np.ndarray) -> plots.Column:
-        return plots.Column(unit_of.get(name, ""), values, limits.get(name), of_time.get(name, ""))
-
-    figures: dict[str, Figure] = {}
-    if finished.any():
-        if folder.flies:  # its histories are not kept, but flown for it
-            figures |= _fan(folder, frame, finished)
-        figures["distributions"] = plots.distributions(
-            {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
-        )
-    outcome = _outcomes(frame, wanted)
-    totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
-    fine = np.isin(outcome, ("ok", plots.AT_TIMES))
-    bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
-    some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
-    angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
-    if np.isfinite(torque).any():
-        figures["torque_by_angle"] = plots.torque_by_angle(
-            angle, torque, outcome[some], totals, limits.get("peak_torque"), kind
-        )
-    drivers = summary["drivers"].get("window_error", {})
-    strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
-    if strongest:
-        inputs = rows.read(parts, strongest)[some]
-        figures["inputs"] = plots.inputs(
-            {name: column(name, inputs[name].to_numpy()) for name in strongest},
-            {name: column(name, frame[name].to_numpy()[some].astype(float)) for name in names[:4]},
-            outcome[some],
-            totals,
-        )
-    return figures
-
-
-def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
-    """How each trial ended, by its name in `plots.MARKS`, (trials,).
-
-    A limit that is asked for in a share of the time is broken by a trial where each must keep it for that long; where
-    the share is of the time of all runs, no single one breaks it.
-    """
-    outcome = frame["status"].to_numpy().astype(object)
-    ok = outcome == "ok"
-    for one in wanted:
-        beyond = ok & ~(frame[one.metric].to_numpy() <= one.limit)
-        breaks = beyond if one.timed is None else np.zeros_like(ok)
-        if one.timed is not None and one.interpretation == "temporal":
-            breaks = ok & ~(frame[one.timed].to_numpy() >= one.quantile)
-        outcome[beyond & (outcome == "ok")] = plots.AT_TIMES
-        outcome[breaks] = plots.BEYOND
-    return outcome
-
-
-def _of_time(verdict: Verdict) -> str:
-    """What a requirement on a share of the time asks for and what is seen of it; empty: it is on trials."""
-    if verdict.share_of_time is None or verdict.quantile is None:
-        return ""
-    asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
-    least = "at least " if verdict.interpretation == "temporal" else ""
-    return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
-
-
-def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
-    """Errors over time of the first trials, and of that with the largest window error, flown again.
-
-    No figure where there is nothing that a log axis shows: no such trial ends, or none has an error.
-    """
-    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
-    shown = trials[:DRAWN]
-    hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-    t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
-    flown, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
-    return {"fan": plots.fan(t, ended, worst, flown.controller.t_f, flown.plant.kind)} if ended.any() else {}

@@ -21,7 +21,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     Beside each stands how the metric goes with it over all trials that end, see `statistics.drivers`; None where so few
     trials do not show it.
     """
-    parts, unit_of = folder.whole_parts(), campaign_summary.units(folder)
+    parts, unit_of = folder.whole_parts(), folder.units
     drawn = campaign_summary.drawn_columns(folder, parts)
     frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
     inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}

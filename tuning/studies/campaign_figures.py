@@ -1,0 +1,104 @@
+"""Figures of a campaign, from its rows."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import rows
+from ptsmc_jax.figures import campaign_plots as plots
+from ptsmc_jax.simulation.catalogues import percent
+from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
+from tuning.studies.campaign_folder import Folder
+
+DRAWN = 1000  # trials whose histories are drawn
+POINTS = 5000  # trials in a figure of points
+
+
+def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
+    """Figures of a campaign by name."""
+    parts, kind = folder.whole_parts(), folder.scenario.plant.kind
+    wanted = scenario.requirements(folder.scenario)
+    limits = {r.metric: r.limit for r in wanted}
+    names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
+    timed = [r.timed for r in wanted if r.timed is not None]
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
+    finished = flying.finished(frame)
+    of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
+    units = folder.units
+
+    def column(name: str, values: np.ndarray) -> plots.Column:
+        return plots.Column(units.get(name, ""), values, limits.get(name), of_time.get(name, ""))
+
+    figures: dict[str, Figure] = {}
+    if finished.any():
+        if folder.flies:  # its histories are not kept, but flown for it
+            figures |= _fan(folder, frame, finished)
+        figures["distributions"] = plots.distributions(
+            {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
+        )
+    outcome = _outcomes(frame, wanted)
+    totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
+    fine = np.isin(outcome, ("ok", plots.AT_TIMES))
+    bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
+    some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
+    angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
+    if np.isfinite(torque).any():
+        figures["torque_by_angle"] = plots.torque_by_angle(
+            angle, torque, outcome[some], totals, limits.get("peak_torque"), kind
+        )
+    drivers = summary["drivers"].get("window_error", {})
+    strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
+    if strongest:
+        inputs = rows.read(parts, strongest)[some]
+        figures["inputs"] = plots.inputs(
+            {name: column(name, inputs[name].to_numpy()) for name in strongest},
+            {name: column(name, frame[name].to_numpy()[some].astype(float)) for name in names[:4]},
+            outcome[some],
+            totals,
+        )
+    return figures
+
+
+def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
+    """How each trial ended, by its name in `plots.MARKS`, (trials,).
+
+    A limit that is asked for in a share of the time is broken by a trial where each must keep it for that long; where
+    the share is of the time of all runs, no single one breaks it.
+    """
+    outcome = frame["status"].to_numpy().astype(object)
+    ok = outcome == "ok"
+    for one in wanted:
+        beyond = ok & ~(frame[one.metric].to_numpy() <= one.limit)
+        breaks = beyond if one.timed is None else np.zeros_like(ok)
+        if one.timed is not None and one.interpretation == "temporal":
+            breaks = ok & ~(frame[one.timed].to_numpy() >= one.quantile)
+        outcome[beyond & (outcome == "ok")] = plots.AT_TIMES
+        outcome[breaks] = plots.BEYOND
+    return outcome
+
+
+def _of_time(verdict: Verdict) -> str:
+    """What a requirement on a share of the time asks for and what is seen of it; empty: it is on trials."""
+    if verdict.share_of_time is None or verdict.quantile is None:
+        return ""
+    asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
+    least = "at least " if verdict.interpretation == "temporal" else ""
+    return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
+
+
+def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
+    """Errors over time of the first trials, and of that with the largest window error, flown again.
+
+    No figure where there is nothing that a log axis shows: no such trial ends, or none has an error.
+    """
+    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
+    shown = trials[:DRAWN]
+    hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+    t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
+    flown, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
+    return {"fan": plots.fan(t, ended, worst, flown.controller.t_f, flown.plant.kind)} if ended.any() else {}
