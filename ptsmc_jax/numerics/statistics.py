@@ -10,6 +10,7 @@ from scipy import special  # `scipy.stats` takes half a second to import
 STEEPEST = 60.0  # tilt of a mean towards its largest values or its smallest, at which nothing else is left
 SOBOL_BINS = 32  # of an input, with equally many trials each
 SAME_INPUT = 0.9999  # rank correlation above which two inputs count as one
+ROUNDING = 1e-12  # of the largest value: by how much values may differ that are one number
 
 
 def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
@@ -135,11 +136,11 @@ def drivers(
         every input has one value.
     """
     ranked = {} if ranked is None else ranked
-    if metric.size < 4 * SOBOL_BINS or np.ptp(metric) == 0.0:
+    if metric.size < 4 * SOBOL_BINS or not vary(metric):
         return {}
     metric_ranks, effects = _ranks(metric), {}
     for name, values in inputs.items():
-        if np.ptp(values) == 0.0:
+        if not vary(values):
             continue
         if name in categories:
             bins = [metric_ranks[values == one] for one in np.unique(values)]
@@ -184,6 +185,15 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
     rank = (np.cumsum(counts) - (counts - 1) / 2)[which]  # of equal ones the mean of theirs
     return (rank - rank.mean()) / rank.std()
+
+
+def vary(values: np.ndarray) -> bool:
+    """Whether values (trials,) differ by more than their rounding, as angles do not that are drawn from 100 to 100 deg.
+
+    >>> vary(np.array([1.7453292519943295, 1.7453292519943298])), vary(np.array([1.7453, 1.7454]))
+    (False, True)
+    """
+    return bool(np.ptp(values) > ROUNDING * np.max(np.abs(values)))
 
 
 def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:

@@ -100,3 +100,15 @@ def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):
     assert said.startswith("no effort in trial 3: ")
     named = [part.split()[0] for part in said.split(": ")[1].split(", ")]
     assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "own_1"]
+
+
+def test_an_angle_that_is_drawn_from_one_point_is_no_reason():
+    """From 100 to 100 deg: what it differs by from trial to trial is the rounding of its quaternion."""
+    random = np.random.default_rng(3)
+    angle = np.deg2rad(100.0) + 2.2e-16 * random.integers(-2, 3, 401)
+    rate = random.normal(size=401)
+    driven = statistics.drivers({"initial_angle": angle, "initial_w1": rate}, rate**3)
+    assert list(driven) == ["initial_w1"]
+    assert statistics.drivers({"initial_w1": rate}, angle) == {}
+    assert not statistics.vary(angle)
+    assert statistics.vary(1e-9 * rate)

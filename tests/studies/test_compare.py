@@ -311,6 +311,10 @@ def test_a_contender_is_summed_up_over_what_it_flew(eight):
     assert found["largest_peak_torque"] == 3.0
     assert found["unsettled"] == 4
     assert found["settling_time"] == {"0.01": 1.0, "0.5": 4.0, "0.99": None}  # half of all, not of those that settled
+    assert found["settling_by_angle"] is not None
+    alike = np.full(8, 2.0) + 4.4e-16 * np.arange(8)  # of one angle, drawn from 115 to 115 deg
+    alike = compare.figures_of(contender(replace(trials, drawn={**trials.drawn, "initial_angle": alike})))
+    assert alike["settling_by_angle"] is alike["settling_near_far"] is None
     missed = contender(changed(eight, [ok] * 7 + [rollout.MISSED]))
     assert all(v.met for v in missed.verdicts)
     assert not missed.met

@@ -14,7 +14,7 @@ from scipy import stats
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.numerics.statistics import value_at
+from ptsmc_jax.numerics.statistics import value_at, vary
 from ptsmc_jax.scenario import cautions, errors, free_gains, own, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_record import common_keys
@@ -266,7 +266,7 @@ def figures_of(contender: Contender) -> dict[str, Any]:
     settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
     times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
-    spread = times.size > 2 and np.ptp(angle[settled]) > 0.0 and np.ptp(times) > 0.0
+    spread = times.size > 2 and vary(angle[settled]) and vary(times)
     mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {

@@ -25,7 +25,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     drawn = campaign_summary.drawn_columns(folder, parts)
     frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
     inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
-    varied = {name: values for name, values in inputs.items() if np.ptp(values) > 0.0}
+    varied = {name: values for name, values in inputs.items() if statistics.vary(values)}
     distinct = statistics.distinct({name: values for name, values in varied.items() if name not in CATEGORIES})
     names = [name for name in varied if name in distinct or name in CATEGORIES]
     failed = ~flying.finished(frame)
