@@ -68,26 +68,33 @@ def scenarios() -> str:
     """Reference of scenario files, for each kind of plant what it does not share with those before."""
     parts = ["# Scenario files", MADE, SCENARIOS]
     seen: dict[type[Table], str] = {}
+    whole: dict[tuple, str] = {}  # a table with all its kinds, the default first
     for plant, title in PLANTS.items():
         parts += [f"## {title}"]
         for name, table in layouts.TABLES[plant].items():
             kinds = table if isinstance(table, Mapping) else {"": table}
             parts += [f"### [{name}]"]
-            if all(struct in seen for struct in kinds.values()):
-                parts += [f"As for {seen[next(iter(kinds.values()))]}."]
+            if tuple(kinds.items()) in whole:
+                parts += [f"As for {whole[tuple(kinds.items())]}."]
                 continue
+            whole[tuple(kinds.items())] = lower = title[0].lower() + title[1:]
+            first = next(iter(kinds))
             for kind, struct in kinds.items():
                 if struct in seen:
                     continue
-                default = " (default)" if kind == next(iter(kinds)) else ""
+                default = " (default)" if kind == first else ""
                 said = f'`kind = "{kind}"`{default}: ' if kind else ""
                 said = f'`kind = "{plant}"`: ' if name == "plant" else said
                 parts += [said + keys.about(struct), *_keys(name, struct, plant)]
-            known = [(f'`"{kind}"`', seen[struct]) for kind, struct in kinds.items() if struct in seen]
-            if known:
-                named = ", ".join(kind for kind, _ in known)
-                parts += [f"As for {known[0][1]}, in the plant's own units: `kind =` {named}."]
-            seen = dict.fromkeys(kinds.values(), title[0].lower() + title[1:]) | seen
+            known: dict[str, list[str]] = {}
+            for kind, struct in kinds.items():
+                if struct in seen:
+                    known.setdefault(seen[struct], []).append(f'`"{kind}"`' + " (default)" * (kind == first))
+            parts += [
+                f"As for {other}, in the plant's own units: `kind =` {', '.join(named)}."
+                for other, named in known.items()
+            ]
+            seen = dict.fromkeys(kinds.values(), lower) | seen
         if plant == "spacecraft":
             parts += ["### [requirements]", REQUIREMENTS, *_keys("requirements", Limit, plant)]
         else:

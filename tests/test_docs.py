@@ -58,6 +58,25 @@ def test_references_are_what_the_code_says(name):
     assert (DOCS / name).read_text(encoding="utf-8") == MADE[name](), "run `python docs/generate.py`"
 
 
+def test_which_kind_is_the_default_is_said_for_each_plant():
+    """A system's disturbance is none where a spacecraft's is a sinusoid: neither has all that the other has."""
+    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    for plant, title in TITLES.items():
+        part = page.split(f"## {title}\n")[1].split("\n## ")[0]
+        for name, kinds in layouts.TABLES[plant].items():
+            if not isinstance(kinds, Mapping):
+                continue
+            said = part.split(f"### [{name}]\n")[1].split("\n### ")[0].strip()
+            others = [
+                other for other, name_of in TITLES.items() if said == f"As for {name_of[0].lower()}{name_of[1:]}."
+            ]
+            for other in others:
+                theirs = layouts.TABLES[other][name]
+                assert isinstance(theirs, Mapping), (plant, name)
+                assert list(kinds.items()) == list(theirs.items()), (plant, name)
+            assert others or re.search(rf'"{next(iter(kinds))}"` \(default\)', said), (plant, name)
+
+
 def test_the_references_name_everything():
     scenarios, metric_list = MADE["scenarios.md"](), MADE["metrics.md"]()
     for plant, tables in layouts.TABLES.items():

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Kinds, Table
 
 
 class Key(NamedTuple):
@@ -54,6 +54,13 @@ def of(struct: type[Table]) -> list[Key]:
 def about(struct: type[Table]) -> str:
     """What a table, or a kind of it, is: its docstring without the keys."""
     return " ".join(inspect.cleandoc(_docstring(struct)).split("\n\nAttributes:")[0].split())
+
+
+def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
+    """Which kind a table is of, and of which others a key is that it has not; empty where it is of none."""
+    others = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
+    own = next((kind for kind, other in kinds.items() if other is struct), None)
+    return f' of {name}.kind = "{own}", but of {", ".join(others)}' if others else ""
 
 
 def allowed(kind: Any) -> str:

@@ -233,7 +233,7 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: b
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
         return _sum(name, raw, kinds, run)
-    return _own(name, raw, struct, run) if issubclass(struct, own.Own) else _fields(name, raw, struct)
+    return _own(name, raw, struct, run) if issubclass(struct, own.Own) else _fields(name, raw, struct, kinds)
 
 
 def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
@@ -337,19 +337,19 @@ def _fits(value: Any, kind: Any) -> bool:
     return True
 
 
-def _fields(name: str, raw: Mapping[str, Any], struct: type[Table]) -> Table:
+def _fields(name: str, raw: Mapping[str, Any], struct: type[Table], kinds: Kinds | None = None) -> Table:
     hints = typing.get_type_hints(struct, include_extras=True)
     for key in raw:
-        _check_known(name, key, struct)
+        _check_known(name, key, struct, kinds)
     said = {key: _in_words(f"{name}.{key}", value, struct, hints[key]) for key, value in raw.items()}
     return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in said.items()})
 
 
-def _check_known(name: str, key: str, struct: type[Table]) -> None:
-    """Raise ScenarioError where the table of this name has no such key."""
-    known = struct.__struct_fields__
-    if key not in known:
-        raise ScenarioError(f"{name}.{key} is not a known key; {nearest(key, known, f'{name}.{{}}')}")
+def _check_known(name: str, key: str, struct: type[Table], kinds: Kinds | None = None) -> None:
+    """Raise ScenarioError where the table of this name, of one of these kinds, has no such key."""
+    if key not in (known := struct.__struct_fields__):
+        of_others = keys.kinds_with(name, key, struct, kinds or {})
+        raise ScenarioError(f"{name}.{key} is not a known key{of_others}; {nearest(key, known, f'{name}.{{}}')}")
 
 
 def _key(key: str, value: Any, kind: Any) -> Any:

@@ -60,6 +60,21 @@ BAD = [
         '"sinusoid" or "none" or "constant" or "gravity_gradient"',
     ),
     ("disturbance = { kind = 'none', bias = [0, 0, 0] }", "disturbance.bias is not a known key", "disturbance.kind"),
+    (
+        "disturbance = { kind = 'none', bias = [0, 0, 0] }",
+        'bias is not a known key of disturbance.kind = "none", but of "sinusoid"; ',
+        "disturbance.kind",
+    ),
+    (
+        CHAIN + "observer.gain = [6.0]",  # whose default is none
+        'key of observer.kind = "none", but of "nonlinear", "finite_time", "prescribed_time"; ',
+        "known are",
+    ),
+    (
+        "wheels.axes = [[1, 0, 0]]",
+        'wheels.axes is not a known key of wheels.kind = "pyramid", but of "axes"; ',
+        "known",
+    ),
     ("disturbance.amplitude = [0.1, 0.1]", "disturbance.amplitude is [0.1, 0.1]", "three numbers"),
     ("disturbance.frequency = [1e9, 0, 0]", "disturbance.frequency is [1000000000.0, 0", ""),
     # times
