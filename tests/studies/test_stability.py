@@ -157,3 +157,23 @@ def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(p
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
     assert np.isnan(course.at_sensors.delay).all()  # what comes late is a command
+
+
+def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
+    """There L is zero: margins have no limit, which is no merit of the gains."""
+    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
+              "controller": {"t_f": 3.0, "delta": 1.0, "sign_width": 0.1},
+              "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
+              "hardware": {"torque_limit": 0.02}}  # fmt: skip
+    ready, course = stability.find(scenario.from_tables(tables))
+    found = stability.summary(ready, course)
+    cut = [one for one in found["before"] if one["open"]]
+    assert cut
+    assert all((one["open"], one["gain_up"], one["delay"]) == (["u1"], None, None) for one in cut)
+    held, before = (line for line in margin_sentences.lines(found) if "limit of the actuators" in line)
+    assert "cuts the nominal run's command at input u1 in hold: the loop is open there" in held
+    assert "cuts the nominal run's command at input u1 before the hand-over, at " in before
+    free = scenario.from_tables(tables | {"hardware": {"torque_limit": 50.0}})
+    found = stability.summary(*stability.find(free))
+    assert not any(one["open"] for one in (found, *found["before"]))
+    assert not any("limit of the actuators" in line for line in margin_sentences.lines(found))

@@ -95,6 +95,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     t_f = float(ready.parts.controller.t_f)
     return {
         "stable": bool(hold.stable.all()),
+        "open": [name for name, cut in zip(inputs, _open(hold), strict=True) if cut],
         "worst": {name: _number(v) for name, v in course.worst().items()},
         "hold": table(hold, inputs, (*FIELDS, "crossover")),
         "together": {name: _number(course.together[name]) for name in FIELDS},
@@ -105,6 +106,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
                 "judged": bool(counts),
                 "stable": bool(before.stable[k].all()),
                 **{name: _number((max if name == "modulus" else min)(getattr(before, name)[k])) for name in FIELDS},
+                "open": [name for name, cut in zip(inputs, _open(before)[k], strict=True) if cut],
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
@@ -112,6 +114,12 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }
+
+
+def _open(left: margins.Margins) -> np.ndarray:
+    """Where nothing comes back (.., m), bool, as where a limit cuts the command of the nominal run: L = 0."""
+    unlimited = np.isposinf(left.gain_up) & np.isposinf(left.gain_down)
+    return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
 
 
 def _start(ready: Study) -> float:
