@@ -15,6 +15,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
 from ptsmc_jax.theory import margins, rest, run_margins
+from ptsmc_jax.theory.crossings import MOST
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.rest import Swing
 from ptsmc_jax.theory.run_margins import Course
@@ -72,7 +73,7 @@ def _swing(scenario: Scenario, swing: Swing) -> dict[str, Any]:
 
 
 def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0: a peak of -0 dB is one of 0
 
 
 def names(ready: Study) -> tuple[list[str], list[str]]:
@@ -118,7 +119,8 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
 
 def _open(left: margins.Margins) -> np.ndarray:
     """Where nothing comes back (.., m), bool, as where a limit cuts the command of the nominal run: L = 0."""
-    unlimited = np.isposinf(left.gain_up) & np.isposinf(left.gain_down)
+    # infinite, or, where other axes make the loop unstable, as far from a border as is told
+    unlimited = (np.abs(left.gain_up) >= MOST) & (np.abs(left.gain_down) >= MOST)
     return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
 
 
