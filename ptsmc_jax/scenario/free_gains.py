@@ -170,3 +170,9 @@ def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """The default bounds of a free gain, before they reach out to the scenario's own."""
     tune = scenario.search
     return scenario.gains[name].usual(Choice(scenario, tune.gains, tune.bounds))
+
+
+def by_default(scenario: Scenario, name: str) -> tuple[float, float]:
+    """The bounds of a free gain where none are given: the usual ones, reaching out to the scenario's own."""
+    tune = scenario.search
+    return _default(Choice(scenario, tune.gains, tune.bounds), name)

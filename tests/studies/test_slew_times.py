@@ -171,3 +171,7 @@ def test_the_usual_bounds_of_delta_lie_below_the_shortest_time():
     given = scenario.from_tables({**tables, "tune": {"bounds": {"delta": [0.05, 4.1]}}})
     with pytest.raises(ScenarioError, match=r"tune\.bounds\.delta is \[0\.05, 4\.1\]"):
         slew_times.check(given, (4.0, 8.0))
+    # and so do those that a hand-over of the scenario's own takes farther out
+    reaching = scenario.from_tables({**tables, "controller": {"t_f": 8.0, "delta": 6.0}, "tune": {}})
+    assert reaching.search.bounds["delta"] == (0.05, 7.0)
+    slew_times.check(reaching, (6.5, 8.0))

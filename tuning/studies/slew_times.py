@@ -87,7 +87,7 @@ def _at(scenario: Scenario, t_f: float) -> Scenario:
     """The scenario with another prescribed time [s], below which the usual bounds of delta lie anew."""
     tune = scenario.search
     own_bounds = {name: both for name, both in tune.bounds.items() if name != "delta"}
-    if tune.bounds.get("delta") not in (None, free_gains.usual(scenario, "delta")):
+    if tune.bounds.get("delta") not in (None, free_gains.by_default(scenario, "delta")):
         own_bounds["delta"] = tune.bounds["delta"]
     at = gains.in_scenario(scenarios.replace(scenario, tune=None), {"t_f": t_f})
     return scenarios.replace(at, tune={**parsing.plain(tune), "bounds": own_bounds})
