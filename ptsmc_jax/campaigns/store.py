@@ -22,8 +22,12 @@ from ptsmc_jax.scenario import parsing
 JOURNAL = "journal.bin"  # of a run that is not finished
 SUMMARY = "summary.json"  # of one that is
 MAKING = ".making-"  # how the name of a file begins that is being written
-MADE_OF_RESULTS = ("figures/*.png", "report.html", "worst.csv", "why.csv")  # they would pass for those of the next one
-FIGURE = b"Creator\0ptsmc"  # by which a figure of theirs is known from a user's own, see `style.save`
+MADE_OF_RESULTS = {  # they would pass for those of the next one; by what is near its beginning each is known as ours
+    "figures/*.png": b"Creator\0ptsmc",  # see `style.save`
+    "report.html": b'<meta name="generator" content="ptsmc">',
+    "worst.csv": b"trial,status,reason,bad_time,",
+    "why.csv": b"metric,trial,value,input,drawn,",
+}
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
@@ -91,18 +95,18 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
 def forget(folder: Path) -> None:
     """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's.
 
-    Of figures only those that came from here, and nothing where no result is.
+    Only what came from here, and nothing where no result is.
     """
     if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
         return
-    made = (path for pattern in MADE_OF_RESULTS for path in folder.glob(pattern) if _ours(path))
+    made = (path for name, mark in MADE_OF_RESULTS.items() for path in folder.glob(name) if _has(path, mark))
     for path in (folder / SUMMARY, *made, *_of_laws(folder)):
         path.unlink(missing_ok=True)
 
 
-def _ours(made: Path) -> bool:
-    """Whether it came from here, as far as its name leaves that open."""
-    return made.suffix != ".png" or FIGURE in made.read_bytes()[:1024]
+def _has(path: Path, mark: bytes) -> bool:
+    """Whether it is a file with this near its beginning."""
+    return path.is_file() and mark in path.read_bytes()[:1024]
 
 
 def _of_laws(folder: Path) -> list[Path]:

@@ -55,15 +55,18 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
         def fill(folder):
             (folder / "figures").mkdir()
             for name in names:
-                (folder / name).write_bytes(store.FIGURE + summary.encode())
+                (folder / name).write_bytes(store.MADE_OF_RESULTS["figures/*.png"] + summary.encode())
             (folder / "summary.json").write_text(summary)
 
         return fill
 
-    out, others = tmp_path / "out", ("mine.txt", "report.html", "figures/mine.csv", "figures/mine.png")
+    out, others = tmp_path / "out", ("mine.txt", "figures/mine.csv", "figures/mine.png")
+    made = [name for name in store.MADE_OF_RESULTS if "*" not in name]
     store.write(out, result("first", "tuned.toml", "figures/a.png", "figures/b.png"))
     for name in others:
         (out / name).write_text("kept")
+    for name in made:
+        (out / name).write_bytes(store.MADE_OF_RESULTS[name])
     before = tree(out)
     store.write(out, result("first", "tuned.toml"))  # the same one, without figures
     assert tree(out) == before
@@ -74,8 +77,12 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
         "summary.json",
     }  # fmt: skip
     assert (moved[0], moved[-1]) == ("versions.json", "summary.json")
+    for name in made:
+        (out / name).write_text("a user's own")
+    store.write(out, result("third"))
+    assert [(out / name).read_text() for name in made] == ["a user's own"] * 3
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "report.html").write_text("of no result")
+    (tmp_path / "mine" / "report.html").write_bytes(store.MADE_OF_RESULTS["report.html"])  # of no result
     store.write(tmp_path / "mine", result("third"))
     assert (tmp_path / "mine" / "report.html").exists()
 

@@ -61,7 +61,8 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
     ]  # fmt: skip
     figures = {path.name for path in (folder / "figures").iterdir()}
     assert figures == {"fan.png", "distributions.png", "torque_by_angle.png", "inputs.png"}
-    assert all(store.FIGURE in (folder / "figures" / name).read_bytes()[:1024] for name in figures)
+    mark = store.MADE_OF_RESULTS["figures/*.png"]
+    assert all(mark in (folder / "figures" / name).read_bytes()[:1024] for name in figures)
     read = checked(folder)
     assert "Every requirement is met 250 trials of seed 3: 250 ok" in read.text
     assert "ptsmc montecarlo scenario.toml --trials 250 --seed 3" in read.text

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import campaign
+from ptsmc_jax.campaigns import campaign, store
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import percent
 from tests.output.pages import checked
@@ -91,6 +91,8 @@ def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
 
     assert command("worst", FOLDER, "--by", "within_ape_boresight", "-n", 3, "--why")[0] == 0
     assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["within_ape_boresight"].to_list() == list(ordered[:3])
+    for name in ("worst.csv", "why.csv"):
+        assert (tmp_path / FOLDER / name).read_bytes().startswith(store.MADE_OF_RESULTS[name])
     why = pl.read_csv(tmp_path / FOLDER / "why.csv").filter(pl.col("metric") == "within_ape_boresight")
     assert set(why["trial"]) == set(np.argsort(within, kind="stable")[:3])
 

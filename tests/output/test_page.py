@@ -10,6 +10,7 @@ import tempfile
 import numpy as np
 import pytest
 
+from ptsmc_jax.campaigns import store
 from tests.helpers import short, tree
 from tests.output.pages import Page, checked
 from tuning.output import made_again, page, page_charts, search_sentences
@@ -54,6 +55,7 @@ def test_a_run_becomes_a_page(command, flown):
     assert {name: content for name, content in after.items() if name != "report.html"} == before
     read = checked(flown)
     assert after["report.html"].decode() == page.build(flown)
+    assert store.MADE_OF_RESULTS["report.html"] in after["report.html"][:1024]
     summary = json.loads((flown / "summary.json").read_text())
     for name in ("window_error", "peak_torque", "hold_error"):
         assert f"{summary[name]:.5g}" in read.text
