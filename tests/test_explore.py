@@ -62,6 +62,17 @@ def test_a_scenario_with_other_gains_is_written_and_read_again(flight, tmp_path)
     assert ptsmc_jax.read(tmp_path / "s.toml").controller.eta == 3.0
     with pytest.raises(ScenarioError, match=r"controller\.eta is 1\.5"):
         ptsmc_jax.in_scenario(flight.scenario, {"eta": 1.5})
+    searched = scenario.replace(flight.scenario, controller__t_f=20.0, loop__t_end=21.0, tune={})
+    with pytest.raises(
+        ScenarioError, match=r"^t_f is 0\.9, but must go with the rest .*: tune\.bounds\.delta is"
+    ) as short:
+        ptsmc_jax.in_scenario(searched, {"t_f": 0.9})
+    assert "\n" not in str(short.value)
+    for gains, said in (({"t_f": "9 s"}, "t_f is '9 s', but must be a number"), ({"eta": None}, "eta is None, but")):
+        with pytest.raises(ScenarioError, match=said):
+            ptsmc_jax.in_scenario(flight.scenario, gains)
+    with pytest.raises(TypeError, match=r"gains are needed by name, such as .*, but this is a float"):
+        ptsmc_jax.in_scenario(flight.scenario, 3.0)  # type: ignore[arg-type]
 
 
 def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(flight):

@@ -13,14 +13,19 @@ from ptsmc_jax.simulation.gains import AXIS, base, on_every_axis
 def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
     """The scenario with other gains, by the names that `gains_of` has, checked; with t_f goes the time after it.
 
-    All else stays, defaults too. Raises ScenarioError where the scenario must not have them.
+    All else stays, defaults too. Raises ScenarioError where the scenario must not have them, TypeError where they have
+    no names.
     """
     scenario = reading.of(scenario)
+    if not isinstance(gains, Mapping):
+        raise TypeError(f"gains are needed by name, such as {{'eta': 3.0}}, but this is a {type(gains).__name__}")
     axes = list(getattr(scenario.observer, "gain", ()))
     known = [*scenario.gains, *(f"{AXIS}{k + 1}" for k in range(len(axes)))]
     for name in gains:
         if name not in known:
             raise ScenarioError(f"{name} is no gain of this scenario; allowed is some of {', '.join(known)}")
+        if gains[name] is None or (name == "t_f" and not hasattr(gains[name], "__float__")):
+            raise ScenarioError(f"{name} is {gains[name]!r}, but must be a number")
     each = on_every_axis(gains, axes)
     gains = {base(name): value for name, value in gains.items()} | ({} if each is None else {"observer_gain": each})
     changes: dict[str, Any] = {}
@@ -33,4 +38,12 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
             changes |= {f"{outer}__{key}": value for key, value in values.items()}
     if "t_f" in gains:
         changes["loop__t_end"] = gains["t_f"] + (scenario.end - scenario.controller.t_f)
-    return reading.replace(reading.settled(scenario), **changes)
+    try:
+        return reading.replace(reading.settled(scenario), **changes)
+    except ScenarioError as error:
+        if "t_f" not in gains or str(error).startswith(("observer.", *(f"controller.{name} is" for name in gains))):
+            raise
+        raise ScenarioError(
+            f"t_f is {gains['t_f']}, but must go with the rest of the scenario, whose defaults stay (by replace they "
+            f"follow it): {error}"
+        ) from None
