@@ -223,9 +223,14 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
 
     Margins are those of its loop, see `margin_verdicts`; where loops differ, of those of this seed's trials.
 
-    Raises ValueError where there are no rows, or a column that is asked for is missing.
+    Raises ValueError where there are no rows, or a column that is asked for is missing; TypeError where they are no
+    polars table.
     """
     draws.check_whole_number("seed", seed)
+    if not isinstance(rows, pl.DataFrame):
+        raise TypeError(
+            f"rows are needed in a polars DataFrame, as trials returns them, but this is a {type(rows).__name__}"
+        )
     loaded = _read(what)
     asked = scenario.requirements(loaded)
     needed = ["status", *(name for r in asked for name in (r.metric, r.timed) if name is not None)]

@@ -15,7 +15,7 @@ from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
-from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.dispersions.variation import Dispersion, check_dispersion
 from ptsmc_jax.numerics.draws import check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
@@ -103,7 +103,11 @@ def one(
         coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
         own: metrics besides the usual ones, for which the run's history is recorded.
         software: the flight computer, where it is not the parts' own code.
+
+    Raises TypeError where there are no parts, or no dispersion.
     """
+    check_parts(parts)
+    check_dispersion(dispersion)
     about = planned.about(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = about.dispersion.coordinates(about.seed, about.trial)
@@ -163,13 +167,15 @@ def run(
             interpreted, slowly.
         software: see `one`.
 
-    Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts.
+    Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts, or no dispersion.
     """
     if software.on_processor and configure.backend() != "cpu":
         with jax.default_device(configure.processors()[0]):
             return run(parts, dispersion, seed, trials, block, own=own, kernel=kernel, software=software)
     check_parts(parts)
     check_whole_number("seed", seed)
+    check_dispersion(dispersion)
+    check_whole_number("block", 1 if block is None else block, 1)
     trials = trials if isinstance(trials, Row) else _numbers(trials)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
     count, devices = number.shape[0], len(configure.devices())

@@ -48,6 +48,13 @@ FIELDS = {
 }
 
 
+def check_dispersion(what: object) -> None:
+    """Raise TypeError, with one sentence, where something else is in the place of a dispersion."""
+    if not isinstance(what, Dispersion):
+        found = type(what).__name__
+        raise TypeError(f"a dispersion is needed, such as study(scenario).dispersion, but this is a {found}")
+
+
 @pytree
 @dataclass(frozen=True)
 class Dispersion:

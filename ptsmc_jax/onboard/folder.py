@@ -11,6 +11,7 @@ import numpy as np
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard import templates, vectors
 from ptsmc_jax.onboard.board import Board, board
 from ptsmc_jax.onboard.generate import Code, generate
@@ -155,9 +156,12 @@ def export(
     """Writes a scenario's flight computer as C99 into a folder, with vectors of so many trials that check it.
 
     name: of its files, by default the scenario's file. Raises ScenarioError where it cannot be written in C, or its
-    loop is continuous; RefusedError where the folder holds something and force is not said.
+    loop is continuous; RefusedError where the folder holds something and force is not said; ValueError where trials or
+    seed are no such numbers.
     """
     path = Path(folder)
+    draws.check_whole_number("trials", trials, 1)
+    draws.check_whole_number("seed", seed)
     store.check(path, force)
     known = what if isinstance(what, Scenario) else scenarios.read(what)
     source = "a scenario" if isinstance(what, Scenario) else Path(what).name

@@ -87,8 +87,11 @@ def study(
 
     drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
     Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
-    where the law meets its singularity on the way from the initial state to the reference.
+    where the law meets its singularity on the way from the initial state to the reference, TypeError where what is
+    given is no scenario, or no reach.
     """
+    if not isinstance(reach, timing.Reach | None):
+        raise TypeError(f"a reach is needed, as reach_of(scenario) returns it, but this is a {type(reach).__name__}")
     configure.warn_if_forgotten()
     scenario = reading.complete(reading.of(scenario))
     setup = build.setup(scenario)

@@ -50,13 +50,17 @@ class Reach:
 def reach_of(scenario: Scenario, **farther: float) -> Reach:
     """The reach of a scenario's own gains, none beyond them; farther: fields of `Reach` that are to be others.
 
-    Raises ValueError where there is no such field, or one of these is no finite number, or negative.
+    Raises ValueError where there is no such field, or one of these is no finite number, or negative; TypeError where
+    there is no scenario.
 
     >>> from ptsmc_jax.scenario import from_tables
     >>> reach = reach_of(from_tables({}), delta=2.0)
     >>> reach.t_f, reach.smallest_delta, reach.delta
     (30.0, 0.05, 2.0)
     """
+    if not isinstance(scenario, Scenario):
+        found = type(scenario).__name__
+        raise TypeError(f"a scenario is needed, as read or from_tables return it, but this is a {found}")
     names = [field.name for field in dataclasses.fields(Reach)]
     for name, value in farther.items():
         if name not in names:

@@ -13,6 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants import system
@@ -116,6 +117,30 @@ REFUSED = {
     "parts in a file": (lambda: API.write(RUN, "never.toml"), "a scenario is needed, as read or from_tables"),
     "parts for a scenario": (lambda: API.simulate(RUN), "a scenario is needed, as read or from_tables return it"),
     "tables for a scenario": (lambda: API.study({}), "a scenario is needed, as read or from_tables return it"),
+    "a reach of no scenario": (lambda: API.reach_of("file"), "a scenario is needed, as read .* but this is a str"),
+    "a number for a reach": (
+        lambda: API.study(FLIGHT, reach=2.0),
+        r"a reach is needed, as reach_of\(scenario\) returns it, but this is a float",
+    ),
+    "a trial of a scenario": (lambda: API.one(FLIGHT, None, 0, 1), "parts are needed, such as study"),
+    "a trial without a dispersion": (lambda: API.one(RUN, None, 0, 1), "a dispersion is needed, such as study"),
+    "trials of a study's": (
+        lambda: API.run(RUN, scenario.study(FLIGHT), 0, [1]),
+        "a dispersion is needed, such as study",
+    ),
+    "no trials a block": (
+        lambda: API.run(RUN, Dispersion(), 0, [1], block=0),
+        "block is 0, but must be a whole number from 1 to",
+    ),
+    "verdicts on no table": (lambda: API.verdicts(FLIGHT, {}), "rows are needed in a polars DataFrame"),
+    "vectors of no trial": (
+        lambda: API.export(FLIGHT, "never", trials=0),
+        "trials is 0, but must be a whole number from 1 to",
+    ),
+    "vectors of no seed": (
+        lambda: API.export(FLIGHT, "never", seed=-1),
+        "seed is -1, but must be a whole number from 0 to",
+    ),
     "many gains at once": (
         lambda: API.with_gains(RUN, {"eta": [3.0, 3.5, 4.0]}),
         r"eta must be a number, but has shape \(3,\)",
