@@ -72,6 +72,13 @@ class Library:
                 self._made.ptsmc_set()
             except (OSError, AttributeError) as error:  # of another processor, or of another language
                 reason = str(error).removeprefix(f"{made}: ")
+                missing = re.search(r"undefined symbol: (\w+)", reason)
+                if missing:
+                    raise ScenarioError(
+                        f"the controller in {self.folder} needs {missing[1]}, which is neither in ptsmc_{self.name}.c "
+                        f"nor in ptsmc_{self.name}_parameters.c, the files that are compiled; allowed is to #include "
+                        "there the one that has it"
+                    ) from None
                 raise ScenarioError(
                     f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it, which "
                     f"must be a C compiler for this machine: {reason}"

@@ -1,6 +1,7 @@
 """A controller's folder is compiled, or refused in one sentence."""
 
 import json
+import re
 import shutil
 
 import jax
@@ -62,6 +63,23 @@ def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(raw, tmp_path
     code.write_text('#include "other/board.h"\n' + code.read_text())
     with pytest.raises(ScenarioError, match=r"changed/ptsmc_flight\.c:1:.* error: .*other/board\.h"):
         Library(changed)
+
+
+@needs_compiler
+def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(raw, tmp_path):
+    """It was said that the compiler must be one for this machine."""
+    changed = shutil.copytree(raw, tmp_path / "changed")
+    code = changed / "ptsmc_flight.c"
+    (changed / "mine.c").write_text("double mine(double x) { return 2.0 * x; }\n")
+    call = r"\1\n    if (mine(p->period) < 0.0) return 1;"
+    calls = re.sub(r"^(int ptsmc_step\([^{]*\{)", call, code.read_text(), flags=re.MULTILINE)
+    code.write_text(f"double mine(double x);\n{calls}")
+    with pytest.raises(
+        ScenarioError, match=r"^the controller in .* needs mine, which is neither in ptsmc_flight\.c nor"
+    ):
+        Library(changed)
+    code.write_text(f'#include "mine.c"\n{calls}')
+    Library(changed)
 
 
 @needs_compiler
