@@ -61,7 +61,7 @@ def _worst_case(hardest: Summary, *, tuned_for: bool) -> str:
             f"the worst case of {hardest['metric']} inside the dispersions has no bound: over {moved} some trial "
             f"{reach}; ask for a share of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
-    far = "without a value" if hardest["ratio"] is None else f"{hardest['ratio']:.3f} times its limit"
+    far = "without a value" if hardest["ratio"] is None else f"{hardest['ratio']:.4g} times its limit"
     advice = "" if tuned_for or not hardest["beyond"] else "; tune.worst_case = true tunes for it"
     return f"in the worst case inside the dispersions, {hardest['metric']} is {far}{advice}"
 
