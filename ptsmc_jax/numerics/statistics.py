@@ -84,7 +84,7 @@ def percentile(values: np.ndarray, value: float) -> float:
     (100.0, 50.0)
     """
     below, equal = np.count_nonzero(values < value), np.count_nonzero(values == value)
-    return (below + (equal + 1) / 2 * (equal > 0)) / values.size * 100.0
+    return float((below + (equal + 1) / 2 * (equal > 0)) / values.size * 100.0)
 
 
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:
