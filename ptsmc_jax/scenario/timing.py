@@ -204,7 +204,7 @@ def _fastest_of_system(setup: Setup, visited: tuple) -> float:
 
 
 def _with_gain(observer: Any, gain: float) -> Any:
-    return dataclasses.replace(observer, gain=vector(np.full(observer.gain.shape, gain)))
+    return dataclasses.replace(observer, gain=vector(np.full(np.shape(observer.gain), gain)))
 
 
 def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
