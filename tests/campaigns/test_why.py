@@ -11,7 +11,7 @@ from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
 from tuning.output import campaign_sentences, campaign_terminal
-from tuning.studies import campaign_summary, reasons
+from tuning.studies import campaign_folder, campaign_summary, reasons
 
 
 class Rows:
@@ -22,6 +22,7 @@ class Rows:
     ready = scenarios.study(scenario)
     trials = 401
     path = "rows"
+    units = campaign_folder.Folder.units
 
     def whole_parts(self):
         return [self]
