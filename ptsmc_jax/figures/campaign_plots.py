@@ -161,7 +161,7 @@ def inputs(
             if column.limit is not None:
                 axes.axhline(column.limit, **LIMIT)
             if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
-                axes.set_yscale("log")
+                logarithmic(axes, "y")
         line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # longer than a row is high
     for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):
         axes.set_xlabel(x.label(name))

@@ -66,3 +66,15 @@ def test_the_legend_of_a_narrow_figure_stays_inside_it():
     figure.draw_without_rendering()
     (legend,) = figure.legends
     assert figure.bbox.x0 <= legend.get_window_extent().x0
+
+
+def test_a_metric_over_what_was_drawn_has_plain_numbers():
+    """As the other figures of a campaign, not 2 x 10^-1."""
+    x = np.geomspace(0.03, 0.9, 5)
+    column, outcome = campaign_plots.Column("N m", x), np.full(5, "ok", dtype=object)
+    totals = dict.fromkeys(campaign_plots.MARKS, 5)
+    figure = campaign_plots.inputs({"initial_w1": column}, {"peak_torque": column}, outcome, totals)
+    figure.draw_without_rendering()
+    labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels(which="both")]
+    assert {"0.05", "0.1", "0.2", "0.5"} <= set(labels)
+    assert not any("10^" in label for label in labels)
