@@ -106,7 +106,10 @@ def forget(folder: Path) -> None:
 
 def _has(path: Path, mark: bytes) -> bool:
     """Whether it is a file with this near its beginning."""
-    return path.is_file() and mark in path.read_bytes()[:1024]
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return mark in file.read(1024)
 
 
 def _of_laws(folder: Path) -> list[Path]:

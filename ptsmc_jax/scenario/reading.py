@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax.scenario import checks, free_gains, own, parsing
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.tables import Scenario, check_scenario
 
 USUAL_WINDOW = 1.0  # [s]
 
@@ -21,10 +21,7 @@ def of(what: object) -> Scenario:
     """What is a scenario, or the file of one; raises TypeError, with one sentence, where it is neither."""
     if isinstance(what, str | Path):
         return read(what)
-    if not isinstance(what, Scenario):
-        found = type(what).__name__
-        raise TypeError(f"a scenario is needed, as read or from_tables return it, or its file, but this is a {found}")
-    return what
+    return check_scenario(what, ", or its file")
 
 
 def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:

@@ -291,3 +291,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Two scenarios are equal where their values are, whether a file says them or not."""
         names = [name for name in self.__struct_fields__ if name != "defaulted"]
         return isinstance(other, Scenario) and all(getattr(self, name) == getattr(other, name) for name in names)
+
+
+def check_scenario(what: object, besides: str = "") -> Scenario:
+    """What is a scenario; raises TypeError, with one sentence, where it is none; besides: what else it may be."""
+    if not isinstance(what, Scenario):
+        found = type(what).__name__
+        raise TypeError(f"a scenario is needed, as read or from_tables return it{besides}, but this is a {found}")
+    return what

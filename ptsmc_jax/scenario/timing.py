@@ -18,7 +18,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import hand_over
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts, Setup
@@ -58,9 +58,7 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
     >>> reach.t_f, reach.smallest_delta, reach.delta
     (30.0, 0.05, 2.0)
     """
-    if not isinstance(scenario, Scenario):
-        found = type(scenario).__name__
-        raise TypeError(f"a scenario is needed, as read or from_tables return it, but this is a {found}")
+    check_scenario(scenario)
     names = [field.name for field in dataclasses.fields(Reach)]
     for name, value in farther.items():
         if name not in names:

@@ -58,22 +58,24 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
 
 def _cut(summary: Summary) -> Iterator[str]:
     """Where a limit of the actuators opens the loop, so that what is infinite is no margin."""
-    loops = [loop for loop in summary["before"] if loop.get("open")]  # none in results of before it was looked at
-    times = sorted(loop["time_to_go"] for loop in loops)
-    inputs = list(dict.fromkeys(name for loop in loops for name in loop["open"]))
-    for names, where in ((summary.get("open", []), "in hold"), (inputs, f"before the hand-over, at {_span(times)}")):
-        if names:
-            yield (
-                f"a limit of the actuators cuts the nominal run's command at input {', '.join(names)} {where}: the "
-                "loop is open there, and margins without a limit say nothing of it once the limit is left"
-            )
+    cut = {}  # inputs, by where; none in results of before it was looked at
+    if summary.get("open"):
+        cut["in hold"] = summary["open"]
+    loops = [loop for loop in summary["before"] if loop.get("open")]
+    if loops:
+        span = _span(sorted(loop["time_to_go"] for loop in loops))
+        cut[f"before the hand-over, at {span}"] = dict.fromkeys(name for loop in loops for name in loop["open"])
+    for where, names in cut.items():
+        yield (
+            f"a limit of the actuators cuts the nominal run's command at input {', '.join(names)} {where}: the "
+            "loop is open there, and margins without a limit say nothing of it once the limit is left"
+        )
 
 
 def _span(times: list[float]) -> str:
     """Times to go [s] in words; times: the shortest first."""
-    if len(times) < 2:
-        return "".join(f"{time:.3g} s to go" for time in times)
-    return f"{len(times)} times, {times[0]:.3g} to {times[-1]:.3g} s to go"
+    span = f"{times[0]:.3g}" if len(times) == 1 else f"{len(times)} times, {times[0]:.3g} to {times[-1]:.3g}"
+    return f"{span} s to go"
 
 
 def left(summary: Summary) -> str:

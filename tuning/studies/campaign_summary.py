@@ -1,4 +1,4 @@
-"""What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, figures, single trials."""
+"""What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, single trials."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
