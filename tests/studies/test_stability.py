@@ -4,6 +4,8 @@ import csv
 import dataclasses
 import json
 import tomllib
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -173,6 +175,9 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     held, before = (line for line in margin_sentences.lines(found) if "limit of the actuators" in line)
     assert "cuts the nominal run's command at input u1 in hold: the loop is open there" in held
     assert "cuts the nominal run's command at input u1 before the hand-over, at " in before
+    result: Any = SimpleNamespace(summary=found)
+    heading, _ = page._margins(result)
+    assert heading.headline.startswith("The loop in hold is open")
     free = scenario.from_tables(tables | {"hardware": {"torque_limit": 50.0}})
     found = stability.summary(*stability.find(free))
     assert not any(one["open"] for one in (found, *found["before"]))

@@ -306,7 +306,9 @@ def _map(result: Result) -> tuple[Heading, list[Section]]:
 def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     lines = list(margin_sentences.lines(summary, with_least=False))
-    if summary["stable"]:
+    if summary.get("open"):
+        heading = Heading("bad", "The loop in hold is open: a limit of the actuators cuts the command", lines)
+    elif summary["stable"]:
         heading = Heading("calm", f"The loop is stable: {margin_sentences.left(summary)}", lines)
     else:
         heading = Heading("bad", "The loop in hold is NOT stable", lines)
