@@ -199,23 +199,9 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
 
-    def off(at: Array) -> Array:  # ln(-L), w and the delay in periods
-        z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
-        late = linear.late_axis(loop, z, at[1], axis)
-        L = crossings.response(late, crossings.in_triangles(late, of_a), z[None])[0][0]
-        value = -crossings.one_axis(z**-loop.delay * L, axis)
-        return jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
-
-    def step(x: Array) -> Array:
-        (a, b), (c, d) = jax.lax.stop_gradient(jax.jacfwd(off)(x))
-        far = off(x)
-        by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
-        most = jnp.stack([0.2 * jnp.ones_like(a), 0.5 + 0.1 * jnp.abs(x[1])])
-        return jnp.clip(by, -most, most)
-
     def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         steps, starts, x, _ = state
-        by = step(x)
+        by = _delay_step(loop, of_a, axis, x)
         x = x - by
         settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # the last step, below, is of its square
         found = settled & (x[1] > 0.0)
@@ -228,7 +214,29 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     first = (zero, zero, jnp.where(known, start, 1.0), ~known)
     *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), newton, jax.lax.stop_gradient(first))
     root = jax.lax.stop_gradient(jnp.where(found, root, 1.0))
-    return jnp.where(found & known, (root - step(root))[1] * loop.period, sizes[j])
+    return jnp.where(found & known, (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, sizes[j])
+
+
+@jax.jit
+def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) -> Array:
+    """Newton's step from x, ln w and a delay in periods, to where -L of an axis that is late by it is 1.
+
+    of_a: A of the loop closed at its sensors in a triangle.
+    """
+
+    def off(at: Array) -> tuple[Array, Array]:  # ln(-L), twice
+        z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
+        late = linear.late_axis(loop, z, at[1], axis)
+        L = crossings.response(late, crossings.in_triangles(late, of_a), z[None])[0][0]
+        value = -crossings.one_axis(z**-loop.delay * L, axis)
+        far = jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
+        return far, far
+
+    slopes, far = jax.jacfwd(off, has_aux=True)(x)
+    (a, b), (c, d) = jax.lax.stop_gradient(slopes)
+    by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
+    most = jnp.stack([0.2 * jnp.ones_like(a), 0.5 + 0.1 * jnp.abs(x[1])])
+    return jnp.clip(by, -most, most)
 
 
 def together(loop: Loop) -> dict[str, float]:

@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins, run_margins
-from tests.helpers import FIRST_FLIGHT, ROOT, equations, short
+from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, equations, short, untuned
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
 from tuning.studies import posing
@@ -106,15 +106,18 @@ def test_loops_differ_where_what_they_hang_on_is_drawn(dispersion, differ):
     assert margin_verdicts.differ(scenario.study(made).dispersion) == differ
 
 
+TRIALS = 6  # whose loops are looked at: of two at a time on each device, in calls of which the second is not full
+
+
 @programs.jit
 def drawn_parts(parts, dispersion, seed, trials):
     return jax.vmap(lambda trial: dispersion.apply(parts, seed, trial))(trials)
 
 
-def all_of(parts, dispersion, seed, count):
-    """Each margin of each of the first trials' loops, (count, times): by the program of a single run, one by one."""
-    drawn = drawn_parts(parts, dispersion, jnp.uint32(seed), jnp.arange(12, dtype=jnp.uint32))
-    each = [run_margins.judged_jit(jax.tree.map(lambda v, k=k: v[k], drawn))[0].each() for k in range(count)]
+def all_of(parts, dispersion, seed):
+    """Each margin of each of the first trials' loops, (TRIALS, times): by the program of a single run, one by one."""
+    drawn = drawn_parts(parts, dispersion, jnp.uint32(seed), jnp.arange(TRIALS, dtype=jnp.uint32))
+    each = [run_margins.judged_jit(jax.tree.map(lambda v, k=k: v[k], drawn))[0].each() for k in range(TRIALS)]
     return {name: np.stack([farthest(name, one[name], 1) for one in each]) for name in each[0]}
 
 
@@ -134,7 +137,7 @@ def farthest(name, values, axis):
 
 @pytest.fixture(scope="module")
 def drawn():
-    """A problem whose inertias and starts are drawn, none of them nominal, of four loops the two hardest rows.
+    """A problem whose inertias and starts are drawn, none of them nominal, of six loops the two hardest rows.
 
     A loop hangs on where on its way it is linearised, and so on its start.
     """
@@ -145,7 +148,8 @@ def drawn():
     tables = {**BODY, "dispersion": {"inertia": inertia, "attitude": attitude}}
     tables["requirements"] = {**BODY["requirements"], "peak_torque": 5.0}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(margin_verdicts, "TRIALS", 4)
+        patch.setattr(margin_verdicts, "TRIALS", TRIALS)
+        patch.setattr(margin_verdicts, "CALL", 2)
         patch.setattr(margin_verdicts, "JUDGED", 4)
         patch.setattr(margin_rows, "CASES", 2)
         yield posing.pose(scenario.from_tables(tables), 3)
@@ -210,18 +214,18 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_jud
     share = posed.evaluate.bounds.share(posed.own)[None]
     c = posed.evaluate.fly(posed.problem, share).c[0]
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
-    assert [v.trials for v in verdicts] == [4, 4]
-    # its two hardest cases hold the worst of the four
+    assert [v.trials for v in verdicts] == [TRIALS, TRIALS]
+    # its two hardest cases hold the worst of all
     for row, verdict in zip(c[1:], verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
-    each = worst_of(all_of(posed.ready.parts, posed.ready.dispersion, 3, 4))
-    assert len(np.unique(each["gain_margin"])) == 4
+    each = worst_of(all_of(posed.ready.parts, posed.ready.dispersion, 3))
+    assert len(np.unique(each["gain_margin"])) == TRIALS
     # with other gains others are the hardest, and they take the places
     asked = posed.problem.margins
     assert asked is not None
     other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
-    each = worst_of(all_of(parts, asked.dispersion, 3, 4))
+    each = worst_of(all_of(parts, asked.dispersion, 3))
     harder, near = margin_rows.hardest(asked, other)
     bounds = posed.evaluate.bounds
     row = sloped(harder, bounds, bounds.share(other))["c"]
@@ -282,12 +286,12 @@ FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # 
 @pytest.mark.parametrize("changes", short(FACTORS, FACTORS[2:]))
 def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, changes, monkeypatch):
     """As by judging all of them; the nominal loop is not the worst. Lines are off by less than half of `OFF`."""
-    posed, count = drawn, 12
+    posed = drawn
     gains = dict(zip(posed.problem.names, posed.own * np.asarray(changes), strict=True))
     parts, dispersion = with_gains(posed.problem.parts, gains), posed.ready.dispersion
-    every = all_of(parts, dispersion, 3, count)
-    _, looked = margin_verdicts._look(*margin_verdicts._looked_at(parts, dispersion, 3, np.arange(count), late=True))
-    rough = {name: np.asarray(v)[:count] for name, v in looked.items()}
+    every = all_of(parts, dispersion, 3)
+    _, looked = margin_verdicts._look(*margin_verdicts._looked_at(parts, dispersion, 3, np.arange(TRIALS), late=True))
+    rough = {name: np.asarray(v)[:TRIALS] for name, v in looked.items()}
     period = BODY["loop"]["period"]
     for name, off in margin_verdicts.OFF.items():
         some = np.isfinite(every[name])
@@ -310,7 +314,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, cha
         monkeypatch.setattr(margin_verdicts, "OFF", known)
         for names in (list(limits), ["phase_margin", "delay_margin"], ["phase_margin"]):
             asked = {name: limits[name] for name in names}
-            found = margin_verdicts.worst(parts, dispersion, 3, np.arange(count), asked, places=2)
+            found = margin_verdicts.worst(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
             near = [np.max([margin_verdicts.nearness(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
             first = [np.argsort(-v, kind="stable")[:2] for v in near]
             np.testing.assert_array_equal(first[0], first[1])
@@ -357,8 +361,7 @@ def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatc
 @pytest.mark.parametrize("left", [None, '{"window_error": 1e-6, "marg', '{"window_error": 1e-6}'])
 def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_path, left):
     """A kill may come between the last trial and them; and a file may be damaged."""
-    tables = {**BODY, "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
-    del tables["tune"]
+    tables = {**untuned(SHORT_CHAIN), "dispersion": {}, "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
     store.write_toml(tmp_path / "s.toml", tables)
     again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"
     assert command(*again, "--quiet") == (0, "", "")
