@@ -133,12 +133,18 @@ def _acted(
 
     pushed: a torque on the plant besides, (m,).
     """
-    prompt, x, acting = replace(parts.effective_actuators, delay=0), carry.x, carry.acting
-    for command, t, length in commands:
+    prompt = replace(parts.effective_actuators, delay=0)
+
+    def span(state: tuple[Any, ActuatorState], arrived: tuple) -> tuple[tuple[Any, ActuatorState], None]:
+        (x, acting), (command, t, length) = state, arrived
         drive, _ = prompt.command(acting, command, w, t, length, period.now.noise_weight)
         x = PeriodMotion(parts, t, x, drive, pushed).after(length)
-        acting = prompt.end(acting, drive, None, length)
-    return x, acting
+        return (x, prompt.end(acting, drive, None, length)), None
+
+    if len(commands) == 1:
+        return span((carry.x, carry.acting), commands[0])[0]
+    in_turn = jax.tree.map(lambda *v: jnp.stack(v), *commands)  # a loop: the motion is traced and compiled once
+    return jax.lax.scan(span, (carry.x, carry.acting), in_turn)[0]
 
 
 class Opened(NamedTuple):
@@ -172,7 +178,10 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
 
     def pushed(part: Scalar) -> tuple[Array, Array, Array]:
         def ended(old: Array, new: Array, d: Array) -> Array:
-            commands = [(arriving + old, now.t, part * dt), (arriving + new, now.t + part * dt, (1.0 - part) * dt)]
+            commands = [(arriving + new, now.t, dt)]
+            if late:
+                from_then_on = (arriving + new, now.t + part * dt, (1.0 - part) * dt)
+                commands = [(arriving + old, now.t, part * dt), from_then_on]
             x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
             return there.local_coordinates(after._replace(x=x, acting=acting))
 
