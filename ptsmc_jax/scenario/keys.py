@@ -8,6 +8,7 @@ import sys
 import textwrap
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -61,6 +62,25 @@ def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
     others = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
     own = next((kind for kind, other in kinds.items() if other is struct), None)
     return f' of {name}.kind = "{own}", but of {", ".join(others)}' if others else ""
+
+
+def homes(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
+    """The tables of a scenario in which each key stands, in order, but for "kind"."""
+    found: dict[str, list[str]] = {}
+    for name, table in layout.items():
+        for struct in table.values() if isinstance(table, Mapping) else [table]:
+            for key in struct.__struct_fields__:
+                if key != "kind" and name not in found.setdefault(key, []):
+                    found[key].append(name)
+    return found
+
+
+def elsewhere(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) -> str:
+    """Where a key stands that the table of this name has not, as in "loop.period is"; empty: nowhere, or there too."""
+    known = homes(layout).get(key, [])
+    if name in known or not known:
+        return ""
+    return f"{', '.join(f'{home}.{key}' for home in known)} {'are' if known[1:] else 'is'}"
 
 
 def allowed(kind: Any) -> str:

@@ -136,11 +136,9 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
 
 def _place(key: str, layout: Mapping[str, Any]) -> str:
     """Where a key that stands outside a table may belong."""
-    homes = {field: name for name, table in layout.items()
-             for struct in (table.values() if isinstance(table, Mapping) else [table])
-             for field in struct.__struct_fields__ if field != "kind"}  # fmt: skip
+    homes = keys.homes(layout)
     closest = difflib.get_close_matches(key, homes, n=1, cutoff=0.0)[0]
-    return f"the nearest known key is {homes[closest]}.{closest}"
+    return f"the nearest known key is {homes[closest][-1]}.{closest}"
 
 
 def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -349,7 +347,8 @@ def _check_known(name: str, key: str, struct: type[Table], kinds: Kinds | None =
     """Raise ScenarioError where the table of this name, of one of these kinds, has no such key."""
     if key not in (known := struct.__struct_fields__):
         of_others = keys.kinds_with(name, key, struct, kinds or {})
-        raise ScenarioError(f"{name}.{key} is not a known key{of_others}; {nearest(key, known, f'{name}.{{}}')}")
+        hint = keys.elsewhere(name, key, TABLES["spacecraft"]) or nearest(key, known, f"{name}.{{}}")
+        raise ScenarioError(f"{name}.{key} is not a known key{of_others}; {hint}")
 
 
 def _key(key: str, value: Any, kind: Any) -> Any:

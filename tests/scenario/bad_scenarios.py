@@ -193,6 +193,8 @@ BAD = [
     (CHAIN + "[spacecraft]", "[spacecraft] goes with plant.kind", 'is "chain"'),
     (CHAIN + "initial.rate = [0, 0, 0]", "[initial] goes with plant.kind", 'is "chain"'),
     ("plant.order = 3", "plant.order is not a known key", "plant.kind"),
+    ("plant.inertia = [1, 2, 3]", "plant.inertia is not a known key", "; spacecraft.inertia, dispersion.inertia are"),
+    ("controller.period = 0.1", "controller.period is not a known key", "; loop.period is"),
     (CHAIN + "disturbance.amplitude = [1, 1, 1]", "disturbance.amplitude is [1.0, 1.0, 1.0]", "a list of 1 number"),
     (
         CHAIN + "observer = { kind = 'nonlinear', gain = [1, 1, 1] }",
