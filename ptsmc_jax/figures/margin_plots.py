@@ -69,6 +69,9 @@ def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
             worst = float(getattr(hold, name).min())
             if np.isfinite(worst):
                 axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"in hold: {worst:.3g}")
+        limited = any(np.isfinite(getattr(margins, name)).any() for margins in (before, hold) for name in names)
+        if not limited:
+            axes.text(0.5, 0.5, "without a limit", transform=axes.transAxes, ha="center", va="center")
         lost = left[~before.stable[:, 0]]
         if lost.size:
             axes.plot(lost, np.zeros_like(lost), "x", color="0.3", label="frozen loop unstable")

@@ -24,6 +24,15 @@ def test_the_time_to_go_is_in_plain_numbers():
     assert not [label for label in labels if "$" in label]
 
 
+def test_a_panel_says_that_there_is_no_limit():
+    """As of the gain and the delay of a loop that a limit cuts: the panel was empty."""
+    few, free = np.array([10.0, 5.0]), {name: np.full((2, 3), np.inf) for name in ("gain_up", "gain_down")}
+    figure = margin_plots.over_time(few, margins(2)._replace(**free), margins(1)._replace(**free))
+    assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [["without a limit"], [], []]
+    one = margins(1)._replace(gain_up=np.array([[np.inf, 6.0, np.inf]]))
+    assert not margin_plots.over_time(few, margins(2)._replace(**free), one).axes[0].texts
+
+
 def test_a_loop_that_answers_nothing_is_drawn_without_a_warning():
     """As of a command that a limit cuts: L is zero about an axis, whose size has no decibels."""
     w = np.geomspace(1e-3, 1.0, 50)
