@@ -175,6 +175,7 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     held, before = (line for line in margin_sentences.lines(found) if "limit of the actuators" in line)
     assert "cuts the nominal run's command at input u1 in hold: the loop is open there" in held
     assert "cuts the nominal run's command at input u1 before the hand-over, at " in before
+    assert not any("stable" in line or "worst margins" in line for line in margin_sentences.lines(found))
     result: Any = SimpleNamespace(summary=found)
     heading, _ = page._margins(result)
     assert heading.headline.startswith("The loop in hold is open")

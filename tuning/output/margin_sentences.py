@@ -35,8 +35,10 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
     """
     if "swing" in summary:
         yield _swings(summary["swing"])
-    else:
-        yield "the loop in hold is stable" if summary["stable"] else "the loop in hold is NOT stable"
+    elif not summary["stable"]:
+        yield "the loop in hold is NOT stable"
+    elif not summary.get("open"):  # which is said below
+        yield "the loop in hold is stable"
     if "start_deg" in summary:
         yield (
             f"these margins are of the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
@@ -50,7 +52,7 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
         if times:
             yield f"before the hand-over the loop with its gains frozen is unstable at {_span(times)}{caveat}"
     yield from _cut(summary)
-    if summary["stable"] and with_least:
+    if summary["stable"] and with_least and not summary.get("open"):
         yield f"the worst margins in hold, and before the hand-over where judged: {left(summary)}"
     if summary["said"]:
         yield summary["said"]
