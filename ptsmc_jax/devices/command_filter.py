@@ -18,8 +18,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 class FilterState(NamedTuple):
     """Integrators of a second-order filter between samples, advanced by half of the next period."""
 
-    first: Array  # (m,) [N m]
-    second: Array  # (m,) [N m]
+    first: Array  # (m,) of the band [N m]
+    second: Array  # (m,) of the low pass [N m]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ A stage calls the very code that the rollout flies, of `devices`, `observers` an
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from ptsmc_jax.batching.dependence import dependence
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.attitude_filter import Estimate
+from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.observers.base import Observer
@@ -101,7 +103,7 @@ def shapes(tree: Any) -> Any:
 def board(parts: Parts) -> Board:
     """The flight computer of parts whose loop is sampled."""
     observer, law, device = parts.observer, parts.controller, parts.actuators
-    parameters = known(parts)
+    parameters, inputs = known(parts), observer.model.inputs
     computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
     if parameters["filter"] is not None:
         _filter_parameters(computer, parts.sensors, parts.period)
@@ -114,10 +116,10 @@ def board(parts: Parts) -> Board:
     else:
         _filtering(computer, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
     _observing(computer, observer, device)
-    _commanding(computer, law, observer)
-    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), _begin))
+    _commanding(computer, law, observer, parts.command_filter)
+    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), partial(_begin, m=inputs)))
     if device is not None:
-        _acting(computer, device, observer.model.inputs)
+        _acting(computer, device, inputs)
     return computer
 
 
@@ -132,6 +134,7 @@ def known(parts: Parts) -> dict[str, Any]:
         "bound": observer.error_bound(),
         "filter": getattr(sensors, "filter", None),
         "actuators": parts.actuators,
+        "command_filter": parts.command_filter,
         "period": period,
     }
     if parameters["filter"] is not None:  # what its gains follow from
@@ -282,8 +285,8 @@ def _observing(computer: Board, observer: Observer, device: Actuators | None) ->
     computer.stages.append(Stage("observe", about, reads, observe, (observer,)))
 
 
-def _commanding(computer: Board, law: Law, observer: Observer) -> None:
-    """The law, before and after its hand-over."""
+def _commanding(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
+    """The law, before and after its hand-over, and the filter of its command."""
     m, memory = observer.model.inputs, law.begin()
     x = computer.state_of(tuple(computer.state[name] for name in computer.seen))
     target = jax.eval_shape(computer.parameters["reference"], real())
@@ -294,44 +297,66 @@ def _commanding(computer: Board, law: Law, observer: Observer) -> None:
 
     computer.state["law"] = shapes(memory)
     computer.outputs |= {"command": real(m), "s": jax.eval_shape(once, law, x, target)}
+    filtered = "" if command_filter is None else " behind the filter of its command"
     computer.about |= {
         "law": "memory of the law",
-        "command": f"what the law asks for{computer.unit}",
+        "command": f"what the law asks for{filtered}{computer.unit}",
         "s": "sliding variable",
     }
+    memories, shaped = ("before.law",), ()
+    if command_filter is not None:
+        computer.state["command_filter"] = shapes(command_filter.begin(m))
+        computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
+        memories, shaped = ("before.law", "before.command_filter", "dt"), (command_filter,)
     singular = any(_depends(law.clearance, x, target))
     if singular:
         computer.state |= {"clearance": real(), "clearance_unit": real()}
         computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
                        "clearance_unit": "what that is counted in"}  # fmt: skip
 
-    def command(parameters: Any, t: Any, tracking: Any, d_hat: Any, last_memory: Any, *read: Any) -> dict[str, Any]:
-        known, period = parameters["law"], parameters["period"]
+    def command(parameters: Any, t: Any, tracking: Any, d_hat: Any, *read: Any) -> dict[str, Any]:
+        known, period, filtering = parameters["law"], parameters["period"], parameters["command_filter"]
+        remembered, read = read[: len(memories)], read[len(memories) :]
         now, reference = computer.state_of(read[: len(computer.seen)]), parameters["reference"](t)
         hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
 
         def decided() -> Any:
-            return known.command(last_memory, Sample(t, hold, period), now, reference, d_hat, parameters["bound"](t))
+            u, s, after = known.command(
+                remembered[0], Sample(t, hold, period), now, reference, d_hat, parameters["bound"](t)
+            )
+            if filtering is None:
+                return u, s, (after,)
+            _, integrators, dt = remembered
+            before = jnp.where(dt > 0.0, period, 0.0)  # a whole period, also where samples were missed
+            u, integrators = filtering.step(integrators, u, before, period)
+            return u, s, (after, integrators)
+
+        def kept(after: tuple) -> dict[str, Any]:
+            return dict(zip(("now.law", "now.command_filter"), after, strict=False))
 
         if not singular:
             u, s, after = decided()
-            return {"out.command": u, "out.s": s, "now.law": after}
+            return {"out.command": u, "out.s": s, **kept(after)}
         last_unit, last_u, last_s = read[len(computer.seen) :]
         distance = known.clearance(now, reference)
         unit = jnp.where(tracking != 0, last_unit, known.clearance_unit(distance))
         clearance = distance / unit
-        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: (last_u, last_s, last_memory))
-        return {"out.command": u, "out.s": s, "now.law": after, "now.clearance": clearance, "now.clearance_unit": unit}
+        stays = (last_u, last_s, remembered[:2])
+        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: stays)
+        written = {"now.clearance": clearance, "now.clearance_unit": unit}
+        return {"out.command": u, "out.s": s, **kept(after), **written}
 
     states = tuple(f"now.{name}" for name in computer.seen)
     lasts = ("before.clearance_unit", "last.command", "last.s") if singular else ()
-    reads = ("t", "tracking", "out.d_hat", "before.law", *states, *lasts)
-    about = "The law: the input for the state as it is seen; the last one where the law is singular."
-    computer.stages.append(Stage("command", about, reads, command, (law,)))
+    reads = ("t", "tracking", "out.d_hat", *memories, *states, *lasts)
+    about = f"The law: the input for the state as it is seen{filtered}; the last one where the law is singular."
+    computer.stages.append(Stage("command", about, reads, command, (law, *shaped)))
 
 
-def _begin(parameters: Any) -> dict[str, Any]:
-    return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin()}
+def _begin(parameters: Any, m: int) -> dict[str, Any]:
+    filtering = parameters["command_filter"]
+    begun = {} if filtering is None else {"now.command_filter": filtering.begin(m)}
+    return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin(), **begun}
 
 
 def _depends(function: Callable, *args: Any) -> list[bool]:

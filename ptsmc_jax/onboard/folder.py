@@ -58,15 +58,10 @@ class Controller:
 def flown(scenario: Scenario) -> Scenario:
     """The scenario as a flight computer has it, on the flight clock.
 
-    Raises ScenarioError of a continuous loop, of a filter of the command, and of failures that it would be told of.
+    Raises ScenarioError of a continuous loop, and of failures that it would be told of.
     """
     if not scenario.sampled:
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
-    filtering = getattr(scenario.hardware, "command_filter", None)
-    if filtering is not None:
-        raise wrong(
-            "hardware.command_filter", parsing.plain(filtering), "absent to be exported: it is not written in C"
-        )
     failure = getattr(scenario.dispersion, "wheel_failure", None)
     if failure is not None and failure.known:
         raise wrong("dispersion.wheel_failure.known", True, "false to be exported: the C is not told of failures")

@@ -247,7 +247,8 @@ class InTheLoop:
         seen = self.board.state_of(tuple(memory[name] for name in self.board.seen))
         decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
                             parts.plant.velocity(seen), channels)  # fmt: skip
-        return decision, Computer((sensing, after, counts), seen, memory["observer"], memory["law"], computer.applied)
+        kept = memory["observer"], memory["law"], computer.applied, memory.get("command_filter")
+        return decision, Computer((sensing, after, counts), seen, *kept)
 
     def statuses(self, computer: Computer) -> dict[str, Any]:
         """How many samples of a run ended with each status."""

@@ -37,6 +37,7 @@ class Samples(NamedTuple):
     seen: Any  # state as the law sees it
     observer: Any  # memory
     law: Any  # memory
+    command_filter: Any  # memory
     queue: Array | None
     d_hat: Array
     command: Array
@@ -87,7 +88,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             before=before, estimate=getattr(computer.sensors, "estimate", None),
             gyro=getattr(computer.sensors, "rate", None),
             applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.observer,
-            law=computer.law, queue=queue, d_hat=d_hat, command=u, s=s,
+            law=computer.law, command_filter=computer.command_filter, queue=queue, d_hat=d_hat, command=u, s=s,
             error=law.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
@@ -148,6 +149,7 @@ def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.nda
     inputs = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
              "acting": samples.acting, "attitude_valid": samples.valid, "attitude_age": samples.age}  # fmt: skip
     state_by_name = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
+            "command_filter": samples.command_filter,
             "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
     if board.spacecraft:

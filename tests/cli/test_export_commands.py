@@ -131,8 +131,6 @@ def refused(command, tmp_path, *args):
     ("text", "args", "said"),
     [
         (CONTINUOUS, (), "loop.mode is \"continuous\", but must be"),
-        (SHORT + "[hardware.command_filter]\nkind = 'first_order'\ncorner = 2.0\n", (),
-         'hardware.command_filter is { corner = 2.0, kind = "first_order" }, but must be absent to be exported'),
         (SHORT + "[wheels]\n[dispersion.wheel_failure]\nkind = 'uniform'\nlatest = 3.0\nknown = true\n", (),
          "dispersion.wheel_failure.known is true, but must be false to be exported"),
         (SHORT, ("--trials", "0"), "--trials is 0, but must be a whole number from 1 to 100"),

@@ -33,7 +33,8 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "raw": flight(),
     "filter": flight(**FILTER),
     "wheels": flight(**FILTER, wheels={"torque_limit": 2.0, "momentum_limit": 2.0}, spacecraft={"inertia": FULL},
-                     dispersion=MISFITS, controller=BETWEEN),
+                     hardware={"command_filter": {"kind": "notch", "corner": 4.0}}, dispersion=MISFITS,
+                     controller=BETWEEN),
     "chain": CHAIN,
     "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
                              reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
@@ -53,6 +54,10 @@ FLIGHTS: dict[str, dict[str, Any]] = {
                                       controller={"delta": 1.0}),
     "lag and rate limit": flight(
         **FILTER, hardware={"torque_lag": 0.1, "torque_rate_limit": 20.0, "torque_limit": 4.0}),
+    "first-order roll-off of a chain": {
+        **CHAIN, "hardware": {"delay": 1, "command_filter": {"kind": "first_order", "corner": 9.0}}},
+    "second-order roll-off, lag": flight(
+        hardware={"torque_lag": 0.1, "command_filter": {"kind": "second_order", "corner": 6.0}}),
     "slow star tracker": flight(
         **FILTER, hardware={"star_tracker_every": 5, "rate_bias": 1e-5, "rate_bias_walk": 1e-7}),
     "star tracker out of step": flight(**FILTER, hardware={"star_tracker_period": 0.25, "rate_bias": 1e-5}),

@@ -181,9 +181,6 @@ def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
         folder.export(scenario.from_tables({}), tmp_path / "x")
     with pytest.raises(RefusedError, match="holds something already"):
         folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), exported)
-    filtering = {"loop": {"mode": "sampled"}, "hardware": {"command_filter": {"kind": "first_order", "corner": 2.0}}}
-    with pytest.raises(ScenarioError, match=r"^hardware.command_filter is .*, but must be absent to be exported"):
-        folder.export(scenario.from_tables(filtering), tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
 
