@@ -69,6 +69,13 @@ def as_system(run, reference):
 torque = jax.jit(lambda law, *at: law.torque(*at))
 
 
+@jax.jit
+def looked_at(model, t, x, u):
+    """Slope, acceleration without force, mass matrix and generalised force of a system."""
+    force = model.generalised_force(t, x, u)
+    return model.slope(t, x), model.coasting_acceleration(t, x), model.mass(t, x), force
+
+
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", short(range(4), [0]))
 def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derived_by_hand(seed, hold):
@@ -85,14 +92,12 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
     # by hand: dF/dx2 = T / 2, and what no acceleration makes of x_1'': -|w|^2 v / 4 - q_1f'' (58)
-    model: Any = own.plant
-    np.testing.assert_allclose(model.slope(t, state), 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
-    by_hand = -0.25 * jnp.dot(x.w, x.w) * x.q[:3] - SPIN(t).vector_rates()[1]
-    np.testing.assert_allclose(model.coasting_acceleration(t, state), by_hand, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(model.mass(t, state), FULL_INERTIA, rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(
-        model.generalised_force(t, state, u), run.plant.generalised_force(t, x, u), rtol=0, atol=1e-13
-    )
+    slope, coasting, mass, force = looked_at(own.plant, t, state, u)
+    np.testing.assert_allclose(slope, 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
+    by_hand = -0.25 * (x.w @ x.w) * x.q[:3] - jax.jit(lambda t: SPIN(t).vector_rates()[1])(t)
+    np.testing.assert_allclose(coasting, by_hand, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mass, FULL_INERTIA, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(force, run.plant.generalised_force(t, x, u), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("period", short([None, 0.05], [0.05]))
@@ -341,36 +346,35 @@ def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
         study(one(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)
 
 
+# inputs in different units, and a disturbance that acts on one of two
+HALF = second_order.system(
+    2,
+    lambda t, a, b: b,
+    lambda t, a, b: 0 * a,
+    lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]]),
+    lambda t, a, b: jnp.diag(jnp.array([1.0, 0])),
+)
+BOTH = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5))
+
+
 @pytest.mark.parametrize(
     ("system", "x0", "mode", "singular"),
     [
-        (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(2) * (a[0] - 0.5)),
-         [1.0, 0.2, 0.0, 0.0], "sampled", True),
+        pytest.param(BOTH, [1.0, 0.2, 0.0, 0.0], "sampled", True, marks=pytest.mark.long),
         (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], "continuous", True),
-        # the same plant, its first input in another unit
-        (second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a,
-                             lambda t, a, b: jnp.array([[1e-4, 1.0], [0, 1]])),
-         [1.0, 0.2, 0.0, 0.0], "continuous", False),
+        (HALF, [1.0, 0.2, 0.0, 0.0], "continuous", False),
     ],
-)  # fmt: skip
+)
 def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, mode, singular):
     run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
-    assert (fly(run).status == rollout.SINGULAR) == singular
+    assert fly(run).status == (rollout.SINGULAR if singular else rollout.OK)
 
 
 def test_a_singular_matrix_at_the_start_is_refused_by_name():
     with pytest.raises(ScenarioError, match=r"^plant\.system has a singular dF/dx2 G at t = 0 in plant\.x0"):
         study(one(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
-    half = second_order.system(
-        2,
-        lambda t, a, b: b,
-        lambda t, a, b: 0 * a,
-        lambda t, a, b: jnp.eye(2),
-        lambda t, a, b: jnp.diag(jnp.array([1.0, 0])),
-    )
     with pytest.raises(ScenarioError, match=r'singular D .*observer\.kind = "nonlinear" must invert; .*"none"$'):
-        study(half, [1.0, 0.0, 0.0, 0.0], observer={"kind": "nonlinear"})
-    assert fly(study(half, [1.0, 0.0, 0.0, 0.0]).parts).status == rollout.OK
+        study(HALF, [1.0, 0.0, 0.0, 0.0], observer={"kind": "nonlinear"})
 
 
 @pytest.mark.parametrize(
@@ -384,9 +388,11 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
     ],
 )
 def test_what_is_not_finite_at_the_start_is_refused_by_name(changes, said):
-    """Of the system, and of a truth, whose hidden state may be it too."""
     with pytest.raises(ScenarioError, match=f"^{re.escape(f'plant.system has {said} at t = 0 in plant.x0; allowed')}"):
         study(one(**changes), [1.0, 0.0])
+
+
+def test_a_hidden_state_of_a_truth_that_is_not_finite_at_the_start_is_refused():
     late = {"H": lambda t, a, b, z: 0 * a, "Z": lambda t, a, b, z, u: u / b, "z0": [0.0]}
     truth = second_order.system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **late)
     tables = {"kind": "system", "system": one(), "truth": truth, "x0": [1.0, 0.0]}
