@@ -54,17 +54,19 @@ def _expansion() -> Slip:
     def x(time: Any) -> Any:
         return 2.0 - 0.7 * time + 0.3 * time**2 - 0.1 * time**3
 
-    worst = 0.0
-    for n in (2, 3, 4, 5):
-        derivative, x_derivative = (lambda time: x(time) / (t_f - time) ** eta), x
-        states = [x(t)]
-        for _ in range(n - 1):
+    @jax.jit
+    def off(t: Any) -> Any:
+        derivative, x_derivative, states, found = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
+        tau = t_f - t
+        for n in (2, 3, 4, 5):
             derivative, x_derivative = jax.grad(derivative), jax.grad(x_derivative)
             states.append(x_derivative(t))
-        c = closed_forms.expansion(jnp.asarray(eta), n)
-        tau = t_f - t
-        s = sum(c[i] * tau**i * states[i] for i in range(n))
-        worst = max(worst, abs(float(derivative(t) * tau ** (eta + n - 1) / s - 1.0)))
+            c = closed_forms.expansion(jnp.asarray(eta), n)
+            s = sum(c[i] * tau**i * states[i] for i in range(n))
+            found.append(derivative(t) * tau ** (eta + n - 1) / s - 1.0)
+        return jnp.abs(jnp.stack(found))
+
+    worst = float(off(t).max())
     return Slip(
         "(37), (38), (40)",
         'c_i is an "expansion parameter", sums of (38) and (40) end at n-1',
