@@ -41,6 +41,11 @@ SMALLER = {
         '"out/tune-first_flight"': '__import__("pathlib").Path("out")',
     },
     "04_monte_carlo": {"trials=20_000": "trials=200"},
+    "05_your_own_plant": {
+        '(("as the law knows it", pendulum), ("a tenth heavier", heavier))': '[("a tenth heavier", heavier)]',
+        '    "built in": {"kind": "scaling", "t_f": t_f, "delta": delta},\n': "",
+        "(peak(3.0001) - peak(2.9999)) / 2e-4": "slope",
+    },
 }
 
 

@@ -65,36 +65,6 @@ def test_what_has_none_goes_as_ever():
     assert [e.primitive.name for e in equations(traces[0])] == [e.primitive.name for e in equations(traces[1])]
 
 
-def test_a_plant_with_eigenvalues_is_looked_at_one_period_at_a_time():
-    """Its integration steps, its loop in many periods and that of many trials."""
-
-    def softened(t, x_1, x_2):
-        values, axes = jnp.linalg.eigh(jnp.eye(2) + 0.1 * jnp.outer(x_1, x_1))
-        return axes @ ((axes.T @ -x_1) / values)
-
-    plant = system(2, lambda t, x_1, x_2: x_2, softened, lambda t, x_1, x_2: jnp.eye(2))
-    tables = {
-        "plant": {"kind": "system", "system": plant, "x0": [1.0, 0.5, 0.0, 0.0]},
-        "controller": {"t_f": 3.0, "delta": 0.5, "eta": 3.0},
-        "observer": {"kind": "nonlinear", "gain": [2.0, 2.0]},
-        "loop": {"mode": "sampled", "period": 0.1, "t_end": 4.0},
-        "dispersion": {"x0": {"kind": "uniform", "half_width": [0.1, 0.1, 0.0, 0.0]}},
-    }
-    studied = scenario.study(scenario.from_tables(tables))
-    ready, dispersion = studied.parts, studied.dispersion
-    run = linear.nominal_jit(ready)
-    some = jax.tree.map(lambda v: jnp.asarray(v)[:4], run)
-    trials = jnp.arange(margin_verdicts.CALL, dtype=jnp.uint32)
-    visited = jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4))
-    traces = {
-        "loops": linear._opened.trace(ready, some, None, late=True),
-        "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(ready, run, k))(jnp.arange(4)),
-        "loops of trials": margin_verdicts._look.trace(ready, dispersion, jnp.uint32(0), trials, 1, True),
-        "steps": timing._rates_of_system.trace(ready, visited),
-    }
-    assert not any(handed(trace.jaxpr)[1] for trace in traces.values())
-
-
 def softened(v):
     """A vector as it is, by eigenvalues."""
     values, axes = jnp.linalg.eigh(jnp.diag(jnp.arange(1.0, v.size + 1.0)) + 0.1 * jnp.outer(v, v))
@@ -136,32 +106,51 @@ def shared(monkeypatch):
     return several
 
 
-TIMES = {"t_f": 3.0, "delta": 0.5}
-LOOP = {"mode": "sampled", "period": 0.1, "t_end": 4.0}
+OWN = {
+    "disturbance": {"kind": "own", "code": Pushed},
+    "controller": {"t_f": 3.0, "delta": 0.5},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 4.0},
+}
 
 
-def test_what_is_seen_before_and_after_a_flight_is_looked_at_one_matrix_at_a_time(shared):
-    """Bounds of a disturbance, states on the way, a law's start, where a loop is at rest, C's vectors, peaks by theory.
+def looked_at_before_and_after(parts, dispersion):
+    """Where a loop is at rest, C's vectors, peaks by theory."""
+    trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.nominal, parts)
+    run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
+    rest._unexplained.trace(parts, run)
+    vectors.fly_many.trace(parts, dispersion, seed, trials)
+    design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
 
-    Of a system and of a spacecraft, whose parts have eigenvalues in them.
-    """
-    plant = system(2, moved, lambda t, x_1, x_2: -x_1, lambda t, x_1, x_2: jnp.eye(2))
-    own = {"disturbance": {"kind": "own", "code": Pushed}, "controller": TIMES, "loop": LOOP}
+
+def test_what_is_seen_of_a_system_is_looked_at_one_matrix_at_a_time(shared):
+    """Bounds of its disturbance, states on its way, its law's start; its steps, its loop in many periods and trials."""
+    plant = system(2, moved, lambda t, x_1, x_2: softened(-x_1), lambda t, x_1, x_2: jnp.eye(2))
     of_system = {
         "plant": {"kind": "system", "system": plant, "x0": [1.0, 0.5, 0.0, 0.0]},
+        "observer": {"kind": "nonlinear", "gain": [2.0, 2.0]},
         "dispersion": {"x0": {"kind": "uniform", "half_width": [0.1, 0.1, 0.0, 0.0]}},
     }
-    of_body = {"reference": {"kind": "own", "code": Held}}
-    trials, seed = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0)
-    for tables in (of_system, of_body):
-        studied = scenario.study(scenario.from_tables(own | tables))
-        parts, dispersion = studied.parts, studied.dispersion
-        run = jax.eval_shape(linear.nominal, parts)
-        if tables is of_system:
-            visited = jax.eval_shape(solutions.visited, parts)
-            timing._boundary_layer.trace(parts.controller, parts.observer, visited)
-        run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
-        rest._unexplained.trace(parts, run)
-        vectors.fly_many.trace(parts, dispersion, seed, trials)
-        design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
+    studied = scenario.study(scenario.from_tables(OWN | of_system))
+    parts, dispersion = studied.parts, studied.dispersion
+    visited = jax.eval_shape(solutions.visited, parts)
+    timing._boundary_layer.trace(parts.controller, parts.observer, visited)
+    looked_at_before_and_after(parts, dispersion)
+    run = jax.eval_shape(linear.nominal, parts)
+    some = jax.tree.map(lambda v: jnp.ones((4, *v.shape[1:]), v.dtype), run)
+    trials = jnp.arange(margin_verdicts.CALL, dtype=jnp.uint32)
+    of_periods = jax.tree.map(lambda v: jnp.ones(v.shape, v.dtype), run)
+    traces = {
+        "loops": linear._opened.trace(parts, some, None, late=True),
+        "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(parts, of_periods, k))(jnp.arange(4)),
+        "loops of trials": margin_verdicts._look.trace(parts, dispersion, jnp.uint32(0), trials, 1, True),
+        "steps": timing._rates_of_system.trace(parts, (jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4)))),
+    }
+    assert not any(handed(trace.jaxpr)[1] for trace in traces.values())
+    assert not shared
+
+
+def test_what_is_seen_of_a_spacecraft_is_looked_at_one_matrix_at_a_time(shared):
+    """Its disturbance and its reference have eigenvalues in them."""
+    studied = scenario.study(scenario.from_tables(OWN | {"reference": {"kind": "own", "code": Held}}))
+    looked_at_before_and_after(studied.parts, studied.dispersion)
     assert not shared
