@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.closed_forms import expansion
 from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem
@@ -180,9 +179,9 @@ def test_a_hand_over_a_period_before_t_f_turns_no_noise_of_position_into_a_rate(
             "hardware": {"state_noise": [noise, 1e-7]},
             "loop": {"mode": "sampled", "period": H, "t_end": 7.0},
         }
-        ready = scenario.study(scenario.from_tables(tables))
-        trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(256))
-        error[sampling] = np.sqrt(np.mean(trials.metrics.window_error**2))
+        parts = scenario.study(scenario.from_tables(tables)).parts
+        trials = jax.vmap(lambda trial, parts=parts: rollout.simulate(parts, 0, trial).metrics.window_error)
+        error[sampling] = np.sqrt(np.mean(jax.jit(trials)(np.arange(256, dtype=np.uint32)) ** 2))
     assert error["implicit"] < 0.4 * 3.0 / H * noise / 3.0 < error["explicit"]
 
 

@@ -15,7 +15,7 @@ from ptsmc_jax.plants import system
 from ptsmc_jax.scenario import own, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import linear, margins, run_margins, solutions
+from ptsmc_jax.theory import linear, margins, solutions
 from tuning.studies import stability
 
 FILE = """
@@ -88,7 +88,9 @@ def test_a_truth_with_a_state_that_nobody_sees():
     told = run.columns()
     np.testing.assert_array_equal(told["z1"], x[:, 2])
     assert [name for name in told if name[0] == "x"] == ["x1", "x2"]
-    loop = jax.tree.map(lambda v: np.asarray(v)[-1], run_margins.at(parts, jnp.ones(1)).loops)  # with z
+    course = linear.nominal_jit(parts)
+    last = np.flatnonzero(linear.is_full(jax.tree.map(np.asarray, course.period.now), PERIOD))[-1:]
+    loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, course, last))  # with z
     poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
     closed = block[:3, :3] + np.outer(block[:3, 3], [-2.0, -1.5, 0.0])
     slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
