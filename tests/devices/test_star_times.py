@@ -203,9 +203,15 @@ def test_in_an_outage_a_period_is_what_the_gyro_says_of_it(run):
     np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-15)
 
 
-def test_the_floor_lies_between_those_of_the_whole_ratios(run):
-    parts, _ = run
-    log = fly(parts, 3).log
+@pytest.fixture(scope="module")
+def anchored():
+    """Such parts on the anchored clock."""
+    tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
+    return scenario.study(scenario.from_tables(tables)).parts
+
+
+def test_the_floor_lies_between_those_of_the_whole_ratios(anchored):
+    parts, log = anchored, fly(anchored, 3).log
     floors = [error_floor.along(parts, log).window_error]
     bandwidth = parts.sensors.bandwidth(0.1)
     for every in (2, 3):
@@ -214,10 +220,8 @@ def test_the_floor_lies_between_those_of_the_whole_ratios(run):
     assert floors[1] < floors[0] < floors[2]
 
 
-def test_a_run_does_not_jump_where_the_partial_first_period_vanishes():
-    """On the anchored clock, with a hand-over a little before and after a whole number of periods from t = 0."""
-    tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
-    anchored = scenario.study(scenario.from_tables(tables)).parts
+def test_a_run_does_not_jump_where_the_partial_first_period_vanishes(anchored):
+    """With a hand-over a little before and after a whole number of periods from t = 0."""
     found = []
     for off in (1e-7, 0.0, -1e-7):
         law = dataclasses.replace(anchored.controller, delta=vector(0.5 + off))
