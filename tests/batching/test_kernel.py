@@ -211,7 +211,7 @@ def test_extremes_keep_what_is_not_a_number(kernels, monkeypatch):
             0
         ]
 
-    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     trace, text = lowered(function, NUMBERS, monkeypatch)
     (flown,) = (eqn for eqn in equations(trace) if eqn.primitive.name == "pallas_call")
     used = {eqn.primitive.name for eqn in equations(flown.params["jaxpr"])}
@@ -256,8 +256,8 @@ def test_what_is_written_out_and_what_is_looped(kernels):
         return {**single, "last": last, "pairs": pairs, "own": own, "nested": nested, "flags": flags}
 
     arguments = NUMBERS, np.linspace(0.5, 1.5, 6)
-    got = lanes.vmap(function, whole=True)(*arguments)
-    wanted = jax.vmap(function)(*arguments)
+    got = jax.jit(lanes.vmap(function, whole=True))(*arguments)
+    wanted = jax.jit(jax.vmap(function))(*arguments)
     assert sorted(kernels) == [15, 20, 50, 100]
     same(got, wanted)
 
@@ -297,7 +297,7 @@ def beside(*values):
     ids="carried reduced mapped".split(),
 )
 def test_arrays_without_entries_are_carried_and_summed(function, kernels):
-    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     assert set(kernels) == {9}
 
 
@@ -340,7 +340,7 @@ def test_a_loop_of_no_trials_stays_a_scan(kernels):
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
     function = forward(step)
-    same(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS))
+    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     assert "triton" in lowered(function, NUMBERS, monkeypatch)[1]
     assert kernels == [9, 9]
 
