@@ -433,11 +433,13 @@ def test_a_body_at_rest_turns_about_its_eigenaxis_by_the_quintic():
 
 def closed_loop(law, start, t_end, d=0.0, event=None, bound=0.0):
     """The law as the package computes it, in continuous time on a double integrator; events: of the law's s."""
-    memory, bound, never, period = law.begin(), vector(bound), np.array(False), np.array(0.1)
+    memory, bound = law.begin(), vector(bound)
+    never: Any = np.array(False)  # NumPy's, which a compiled program is handed quickest
+    period: Any = np.array(0.1)
 
     def asked(t, y):
-        error, rate = np.split(np.array(y), 2)
-        return stepped(law, memory, Sample(np.array(t), never, period), error, rate, bound)
+        now: Any = np.array(t)
+        return stepped(law, memory, Sample(now, never, period), *np.split(np.array(y), 2), bound)
 
     def surface(t, y):
         return float(asked(t, y)[1][0])

@@ -268,11 +268,10 @@ def test_slopes_of_tail_and_share_agree_in_both_modes_and_with_central_differenc
 @pytest.mark.long
 def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
     helpers.small_search(monkeypatch)
-    limits = WITHIN
     largest = {}
     for tail in (None, 1):
         some = replace(problem(), tail=tail)
-        found = optimise.search(Evaluator(limits), some, (), np.array([3.0, 0.5]), optimise.Settings(2, 25, 1))
+        found = optimise.search(Evaluator(WITHIN), some, (), np.array([3.0, 0.5]), optimise.Settings(2, 25, 1))
         f, _, _ = measure(replace(some, tail=1), jnp.asarray(found.gains))
         largest[tail] = float(np.exp(f))
     assert largest[1] <= largest[None] * (1 + 1e-6)
@@ -309,10 +308,12 @@ def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
     """A thousand times beyond one, and within another: each says how far, where every trial ends."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
-    limits = FAR_OFF | {"window_error": 1e-9}
-    wanted = [Requirement(metric, limit) for metric, limit in limits.items()]
+    some, wanted = (
+        problem(window_error=1e-9),
+        [Requirement(m, v) for m, v in (FAR_OFF | {"window_error": 1e-9}).items()],
+    )
     evaluate, settings = Evaluator(WITHIN), optimise.Settings(1, 2, 1)
-    found = optimise.search(evaluate, problem(**limits), wanted, np.array([3.0, 0.5]), settings)
+    found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), settings)
     assert found.worst[2] > descent.BROKEN
     assert found.worst[:2].max() < 1.0
     np.testing.assert_array_equal(found.worst, found.ended)
@@ -392,14 +393,8 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     wanted = (Requirement("peak_torque", 1.4),)
     seen = []
     evaluate = Evaluator(WITHIN)
-    found = optimise.search(
-        evaluate,
-        some,
-        wanted,
-        np.array([3.0, 0.5]),
-        optimise.Settings(3, 40, 1),
-        report=lambda *told: seen.append(told),
-    )
+    started, settings = np.array([3.0, 0.5]), optimise.Settings(3, 40, 1)
+    found = optimise.search(evaluate, some, wanted, started, settings, report=lambda *told: seen.append(told))
     assert found.worst[0] <= 1.0
     assert [step.start for step in found.history] == sorted(step.start for step in found.history)
     assert {step.start for step in found.history} == set(range(3))
@@ -461,8 +456,7 @@ def test_where_going_on_with_harder_trials_leads_beyond_a_limit_it_starts_over(m
 
 @pytest.mark.long
 def test_starts_begin_with_the_first_one_and_differ():
-    limits = WITHIN
-    share = starts.starting_points(Evaluator(limits), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)
+    share = starts.starting_points(Evaluator(WITHIN), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)
     assert share.shape == (4, 2)
     np.testing.assert_array_equal(share[0], [0.2, 0.3])
     assert len(np.unique(share, axis=0)) == 4
@@ -531,8 +525,7 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(descents, "MANY", 64)
     monkeypatch.setattr(cma_es, "GENERATIONS", 25)
-    limits = WITHIN
-    found, evaluates = {}, {sloped: Evaluator(limits) for sloped in (True, False)}
+    found, evaluates = {}, {sloped: Evaluator(WITHIN) for sloped in (True, False)}
     for sloped, evaluate in evaluates.items():
         settings = optimise.Settings(3, 40, 1, sloped=sloped)
         found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), settings)
@@ -714,10 +707,9 @@ def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_wit
             c = np.full((1, 0, 8), -1.0)
             return Sloped(share, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2)))
 
-    limits = WITHIN
     for steps, near in ((3, 1.0), (40, 1e-4)):
         start = descent.Start(np.array([0.9, 0.1]))
-        evaluate, best, path = Bowl(limits), descent.Best(start.share, 0, 0.0), []
+        evaluate, best, path = Bowl(WITHIN), descent.Best(start.share, 0, 0.0), []
         descent.descend(partial(evaluate.slopes, problem()), best, start, steps, path.append, close=1e-12)
         assert evaluate.gradients <= steps
         assert best.f < near
