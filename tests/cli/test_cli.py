@@ -260,7 +260,7 @@ def test_an_empty_file_is_said_to_be_the_papers_case(command, tmp_path):
     assert (status, said) == (0, "ptsmc: none.toml says nothing: what flies is the paper's Case I\n")
 
 
-@pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.57', 'clock = "anchored"\nt_end = 6.4700001'])
+@pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.47', 'clock = "anchored"\nt_end = 6.4700001'])
 def test_the_last_row_is_at_t_end_wherever_the_samples_fall(command, tmp_path, timing):
     (tmp_path / "s.toml").write_text(SHORT.replace("t_end = 6.5", timing))
     assert command("simulate", "s.toml", "--quiet", "--no-figures")[0] == 0
@@ -344,6 +344,7 @@ def stop_at(monkeypatch, call):
 def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, monkeypatch, calls):
     """At the first evaluation there is nothing yet; later it is in the middle of a descent."""
     small_search(monkeypatch)
+    (tmp_path / "s.toml").write_text(SHORT.replace("steps = 4", "steps = 2"))
     with monkeypatch.context() as patch:
         computed = stop_at(patch, 0)
         whole = command("tune", "s.toml", "--out", "whole", "--quiet", "--no-figures")[0]
@@ -426,7 +427,7 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     )
     assert "peak_torque at most 0.01 N m: worst" in told
     # the best compromise: the smallest torque within the bounds is that of the smallest eta
-    assert 2.6 <= summary["gains"]["eta"] < 2.8  # of 2.6 to 3.1
+    assert 2.6 <= summary["gains"]["eta"] < 2.8  # of 2.6 to 3.05
 
 
 def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
@@ -497,8 +498,8 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
 def in_a_process(*args, then=""):
     """`ptsmc ...` as a user runs it; `then` is checked at its end."""
     code = f"import sys\nfrom tuning.cli.main import main\ntry: main()\nfinally:\n    {then or 'pass'}"
-    command = [sys.executable, "-c", code, *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    command, quickly = [sys.executable, "-c", code, *map(str, args)], os.environ | {"XLA_FLAGS": QUICKLY}
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=quickly, check=False)
 
 
 CHAIN = """

@@ -149,6 +149,9 @@ def test_what_cannot_be_compared_is_refused(tables, said):
 def test_the_command(command, tmp_path, monkeypatch, others):
     small_search(monkeypatch)
     monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # each compiles as long again
+    untold = compare.UNTOLD if others else ("heavier", "lighter")  # as one that is later does
+    perturbed = compare.perturbed
+    monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in untold})
     code, said, _ = command("compare", "s.toml")
     folder = tmp_path / "out/compare-s"
     found = json.loads((folder / "summary.json").read_text())
@@ -156,6 +159,10 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     assert list(found["laws"]) == laws
     assert found["judged_on"] == "flight clock"  # not with the sign of one of them
     assert code == (0 if found["laws"]["prescribed_time"]["met"] else 1)
+    for said_of in found["laws"].values():  # another inertia, the same law: hardly another error
+        assert tuple(said_of["untold"]) == untold
+        for other in said_of["untold"].values():
+            assert other["window_error"] != said_of["window_error"]
     assert {path.name for path in (folder / "figures").iterdir()} == {"settling.png", "tradeoff.png"}
     rows = list(csv.DictReader((folder / "compare.csv").read_text().splitlines()))
     assert [row["law"] for row in rows] == laws
@@ -283,7 +290,7 @@ def test_for_the_shortest_t_f_every_law_may_move_its_gains():
 
 @pytest.fixture(scope="module")
 def eight():
-    ready = scenario.study(scenario.from_tables(TABLES))
+    ready = scenario.study(judging.as_flown(scenario.from_tables(TABLES)))  # by the program that judges
     return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
 
 

@@ -25,7 +25,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
         re.sub(r"\[dispersion\]\n.*\n", "", SHORT_CHAIN)  # one loop
         .replace("peak_torque = 3.0", "peak_torque = 3.0\nphase_margin = 45.0")
         .replace('free = ["eta", "delta"]', 'free = ["k1", "sign_width"]')
-        .replace("eta = [2.6, 3.1], delta = [0.1, 2.0]", "k1 = [0.5, 12.0], sign_width = [1e-3, 0.1]")
+        .replace("eta = [2.6, 3.05], delta = [0.1, 2.0]", "k1 = [0.5, 12.0], sign_width = [1e-3, 0.1]")
         .replace("starts = 2\nsteps = 4", "starts = 1\nsteps = 8")
     )
     status, out, _ = command("pareto", "c.toml", "--against", "margins", "--limits", "4,60,6", "--out", "cost")
