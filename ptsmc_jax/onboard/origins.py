@@ -38,10 +38,14 @@ def frames(eqn: Any) -> list[Frame]:
     codes, at = ((), ()) if trace is None else trace.raw_frames()
     calls = []
     for code, where in zip(codes, at, strict=True):
-        file = code.co_filename
-        if not Path(file).is_relative_to(JAX) and not any(part in file for part in FOREIGN):
-            calls.append(Frame(file, code.co_qualname, _spans(code)[where // 2]))
+        if not _foreign(code.co_filename):
+            calls.append(Frame(code.co_filename, code.co_qualname, _spans(code)[where // 2]))
     return calls
+
+
+@functools.cache
+def _foreign(file: str) -> bool:
+    return Path(file).is_relative_to(JAX) or any(part in file for part in FOREIGN)
 
 
 @functools.cache
@@ -59,15 +63,20 @@ def line(calls: list[Frame]) -> str:
 def section(found: list[Frame]) -> Section | None:
     """The function that an equation belongs to: the innermost one that is more than a helper."""
     for frame in found:
-        path = Path(frame.file)
-        inside = path.is_relative_to(LIBRARY)
-        place = path.relative_to(LIBRARY.parent).as_posix() if inside else path.name
-        if inside and path.relative_to(LIBRARY).as_posix().startswith(HELPERS):
-            continue
-        if not _name(frame):
-            continue
-        return Section(_name(frame), place, _about(frame.file, frame.span[0]))
+        place, name = _place(frame.file), _name(frame.name)
+        if place and name:
+            return Section(name, place, _about(frame.file, frame.span[0]))
     return None
+
+
+@functools.cache
+def _place(file: str) -> str:
+    """A file as a reader finds it; empty where its functions are no sections."""
+    path = Path(file)
+    if not path.is_relative_to(LIBRARY):
+        return path.name
+    helps = path.relative_to(LIBRARY).as_posix().startswith(HELPERS)
+    return "" if helps else path.relative_to(LIBRARY.parent).as_posix()
 
 
 def title(found: list[Frame]) -> str:
@@ -126,8 +135,9 @@ def _span(node: Any) -> tuple[int, int, int, int]:
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 
-def _name(frame: Frame) -> str:
-    return re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", frame.name).strip(".")
+@functools.cache
+def _name(name: str) -> str:
+    return re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", name).strip(".")
 
 
 @functools.cache

@@ -154,7 +154,7 @@ def test_what_rounding_may_leave_is_reckoned_to_the_last_sample_before_the_hand_
 
 def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
     known = scenario.replace(
-        scenario.read(exported / "scenario.toml"), controller__eta=4.0, spacecraft__inertia=[9, 11, 13]
+        scenario.read(exported / "scenario.toml"), controller__eta=2.8, spacecraft__inertia=[9, 11, 13]
     )
     other = folder.export(known, tmp_path / "other", name="short", trials=2)
 
